@@ -34,7 +34,7 @@ from alidade.pipelines.applications.fleet.recordings import Recording, find, loc
 from alidade.pipelines.applications.fleet.store import RecordingResult, Store, UnitResult
 from alidade.pipelines.applications.fleet.write import write_fleet
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from benchmarks.measure import peak_mib
 
 # Of a unit, in the table that is compared.

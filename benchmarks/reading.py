@@ -14,8 +14,8 @@ from rosbags.highlevel import AnyReader
 
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_file import McapFile
-from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
 from benchmarks.measure import Ratio, costs
 
 TOPIC = "/imu"
@@ -59,7 +59,7 @@ def read_mcap_ros2(path: Path) -> tuple[Any, Any]:
 def decompress(path: Path) -> int:
     """Chunks decompressed and checked, messages located, nothing decoded."""
     file = McapFile(path)
-    return sum(len(rows.start) for rows in file.rows(set(file.channels)))
+    return sum(len(block.start) for block in file.blocks(set(file.channels)))
 
 
 def run() -> Iterator[Ratio]:

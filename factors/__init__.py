@@ -25,7 +25,7 @@ _HOMES = {
         "TriadPriorFactor",
     ),
     "turns": ("GyroRotationFactor",),
-    "vectorized": ("Ensemble", "VectorizedFactor"),
+    "bridge": ("BoundModel",),
 }
 _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -70,9 +70,9 @@ def sagitta(raw: Array, scatter: Array, numbers: Array) -> Array:
 
 @dataclass(frozen=True)
 class StrengthFactor(Model):
-    """The length of a vector measured in any attitude: |K raw + b - c warmth| = s.
+    """The length of a vector measured in any attitude: |K raw + b - drift| = s.
 
-    Blocks: triad (9 or 12), s (1) and, of a sensor whose temperature is known, c (3, in the unit of b per K).
+    Blocks: triad (9 or 12), s (1) and, of a sensor whose offset has drivers, what these do (m), see `drifted`.
 
     The residual is how far raw is from the ellipsoid (Sampson's distance, |v| - s over its slope |K' v / |v||), and not
     how far |v| is from s: that would be less for a K that is too small, down to K = 0 and |b| = s.
@@ -83,7 +83,7 @@ class StrengthFactor(Model):
         sigma: (n,) of raw, per axis.
         excess: (n,) by what the distance is more than 0 on average, see `excess`.
         symmetric: whether K is.
-        warmth: (n,) K, temperature above that at which b is the offset; None: not known.
+        drivers: (n, m) of the offset, see `drifted`; None: there are none.
     """
 
     time: Array
@@ -91,19 +91,19 @@ class StrengthFactor(Model):
     sigma: Array
     excess: Array
     symmetric: bool
-    warmth: Array | None = None
+    drivers: Array | None = None
     shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 1
-    stacked: ClassVar = ("time", "raw", "sigma", "excess", "warmth")
+    stacked: ClassVar = ("time", "raw", "sigma", "excess", "drivers")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Triad, strength and, where the temperature is known, the slope over it."""
-        return (9 if self.symmetric else 12, 1, *([] if self.warmth is None else [3]))
+        """Triad, strength and what the drivers do."""
+        return (9 if self.symmetric else 12, 1, *([] if self.drivers is None else [self.drivers.shape[1]]))
 
     def __call__(self, triads: Array, strength: Array, *drift: Array) -> Residuals:
-        """Residual ((|v| - s) / |K' v / |v|| - excess) / sigma, (n, 1), v = K raw + b - c warmth."""
-        triads = drifted(triads, self.warmth, drift)
+        """Residual ((|v| - s) / |K' v / |v|| - excess) / sigma, (n, 1), v = K raw + b - drift."""
+        triads = drifted(triads, self.drivers, drift)
         length, direction, by_triad = _polar(self.raw, triads, self.symmetric)
         K = (triads @ entries(self.symmetric).T)[:, :9].reshape(-1, 3, 3)
         gradient = np.einsum("nij,ni->nj", K, direction)
@@ -122,7 +122,7 @@ class StrengthFactor(Model):
             of_length = np.einsum("ni,nid->nd", direction, by_triad)
             scale = (weight / slope)[:, None]
             by_numbers = ((of_length - distance[:, None] * of_slope) * scale)[:, None]
-            return by_numbers, -scale[..., None], *by_slope(by_numbers, self.warmth)
+            return by_numbers, -scale[..., None], *by_slope(by_numbers, self.drivers)
 
         return ((distance - self.excess) * weight)[:, None], jacobians
 
@@ -132,15 +132,15 @@ class DipFactor(Model):
     """The angle between two constant vectors, up and the field, measured together in any attitude: u . f = -sin dip.
 
     u and f have the directions of K raw + b of the accelerometer and of the magnetometer. Blocks: both triads (9 or 12
-    each), dip (1; rad, the field's inclination, positive down) and, where its temperature is known, the accelerometer's
-    slope (3), as of the length.
+    each), dip (1; rad, the field's inclination, positive down) and what the accelerometer's drivers do (m), as of the
+    length.
 
     Attributes:
         time: (n,) s.
         accel, mag: (n, 3) raw.
         sigma: (n,) of the product.
         symmetric: whether the K of accelerometer and magnetometer are.
-        warmth: (n,) K, of the accelerometer, as of the length.
+        drivers: (n, m), of the accelerometer, as of the length.
     """
 
     time: Array
@@ -148,20 +148,20 @@ class DipFactor(Model):
     mag: Array
     sigma: Array
     symmetric: tuple[bool, bool]
-    warmth: Array | None = None
+    drivers: Array | None = None
     shapes: ClassVar = {"accel": (3,), "mag": (3,), "sigma": ()}
     rows: int = 1
-    stacked: ClassVar = ("time", "accel", "mag", "sigma", "warmth")
+    stacked: ClassVar = ("time", "accel", "mag", "sigma", "drivers")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Accelerometer, magnetometer, dip and, where the temperature is known, the slope over it."""
+        """Accelerometer, magnetometer, dip and what the drivers do."""
         triads = (9 if symmetric else 12 for symmetric in self.symmetric)
-        return (*triads, 1, *([] if self.warmth is None else [3]))
+        return (*triads, 1, *([] if self.drivers is None else [self.drivers.shape[1]]))
 
     def __call__(self, accel: Array, mag: Array, dip: Array, *drift: Array) -> Residuals:
         """Residual (u . f + sin dip) / sigma, (n, 1)."""
-        accel = drifted(accel, self.warmth, drift)
+        accel = drifted(accel, self.drivers, drift)
         up_length, up, by_accel = _polar(self.accel, accel, self.symmetric[0])
         field_length, field, by_mag = _polar(self.mag, mag, self.symmetric[1])
         cosine = (up * field).sum(axis=1)
@@ -175,22 +175,29 @@ class DipFactor(Model):
                 by_up,
                 np.einsum("ni,nid->nd", across_field, by_mag)[:, None],
                 (np.cos(dip) * weight)[..., None],
-                *by_slope(by_up, self.warmth),
+                *by_slope(by_up, self.drivers),
             )
 
         return (cosine[:, None] + np.sin(dip)) * weight, jacobians
 
 
-def drifted(triads: Array, warmth: Array | None, slope: Sequence[Array]) -> Array:
-    """Triads (n, 9 or 12) with b as it is at a temperature, b - c warmth; as they are where that is not known."""
-    if warmth is None:
+def drifted(triads: Array, drivers: Array | None, slopes: Sequence[Array]) -> Array:
+    """Triads (n, 9 or 12) with b less the drift of their drivers; as they are where there are none.
+
+    Drivers (n, m) are three to each cause, along the axes of b: a temperature three times, or squares of what is felt.
+    What they do, the last of `slopes` (n, m), is in the unit of b for each of theirs.
+    """
+    if drivers is None:
         return triads
-    return np.concatenate([triads[:, :-3], triads[:, -3:] - warmth[:, None] * slope[-1]], axis=1)
+    drift = (drivers * slopes[-1]).reshape(len(drivers), -1, 3).sum(axis=1)
+    return np.concatenate([triads[:, :-3], triads[:, -3:] - drift], axis=1)
 
 
-def by_slope(by_triad: Array, warmth: Array | None) -> tuple[Array, ...]:
-    """The Jacobian by c that goes with one by such triads, (n, d, 9 or 12); none where there is no c."""
-    return () if warmth is None else (-warmth[:, None, None] * by_triad[..., -3:],)
+def by_slope(by_triad: Array, drivers: Array | None) -> tuple[Array, ...]:
+    """The Jacobian by what drivers do that goes with one by such triads, (n, d, 9 or 12); none where there are none."""
+    if drivers is None:
+        return ()
+    return (-np.tile(by_triad[..., -3:], drivers.shape[1] // 3) * drivers[:, None],)
 
 
 def _polar(raw: Array, triads: Array, symmetric: bool) -> tuple[Array, Array, Array]:

@@ -20,8 +20,8 @@ from alidade.factors.soundness import make_sound
 if TYPE_CHECKING:
     import gtsam
 
+    from alidade.factors.bridge import BoundModel
     from alidade.factors.loss import TruncatedLoss
-    from alidade.factors.vectorized import VectorizedFactor
 
 Array = NDArray[np.float64]
 # Whitened residuals (n, m) and, on demand, their Jacobians by the blocks, (n, m, d) each.
@@ -90,32 +90,25 @@ class Model:
         def __call__(self, *blocks: Any, **_: Any) -> Residuals:
             """Residuals and Jacobians."""
 
-    @property
-    def turning(self) -> tuple[int, int] | None:
-        """A number that turns the first two rows in their plane, from the first to the second: its block and place."""
-        return None
-
     def on(
         self,
         *keys: Keys,
         loss: TruncatedLoss | None = None,
-        compress: bool = False,
         noise: gtsam.noiseModel.Base | None = None,
-    ) -> VectorizedFactor:
+    ) -> BoundModel:
         """The model tied to variables; its `.factor` is what a gtsam graph takes.
 
         Args:
             keys: for each block one key that all measurements share, or a key for each of the n.
             loss: how outlying measurements are weighed; None counts all in full.
-            compress: hand gtsam the square root of the normal equations instead of the rows (shared keys only).
             noise: Gaussian, of one measurement's m rows, for a model whose residuals are not whitened.
 
         Raises:
             ValueError: keys, noise or the model's own blocks do not fit.
         """
-        from alidade.factors.vectorized import VectorizedFactor
+        from alidade.factors.bridge import BoundModel
 
-        return VectorizedFactor(self, keys, loss, compress, noise)
+        return BoundModel(self, keys, loss, noise)
 
 
 def width(block: Block) -> int:

@@ -95,16 +95,16 @@ class FieldFactor(Model):
 
 @dataclass(frozen=True)
 class UpFactor(Model):
-    """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b + c warmth).
+    """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b + drift).
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), triad (12), strength s (1), unless the gyro is
-    perfect its errors (6 to 18), of a sensor that is swung about a point arm (3; in b, from there to the sensor), where
-    its temperature is known c (3, in the unit of b per K) and, where the place is unknown, the earth's rate (3).
+    perfect its errors (6 to 18), of a sensor that is swung about a point arm (3; in b, from there to the sensor), what
+    drivers of its offset do (m; see `ellipsoid.drifted`) and, where the place is unknown, the earth's rate (3).
 
     Attributes:
         time, anchor, raw, sigma, elapsed, gyro, errors, earth: as of the field.
         unit: m/s^2, of the strength, of a sensor that is swung; None: it is at rest.
-        warmth: (n,) K, temperature above that at which b is the offset; None: not known.
+        drivers: (n, m) of the offset; None: there are none.
     """
 
     time: Array
@@ -116,15 +116,15 @@ class UpFactor(Model):
     errors: int = 0
     earth: Array | None = None
     unit: float | None = None
-    warmth: Array | None = None
+    drivers: Array | None = None
     shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
-    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "elapsed", "warmth")
+    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "elapsed", "drivers")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, bias, triad, strength, the gyro's errors, the arm, the slope over temperature, the earth's rate."""
-        arm, slope = ([] if each is None else [3] for each in (self.unit, self.warmth))
+        """Attitude, bias, triad, strength, the gyro's errors, the arm, what drivers do, the earth's rate."""
+        arm, slope = [] if self.unit is None else [3], [] if self.drivers is None else [self.drivers.shape[1]]
         earth = [] if self.earth is not None else [3]
         return ROT3, 3, 12, 1, *([self.errors] if self.errors else []), *arm, *slope, *earth
 
@@ -133,7 +133,7 @@ class UpFactor(Model):
         middle = 0.5 * (self.anchor + self.time)
         own = others[0] if self.errors else None
         slopes = others if self.earth is not None else others[:-1]
-        triads = drifted(triads, self.warmth, slopes)
+        triads = drifted(triads, self.drivers, slopes)
         dV, _, by_gyro = carried(self.gyro, self.anchor, middle, self.time, bias, own)
         aRn, by_earth = _earth_rotation(self.elapsed, self.earth, others)
         bRn = so3.multiply(so3.inverse(so3.multiply(aRb, dV)), aRn)
@@ -153,7 +153,7 @@ class UpFactor(Model):
                 by_arm = [arm]
                 by_bias, *by_errors = (a + b for a, b in zip((by_bias, *by_errors), more, strict=True))
             numbers = by_triad()
-            shared = by_bias, numbers, by_strength, *by_errors, *by_arm, *by_slope(numbers, self.warmth)
+            shared = by_bias, numbers, by_strength, *by_errors, *by_arm, *by_slope(numbers, self.drivers)
             return by_attitude @ so3.matrix(so3.inverse(dV)), *shared, *by_earth(across, bRn, strength * _UP)
 
         return error, jacobians

@@ -1,6 +1,6 @@
 """How the config of a session is read: an attachment of the recording, overridden key by key by a file.
 
-    config = recorded_config(recording, Path("more.yaml"))
+    recording, config = configured(recording, Path("more.yaml"))
 
 Everything wrong in a config is an InputError that names the key and the source it stands in.
 """
@@ -21,17 +21,16 @@ from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.settings import ATTACHMENT, Config
 
 if TYPE_CHECKING:
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
 
 
-def recorded_config(recording: Recording, override: Path | Config | None = None) -> Config:
-    """The config of a recording, overridden as below; the recording's topics are now what the config makes of them.
+def configured(recording: Recording, override: Path | Config | None = None) -> tuple[Recording, Config]:
+    """A recording with the topics and columns of its config, and this config, overridden as by `load_config`.
 
     Raises InputError.
     """
     config = load_config(recording.attachment(ATTACHMENT, needed=override is None), override)
-    recording.use(config.topics.values(), config.columns)
-    return config
+    return recording.with_config(config.topics.values(), config.columns), config
 
 
 def load_config(attachment: bytes | None, override: Path | Config | None = None) -> Config:

@@ -1,4 +1,4 @@
-"""The one exception of known causes."""
+"""Exceptions of known causes, and how names stand in their messages."""
 
 from __future__ import annotations
 
@@ -21,6 +21,10 @@ class InputError(Exception):
     def __str__(self) -> str:
         """The one line, whatever the names in it are made of."""
         return printable(super().__str__(), _LONGEST)
+
+
+class NotARecordingError(InputError):
+    """A file that is no recording, and will not become one."""
 
 
 def printable(text: str, longest: int = 200) -> str:

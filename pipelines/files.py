@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import stat
 import sys
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,16 @@ def read_bytes(path: Path, most: int) -> bytes:
     if len(data) > most:
         raise InputError(f"{path}: over {most} bytes, which is more than any file of its kind has")
     return data
+
+
+def dump_yaml(content: object, width: int = 80) -> str:
+    """YAML text of mappings, lists and scalars; mappings and lists of scalars alone stand on one line of that width."""
+    from ruamel.yaml import YAML
+
+    yaml, text = YAML(typ="safe", pure=True), StringIO()
+    yaml.default_flow_style, yaml.width = None, width
+    yaml.dump(content, text)
+    return text.getvalue()
 
 
 def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:

@@ -32,7 +32,7 @@ from alidade.pipelines.recording.checks import (
     nanoseconds,
 )
 from alidade.pipelines.recording.opening import Where
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.shapes import Array, Rows, as_dates, rows_by_name
 from alidade.pipelines.settings import Config as _BaseConfig
 from alidade.pipelines.simulation.simulated import Simulated

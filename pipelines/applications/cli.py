@@ -205,7 +205,7 @@ def calibrate(
     from alidade.pipelines.applications.joint import calibrate_together
     from alidade.pipelines.applications.session import OpenOptions
     from alidade.pipelines.errors import InputError
-    from alidade.pipelines.recording.opening import recordings_of, told
+    from alidade.pipelines.recording.opening import describe_recordings, group_recordings
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
@@ -215,7 +215,7 @@ def calibrate(
     def read(where: "Where") -> "Session":
         return replace(options.read(where), engine=engine.value, attitude_rate=attitude_rate.value)
 
-    recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
+    recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
         if solver != Solver.batch:
             raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
@@ -223,7 +223,7 @@ def calibrate(
             raise InputError(f"--engine {engine.value}: with several recordings each uses the engine that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
-            terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
+            terminal.say(f"{len(recordings)} recordings of one device: {describe_recordings(recordings)}")
     require_room(folder)
     with (
         progress.shown(quiet or as_json),
@@ -492,17 +492,16 @@ def info(
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
     from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
-    from alidade.pipelines.config import recorded_config
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.config import configured
+    from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import facts_json
 
     with progress.shown(quiet), progress.doing("reading"):
-        recording = open_recording(session, strict)
-        settings = recorded_config(recording, config)
+        recording, settings = configured(open_recording(session, strict), config)
         columns = None if settings.columns else propose_columns(recording)
         if columns is not None and columns.columns:
-            settings = with_columns(recording, settings)
+            recording, settings = with_columns(recording, settings)
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
@@ -755,7 +754,8 @@ def main() -> None:
     except BaseException as error:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
-        code = _TROUBLE.get(type(error).__name__)
+        names = (kind.__name__ for kind in type(error).__mro__)
+        code = next((_TROUBLE[name] for name in names if name in _TROUBLE), None)
         if code is None and not isinstance(error, OSError):
             raise
         print(f"alidade: {_of_system(error) if isinstance(error, OSError) else error}", file=sys.stderr)

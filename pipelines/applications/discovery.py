@@ -14,8 +14,8 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
 from alidade.pipelines.recording.pairing import MAX_MOUNT, Pairing, pair
-from alidade.pipelines.recording.placeholders import is_there
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.plausibility import is_there
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
 from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.recording.topics import Setting, Topic, wanted
@@ -73,27 +73,29 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
     return tuple(found)
 
 
-def with_suggested(recording: Recording, config: Config, method: str | None = None) -> Config:
-    """The config with the topics suggested for a method, or for the only one that they would serve.
+def with_suggested(recording: Recording, config: Config, method: str | None = None) -> tuple[Recording, Config]:
+    """The recording and config with the topics suggested for a method, or for the only one that they would serve.
 
-    As it is where nothing is lacking. What is taken is remarked in the recording, which has the topics from now on.
-    Raises InputError when no method could be served, or several.
+    Both are as they were where nothing is lacking; the recording notes what was chosen. Raises InputError when no
+    method could be served, or several.
     """
     asked = method or config.method
     config = config.model_copy(update={"method": asked}) if asked else config
     served = [name for name in methods.names() if not lacking(methods.method(name).needs, recording, config)]
     if asked in served or (asked is None and served):
-        return config
-    found = suggestions(recording, config, [asked] if asked else None)
+        return recording, config
+    # Through a copy, for the search reads topics that may not be used.
+    copy = recording.with_config(config.topics.values())
+    found = suggestions(copy, config, [asked] if asked else None)
     whole = [suggestion for suggestion in found if not suggestion.missing and not suggestion.has_to_be_asked_for]
     if len(whole) != 1:
         which = " and ".join(suggestion.method for suggestion in whole)
         what = f"topics could be found for {which}; choose with --method" if whole else nearest_suggestion(found)
         raise InputError(f"{recording.path}: {what or 'no topics for any method were found'}; {recording.there()}")
     more = config.model_copy(update={"topics": {**config.topics, **whole[0].topics}, "method": whole[0].method})
-    recording.use(more.topics.values(), {})
+    recording = recording.with_config(more.topics.values())
     recording.remark(f"topics chosen automatically ({whole[0].method}): {'; '.join(whole[0].reasons)}")
-    return more
+    return recording, more
 
 
 def nearest_suggestion(found: Sequence[Suggestion]) -> str:
@@ -189,10 +191,7 @@ def _suggestion(
             topics[topic.key] = TopicSource(topic=named)
             reasons.append(f"{named} ({_short(recording, named)}) proposed as {topic.key}")
     more = config.model_copy(update={"topics": {**config.topics, **topics}})
-    before = tuple(config.topics.values())
-    recording.use(more.topics.values(), {})
-    missing = lacking(chosen.needs, recording, more)
-    recording.use(before, {})
+    missing = lacking(chosen.needs, recording.with_config(more.topics.values()), more)
     return Suggestion(method, topics, tuple(reasons), missing)
 
 

@@ -20,9 +20,9 @@ from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import clean
 from alidade.pipelines.recording.even import even_pieces
 from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.placeholders import is_there
-from alidade.pipelines.recording.plausibility import implausible
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.plausibility import implausible, is_there
+from alidade.pipelines.recording.recording import Recording, open_recording
+from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
 
@@ -92,10 +92,11 @@ def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_
     Raises:
         InputError: recording or config cannot be used, there is no such sensor, or nothing in it is at rest.
     """
-    recording = open_recording(path, strict)
-    rates = set() if config is None else _described(recording, config)
+    settings = load_config(None, config)
+    recording = open_recording(path, strict).with_config(settings.topics.values(), settings.columns)
     if auto_columns:
-        with_columns(recording, load_config(None, config))
+        recording, _ = with_columns(recording, settings)
+    rates = _rates_alone(settings)
     names = [
         name
         for name, topic in recording.topics.items()
@@ -128,10 +129,8 @@ def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_
     return NoiseStudy(path.name, recording.epoch_ns, recording.duration_s, tuple(found), tuple(notes))
 
 
-def _described(recording: Recording, config: Path) -> set[str]:
-    """Have a recording know what the config says of its topics; those that it names where a gyro's rates will do."""
-    settings = load_config(None, config)
-    recording.use(settings.topics.values(), settings.columns)
+def _rates_alone(settings: Config) -> set[str]:
+    """Topics that the config names where a gyro's rates will do."""
     known = [topic for name in methods.names() for topic in methods.method(name).topics]
     takes = {topic.key for topic in known if set(messages.RATES) <= set(topic.types)}
     return {source.name for key, source in settings.topics.items() if key in takes}

@@ -22,6 +22,7 @@ from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods import Method, Scenario
 from alidade.pipelines.settings import Config
 
@@ -242,15 +243,7 @@ def write_scenario(path: Path, plan: Plan) -> None:
 
 def scenario_yaml(scenario: Scenario) -> str:
     """The text of a scenario file."""
-    from io import StringIO
-
-    from ruamel.yaml import YAML
-
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    text = StringIO()
-    yaml.dump(scenario, text)
-    return text.getvalue()
+    return dump_yaml(scenario)
 
 
 def _candidates(

@@ -22,14 +22,22 @@ from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
-from alidade.pipelines.config import load_config, recorded_config
-from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, step_finding, with_change
+from alidade.pipelines.config import configured, load_config
+from alidade.pipelines.diagnostics.change_test import (
+    Stability,
+    change_finding,
+    stability,
+    step_finding,
+    step_stability,
+    with_change,
+)
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses
 from alidade.pipelines.diagnostics.observability import finite_covariance
+from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
@@ -46,11 +54,11 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
+from alidade.pipelines.recording.decoding import ENCODING
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
-from alidade.pipelines.recording.message_reader import ENCODING
 from alidade.pipelines.recording.opening import Where
-from alidade.pipelines.recording.placeholders import HELD
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.plausibility import HELD
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
@@ -200,11 +208,11 @@ class Session:
         auto_columns: bool = False,
     ) -> Session:
         """Read and check a recording (arguments and exceptions as `OpenOptions` has them)."""
-        config = recorded_config(recording, config_file)
+        recording, config = configured(recording, config_file)
         if auto_columns:
-            config = with_columns(recording, config)
+            recording, config = with_columns(recording, config)
         if auto_topics:
-            config = with_suggested(recording, config, method_name)
+            recording, config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
         try:
             data = chosen.read(recording, config)
@@ -232,7 +240,7 @@ class Session:
 
     def again(self, recording: Recording) -> Session:
         """The same method and config with another recording, or another part of it. Raises InputError."""
-        recording.use(self.config.topics.values(), self.config.columns)
+        recording = recording.with_config(self.config.topics.values(), self.config.columns)
         return replace(self, data=self.method.read(recording, self.config), origin=Recorded(recording))
 
     @classmethod
@@ -340,7 +348,7 @@ class Session:
             elif report and estimate.solver == "incremental" and published is None:
                 published = self._published()
             stable, change = self._change(estimate, quantities)
-            if change is not None and change.severity == Severity.NOTE:
+            if change is not None and change.kind == "change" and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
             tables = self.method.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(problem, estimate)
@@ -399,13 +407,37 @@ class Session:
         self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None
     ) -> tuple[Finding, ...]:
         """The findings on an estimate; hypotheses are tested where it is suspect."""
-        findings = diagnose(estimate, quantities, problem.advice, change)
+        contradicted = self._contradictions(estimate, quantities)
+        findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted)
         if not is_suspect(estimate, findings) or deadline.passed(_HYPOTHESES):
             return findings
+        severe = any(each.severity > Severity.NOTE for each in contradicted)
+        freed = self._freed[0] if severe and self._freed is not None else None
         with progress.doing("testing hypotheses"):
-            hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate)
+            hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate, freed)
         deadline.passed(_HYPOTHESES)
-        return diagnose(estimate, quantities, problem.advice, change, hypotheses)
+        # A fault that explains more than freeing what is fixed is what these contradictions come from.
+        return diagnose(estimate, quantities, problem.advice, change, hypotheses, () if hypotheses else contradicted)
+
+    def _contradictions(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Finding, ...]:
+        """What the config fixes and the recording contradicts."""
+        if estimate.solver == "published" or not estimate.converged or self._freed is None:
+            return ()
+        from alidade.pipelines.solvers.freed import freed_information
+
+        told = freed_information(self._freed[1], estimate)
+        ratios = estimate.inflations if estimate.sandwich is None else estimate.inflations * estimate.sandwich
+        ratio = max((r for r, q in zip(ratios.tolist(), quantities, strict=True) if q.judged), default=1.0)
+        return () if told is None else contradictions(told, self._freed[1].quantities, quantities, ratio)
+
+    @cached_property
+    def _freed(self) -> tuple[Config, Problem] | None:
+        """The config with everything free that it fixes, and its graph; None where it fixes nothing."""
+        config = freed_config(self.config, self.problem().quantities)
+        try:
+            return None if config is None else (config, self.method.graph(self.data, config).near(self.near))
+        except InputError:  # the method has to have it fixed
+            return None
 
     def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
         """The test for a change, and the finding where there is one, with the steps between its two sides."""
@@ -413,13 +445,11 @@ class Session:
             return None, None
         ratios = [] if estimate.sandwich is None else estimate.sandwich[[q.judged for q in quantities]].tolist()
         ratio = max(ratios, default=1.0)
+        if estimate.steps is not None:
+            span = float(np.ptp(np.concatenate([r.time for r in estimate.residuals.values()])))
+            found = step_finding(estimate.steps, span, quantities)
+            return (step_stability(estimate.steps[0], span) if estimate.steps else None), found
         stable = stability(estimate, quantities)
-        times = [r.time for r in estimate.residuals.values()]
-        if estimate.step is not None and times:
-            span = float(np.ptp(np.concatenate(times)))
-            slipped = step_finding(estimate.step, span, quantities)
-            if slipped is not None:
-                return stable, slipped
         if stable is None or not stable.changed:
             return stable, None
         parts: Mapping[str, SplitHalf] = {}
@@ -566,7 +596,7 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
 
 def _refused(method: Method, recording: Recording, config: Config) -> str:
     """Why a method cannot read the recording, as a phrase; empty where it can."""
-    from alidade.pipelines.vision.recorded import camera_of
+    from alidade.pipelines.vision.camera import camera_of
 
     by_key = {topic.key: topic for topic in method.topics}
     image, camera = by_key.get(IMAGE.key), by_key.get(CAMERA_INFO.key)

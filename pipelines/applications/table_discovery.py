@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.sources import TopicSource
-from alidade.pipelines.recording.table_topics import TableTopic
+from alidade.pipelines.recording.table_topics import TableTopic, tables_of
 from alidade.pipelines.recording.table_units import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
 from alidade.pipelines.settings import Config
@@ -92,7 +92,7 @@ class Columns:
 
 def propose_columns(recording: Recording) -> Columns | None:
     """What the tables of a recording hold that no config describes; None where there is no such table."""
-    tables = recording.tables()
+    tables = tables_of(recording.container)
     if not tables:
         return None
     found = [_Table(table, len(tables) > 1) for table in tables.values()]
@@ -107,22 +107,20 @@ def propose_columns(recording: Recording) -> Columns | None:
     return Columns(columns, topics, reasons, tuple(doubt for one in found for doubt in one.doubts))
 
 
-def with_columns(recording: Recording, config: Config) -> Config:
-    """The config with the columns that are proposed, where it has none; remarked in the recording.
+def with_columns(recording: Recording, config: Config) -> tuple[Recording, Config]:
+    """The recording and config with the columns that are proposed, where the config has none; noted in the recording.
 
     Raises InputError where nothing can be concluded.
     """
-    if config.columns:
-        return config
-    found = propose_columns(recording)
+    found = None if config.columns else propose_columns(recording)
     if found is None:
-        return config
+        return recording, config
     if not found.columns:
         raise InputError(f"{recording.path}: no columns could be concluded: {'; '.join(found.doubts)}")
     more = config.model_copy(update={"columns": found.columns, "topics": {**found.topics, **config.topics}})
-    recording.use(more.topics.values(), more.columns)
+    recording = recording.with_config(more.topics.values(), more.columns)
     recording.remark(f"columns taken as concluded: {'; '.join((*found.reasons, *found.doubts))}")
-    return more
+    return recording, more
 
 
 class _Table:
@@ -135,7 +133,7 @@ class _Table:
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
-        texts, _ = read_columns(table.path, table.data, names)
+        texts, _ = read_columns(table.path, table.data, self._form, names)
         self._texts = [texts[name][:_ROWS] for name in names]
         self._values = [self._numbers(i) for i in range(len(names))]
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from alidade.pipelines import deadline, progress
 from alidade.pipelines.applications.session import Recorded, Session, resolve_method
 from alidade.pipelines.applications.sharing import device_belief, walks
-from alidade.pipelines.config import recorded_config
+from alidade.pipelines.config import configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate
 from alidade.pipelines.methods import method
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration
 from alidade.pipelines.reports.known import Known, load_known, saved_of, with_covariance
 
@@ -101,8 +101,7 @@ def validate(
     """
     known = load_known(calibration_file)
     calibration = saved_of(known, calibration_file)
-    recording = open_recording(path, strict)
-    config = recorded_config(recording, config_file)
+    recording, config = configured(open_recording(path, strict), config_file)
     name = resolve_method(method_name or calibration.method, recording, config)
     known.of_method(name)
     chosen = method(name)

@@ -29,8 +29,13 @@ _PATHS, _BATCH = 4000, 500
 _LEAST = 1e-3
 # A step between the segments is significant beyond so many sigmas, and material from this share of the requirement on.
 _STEP, _MATERIAL, _SURE = 3.0, 0.5, 2.0
-# s between times at which a step would look different.
+# s between times at which a step of the mount would look different: in simulated recordings half of the largest tests
+# exceed chi-square's quantile of that many times.
 _EVERY_S = 2.0
+# Numbers of a step of a rotation.
+_TURNS = 3
+# rad: motion capture of healthy recordings differs by up to .29 deg over minutes, and jumps by up to .48 deg at rest.
+_LEAST_STEP, _USUAL_JUMP = np.deg2rad(0.25), np.deg2rad(0.5)
 # Differences that are named where no segment has a solution.
 _MAX_NAMED = 3
 # Source of variance, as in the budget.
@@ -94,7 +99,7 @@ def change_finding(
     material = any(abs(step) - _SURE * s > _MATERIAL * required[name] for name, (step, s) in steps.items())
     immaterial = bool(parts) and not material
     severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
-    return Finding("change", severity, {"time_s": found.time_s, "steps": steps})
+    return Finding("change", severity, {"since_s": found.time_s, "time_s": found.time_s, "steps": steps})
 
 
 def _significant(steps: Mapping[str, tuple[float, float]], ratio: float) -> dict[str, tuple[float, float]]:
@@ -104,28 +109,64 @@ def _significant(steps: Mapping[str, tuple[float, float]], ratio: float) -> dict
     return dict(sorted(beyond.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
 
 
-def step_finding(step: StepEstimate, duration: float, quantities: Sequence[Quantity]) -> Finding | None:
-    """The finding of kind `change` of a step that is certain and material; None of another.
+def step_stability(step: StepEstimate, duration: float) -> Stability:
+    """The test of a step anywhere in a recording, which has a time to step every `_EVERY_S`."""
+    from scipy.special import chdtrc
 
-    Certain: the fall of -2 log L exceeds chi-square's quantile at `LEVEL` over the recording, which has a time to step
-    every `_EVERY_S`; material: by three sigmas, times the sandwich ratio, it is more than half of what is required.
+    times = max(duration, _EVERY_S) / _EVERY_S
+    size = float(_as_normal(np.array([step.statistic]), np.array([_TURNS]))[0])
+    departures = {name: -value / max(sigma, 1e-300) for name, (value, sigma) in step.steps.items()}
+    ordered = dict(sorted(departures.items(), key=lambda item: -abs(item[1])))
+    return Stability(size, min(float(chdtrc(_TURNS, step.statistic)) * times, 1.0), step.time_s, ordered, step.steps)
+
+
+def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Sequence[Quantity]) -> Finding | None:
+    """The most severe finding, of kind `change` or `jump`, on a step that is significant; None where none is.
+
+    A change is a step that motion alone shows too, and the same one; it is a NOTE where it is not material. A `jump` is
+    a material one of which motion does not tell whether the mount or the reference made it.
 
     Args:
-        step: that explains the recording best.
+        steps: that explain the recording best, the most significant first.
         duration: of the recording, s.
         quantities: of the estimate.
     """
-    from scipy.special import chdtri
+    found = [f for s in steps if (f := _changed(s, duration, quantities)) is not None]
+    jumps = [s for s in steps if _is_jump(s, duration) and _is_material(s, quantities)]
+    found += [_jump(step) for step in sorted(jumps, key=_certain_size, reverse=True)]
+    return max(found, key=lambda finding: finding.severity, default=None)
 
-    ratio = step.ratio
-    if step.fall < chdtri(len(step.steps), LEVEL * min(_EVERY_S / max(duration, _EVERY_S), 1.0)) * ratio**2:
+
+def _changed(step: StepEstimate, duration: float, quantities: Sequence[Quantity]) -> Finding | None:
+    """The finding that something changed; None where the step is not significant."""
+    significant = _significant(step.steps, step.ratio)
+    if not significant or not step_stability(step, duration).changed:
         return None
-    required = {q.name: q.require for q in quantities}
-    wide = {name: (size, ratio * sigma) for name, (size, sigma) in step.steps.items()}
-    if not any(abs(size) - _STEP * sigma > _MATERIAL * required[name] for name, (size, sigma) in wide.items()):
-        return None
-    steps = dict(sorted(wide.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
-    return Finding("change", Severity.INCONSISTENT, {"time_s": step.time_s, "steps": steps})
+    severity = Severity.INCONSISTENT if _is_material(step, quantities) else Severity.NOTE
+    return Finding("change", severity, {"since_s": step.since_s, "time_s": step.time_s, "steps": significant})
+
+
+def _jump(step: StepEstimate) -> Finding:
+    """The finding that vision jumped: from a size on that no healthy reference has it keeps from `calibrated`."""
+    severity = Severity.WEAK if _certain_size(step) > _USUAL_JUMP else Severity.NOTE
+    sizes = {"size": step.size, "sigma": step.ratio * step.sigma}
+    return Finding("jump", severity, {"since_s": step.since_s, "time_s": step.time_s, **sizes})
+
+
+def _certain_size(step: StepEstimate) -> float:
+    """What a step exceeds by two sigmas, rad."""
+    return step.size - _SURE * step.ratio * step.sigma
+
+
+def _is_material(step: StepEstimate, quantities: Sequence[Quantity]) -> bool:
+    """Whether a step is certainly more than half of what is required, and than a reference's own slow error."""
+    required = min(q.require for q in quantities if q.name in step.steps)
+    return _certain_size(step) > max(_MATERIAL * required, _LEAST_STEP)
+
+
+def _is_jump(step: StepEstimate, duration: float) -> bool:
+    """Whether vision jumps by a step, be that the mount's or not."""
+    return step.agrees and step_stability(replace(step, by_motion=np.inf), duration).changed
 
 
 def with_change(estimate: Estimate, change: Finding) -> Estimate:

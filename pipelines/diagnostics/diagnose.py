@@ -55,6 +55,7 @@ def diagnose(
     advise: Advise | None = None,
     change: Finding | None = None,
     hypotheses: Sequence[Finding] = (),
+    contradictions: Sequence[Finding] = (),
     limits: Thresholds = DEFAULT,
 ) -> tuple[Finding, ...]:
     """All findings, the most severe first; equally severe ones in the order of explanation, cause before symptom.
@@ -65,17 +66,18 @@ def diagnose(
         advise: weights of a direction -> motion that would determine it.
         change: finding of `diagnostics.change_test`.
         hypotheses: findings of `diagnostics.hypothesis_tests`, which run where `is_suspect` is true.
+        contradictions: findings of `diagnostics.stated_priors`.
         limits: thresholds.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone
     failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": estimate.message})
     if not estimate.converged and not published:
-        return by_severity([*hypotheses, failure, *_rejections(estimate, limits)])
+        return by_severity([*hypotheses, failure, *rejections(estimate, limits)])
     directions = weak_directions(quantities, estimate.covariance, advise)
-    found = [*directions, *hypotheses, *([] if estimate.converged else [failure])]
+    found = [*directions, *contradictions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
         found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
-        found += [*_rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
+        found += [*rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
         found += _slow_errors(estimate, quantities)
     found += misfits(estimate.chi_square, estimate.levels, limits)
     if any(finding.severity == WEAK for finding in directions):
@@ -99,12 +101,12 @@ def is_suspect(estimate: Estimate, findings: Sequence[Finding], limits: Threshol
 
 
 def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity], limits: Thresholds) -> Iterator[Finding]:
-    """Nuisance parameters, worst first, inseparable ones as one.
+    """Nuisance parameters and those of a prior tighter than usual, worst first, inseparable ones as one.
 
     Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
     """
     P, sigma, x = estimate.covariance, estimate.sigmas, estimate.values
-    nuisance = [j for j, q in enumerate(quantities) if q.assumed and sigma[j] > 0.0]
+    nuisance = [j for j, q in enumerate(quantities) if (q.assumed or q.tight) and sigma[j] > 0.0]
     z = {j: prior_z_score(quantities[j], x[j], sigma[j], estimate.inflations[j]) or 0.0 for j in nuisance}
     left = sorted((j for j in nuisance if abs(z[j]) > limits.prior_z), key=lambda j: -abs(z[j]))
     while left:
@@ -124,7 +126,7 @@ def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity], limits: 
     z = {
         j: float((estimate.values[j] - q.prior_mean) / q.prior_sigma)
         for j, q in enumerate(quantities)
-        if q.prior_sigma and not q.assumed
+        if q.prior_sigma and not (q.assumed or q.tight)
     }
     for j in sorted(z, key=lambda j: -abs(z[j])):
         if abs(z[j]) > limits.far_from_prior:
@@ -139,7 +141,8 @@ def _prior_conflict(
     return Finding("prior_conflict", severity, evidence)
 
 
-def _rejections(estimate: Estimate, limits: Thresholds) -> list[Finding]:
+def rejections(estimate: Estimate, limits: Thresholds = DEFAULT) -> list[Finding]:
+    """Families of which more is rejected than outliers are, the largest share first."""
     every = {f: r.used for f, r in estimate.residuals.items() if len(r.used) >= limits.min_few}
     least = {
         f: limits.rejected_note if len(used) >= limits.min_family else limits.rejected_few for f, used in every.items()

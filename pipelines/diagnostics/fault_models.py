@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -66,8 +66,6 @@ class FaultModel:
     Attributes:
         streams: stamps -> what carries them.
         signs: readings (n,) or (n, k) -> how people call them, and their columns.
-        offset: whether the method has a parameter `time_offset`.
-        delays: other parameters that are delays -> the fault in words, with the parameter's name in braces.
         clock: stamps that may be late, and how people call their source.
         scalings: numbers of the config that may be off by a factor.
         faults: of other kinds.
@@ -77,8 +75,6 @@ class FaultModel:
 
     streams: Mapping[str, Sequence[str]]
     signs: Mapping[str, tuple[str, Sequence[str]]]
-    offset: bool = False
-    delays: Mapping[str, str] = field(default_factory=dict)
     clock: tuple[str, str] | None = None
     scalings: Sequence[ScaleFactor] = ()
     faults: Sequence[DataFault] = ()

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from alidade.pipelines import parallel
-from alidade.pipelines.diagnostics.diagnose import DEFAULT
+from alidade.pipelines.diagnostics.diagnose import rejections
 from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.observability import rejects_many
 from alidade.pipelines.diagnostics.trial_cases import TrialCase, data_faults, trial_cases
 from alidade.pipelines.diagnostics.trial_fit import Build, TrialFit, max_concurrent, score_trial, solve_trial
 from alidade.pipelines.estimation.finding import Finding, Severity
@@ -47,7 +48,12 @@ _Tested = tuple[TrialFit, str]
 
 
 def find_hypotheses(
-    build: Build, model: FaultModel, data: Any, config: Config, estimate: Estimate | None = None
+    build: Build,
+    model: FaultModel,
+    data: Any,
+    config: Config,
+    estimate: Estimate | None = None,
+    freed: Config | None = None,
 ) -> tuple[Finding, ...]:
     """Faults with whose correction a recording fits that does not as it is, the best fit first.
 
@@ -57,6 +63,7 @@ def find_hypotheses(
         data: as read.
         config: of the recording.
         estimate: its calibration, by whose residuals the worst segment is chosen; None: the whole is used.
+        freed: the config with what the recording contradicts in it free: a fault has to explain more than that does.
     """
     known = config.noise_known == 0.0
     # With the noise as stated: levels that are estimated hide what is looked for.
@@ -64,7 +71,10 @@ def find_hypotheses(
     if estimate is not None and model.cut and estimate.residuals:
         data = model.segment(data, *_worst_segment(estimate.residuals, _SEGMENT_S))
     before = solve_trial(build, data, config)
-    if before is None or (before.fits and not _rejects_many(before.estimate)):
+    if before is None or (before.fits and not rejects_many(rejections(before.estimate))):
+        return ()
+    without = None if freed is None else solve_trial(build, data, freed.model_copy(update={"noise_known": 0.0}))
+    if without is not None and without.fits and not rejects_many(rejections(without.estimate)):
         return ()
     concurrent = max_concurrent(model.times(data))
     found = _explaining(build, _promising(build, model, data, config, before), before, concurrent)
@@ -75,13 +85,9 @@ def find_hypotheses(
         found = [each for each in fallback if each[0].fits]
     if not found and known:
         found = _noise(build, data, config)
+    if without is not None:
+        found = [each for each in found if each[0].cost < without.cost]
     return _findings(before, found[:_MAX_REPORTED])
-
-
-def _rejects_many(estimate: Estimate) -> bool:
-    """Whether so much of a family is rejected that these can be no outliers."""
-    shares = (np.mean(~r.used) for r in estimate.residuals.values() if len(r.used) >= DEFAULT.min_family)
-    return bool(max(shares, default=0.0) > DEFAULT.rejected)
 
 
 def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]:
@@ -114,7 +120,7 @@ def _explaining(build: Build, cases: Iterable[TrialCase], before: TrialFit, conc
     works = [partial(solve_trial, build, case.data, case.config, case.label) for case in cases]
     for case, after in zip(cases, parallel.done(works, _WHAT, concurrent), strict=True):
         if after is not None and _explains(before, after):
-            found.append((after, _with_delays(case.label, after)))
+            found.append((after, case.label))
     # Corrections that fit alike are weighed by their priors: a mount that is likely before one that is not.
     return sorted(found, key=lambda each: each[0].cost_with_priors / max(each[0].dof, 1.0))
 
@@ -142,12 +148,6 @@ def _worst_segment(residuals: Mapping[str, Residuals], length: float) -> tuple[f
     first = int(np.argmax(total[ends] - total[: len(time)]))
     start = max(min(time[first], time[-1] - length), time[0])
     return float(start) - 0.1, float(start) + length + 0.1
-
-
-def _with_delays(label: str, after: TrialFit) -> str:
-    """The label with the estimated delays, which stand in it by name."""
-    found = zip(after.estimate.names, after.estimate.values, after.estimate.sigmas, strict=True)
-    return label.format(**{name: f"{1e3 * value:.3g} ± {1e3 * sigma:.2g} ms" for name, value, sigma in found})
 
 
 def _explains(before: TrialFit, after: TrialFit) -> bool:

@@ -44,10 +44,25 @@ def verdict(quantity: Quantity, sigma: float) -> Verdict:
     return "unobservable" if unchanged else "weak"
 
 
-def verdicts(quantities: Sequence[Quantity], covariance: Array) -> dict[str, Verdict]:
-    """Parameter -> verdict, of those with a required accuracy; covariance (n, n) in the order of the quantities."""
-    sigmas = np.sqrt(np.diag(covariance)).tolist()
-    return {q.name: verdict(q, sigma) for q, sigma in zip(quantities, sigmas, strict=True) if q.judged}
+def verdicts(quantities: Sequence[Quantity], covariance: Array, findings: Sequence[Finding] = ()) -> dict[str, Verdict]:
+    """Parameter -> verdict, of those with a required accuracy; covariance (n, n) in the order of the quantities.
+
+    Of a solution that rejected more than a quarter of a family, as its findings have it, nothing is `observable`: what
+    is left are the measurements that agree with it.
+    """
+    sigmas, doubtful = np.sqrt(np.diag(covariance)).tolist(), rejects_many(findings)
+    found = {q.name: verdict(q, sigma) for q, sigma in zip(quantities, sigmas, strict=True) if q.judged}
+    return {name: "weak" if doubtful and each == "observable" else each for name, each in found.items()}
+
+
+def rejects_many(findings: Sequence[Finding]) -> bool:
+    """Whether so much of a family is rejected, in one of the recordings, that these are no outliers."""
+    return any(
+        rejects_many(each.evidence["findings"])
+        if each.kind == "recording"
+        else each.kind == "rejection" and each.severity == Severity.INCONSISTENT
+        for each in findings
+    )
 
 
 def finite_covariance(quantities: Sequence[Quantity], covariance: Array) -> Array:

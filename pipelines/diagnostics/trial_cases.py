@@ -14,8 +14,6 @@ from alidade.pipelines.diagnostics.fault_models import FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.trial_fit import Build, score_trial, solve_trial
 from alidade.pipelines.settings import Config
 
-_OFFSET = "time_offset"
-_DELAY_PRIOR = 0.05
 # Stamps are moved by this much first, s, and numbers scaled by this much; then so many times to the bottom of a
 # parabola.
 _FIRST_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 0.01, 5e-3, 4
@@ -36,7 +34,7 @@ def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> I
     yield from inverted_signs(model, data, config)
     yield from axis_orders(model, data, config)
     yield from units(model, data, config)
-    yield from delays(build, model, data, config)
+    yield from late_stamps(build, model, data, config)
     yield from scale_factors(build, model, data, config)
 
 
@@ -95,11 +93,8 @@ def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
                 yield TrialCase(label, replace(data, **{name: changed}), config)
 
 
-def delays(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """Delays as parameters with wide priors, or the stamps that may be late moved to where residuals are smallest."""
-    known = {_OFFSET: "a time offset of {time_offset} is taken for known"} if model.offset else {}
-    for name, label in {**known, **model.delays}.items():
-        yield TrialCase(label, data, config.model_copy(update={"priors": {**config.priors, name: _DELAY_PRIOR}}))
+def late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
+    """The stamps that may be late moved to where residuals are smallest."""
     if model.clock is None:
         return
     stamps, source = model.clock

@@ -19,7 +19,10 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "hypothesis": ("label", "chi_square_before", "chi_square_after", "dof", "equivalents"),
     # Effect: required parameter -> shift if the parameter were at its prior mean.
     "prior_conflict": ("parameter", "value", "sigma", "z", "inseparable", "effect"),
-    "change": ("time_s", "steps"),  # parameter -> (step, sigma)
+    # A number that the config fixes, what it is stated to be and what it is freed alone; effect: parameter -> shift.
+    "contradiction": ("parameter", "unit", "stated", "value", "sigma", "z", "inseparable", "effect"),
+    "change": ("since_s", "time_s", "steps"),  # between both times; parameter -> (step, sigma)
+    "jump": ("since_s", "time_s", "size", "sigma"),  # of vision, by the mount or by the reference, rad
     "device_change": ("parameter", "step", "sigma", "recordings", "dates"),  # between two recordings
     "rejection": ("family", "share", "noise_factor"),  # with noise_factor times the noise all of it would fit
     "noise": (

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from alidade.factors.bridge import BoundModel
 from alidade.factors.model import Block, Model, Residuals
-from alidade.factors.vectorized import VectorizedFactor
 from alidade.pipelines.estimation.problem import Array
 
 
@@ -51,7 +51,7 @@ class LinearModel(Model):
         return sum(parts, start=-self.right), lambda: self.coefficients
 
 
-def linear_factor(blocks: Mapping[int, Array], origin: Mapping[int, Array], sigma: float) -> VectorizedFactor:
+def linear_factor(blocks: Mapping[int, Array], origin: Mapping[int, Array], sigma: float) -> BoundModel:
     """The measurement 0 = sum of blocks[key] (x[key] - origin[key]), with `sigma` in each of its m rows.
 
     The rows are divided by sigma here. With a noise model beside them gtsam's elimination would take any row whose

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.vectorized import VectorizedFactor
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.noise import Level
@@ -117,6 +117,11 @@ class Quantity:
         return self.nuisance or self.group is not None
 
     @property
+    def tight(self) -> bool:
+        """Whether its prior is tighter than the usual one, so that somebody states it."""
+        return 0.0 < (self.prior_sigma or 0.0) < self.prior_scale
+
+    @property
     def judged(self) -> bool:
         """Whether an accuracy is wanted of it, so that there is a verdict."""
         return math.isfinite(self.require)
@@ -168,17 +173,17 @@ class Factor:
 
     family: str
     native: gtsam.NonlinearFactor | None = None
-    measurement: VectorizedFactor | None = None
-    process: VectorizedFactor | None = None
+    measurement: BoundModel | None = None
+    process: BoundModel | None = None
     beside: Array | None = None
 
     @classmethod
-    def of(cls, family: str, measurement: VectorizedFactor, beside: Array | None = None) -> Factor:
+    def of(cls, family: str, measurement: BoundModel, beside: Array | None = None) -> Factor:
         """A measurement that may be an outlier."""
         return cls(family, measurement=measurement, beside=beside)
 
     @classmethod
-    def process_of(cls, family: str, process: VectorizedFactor, beside: Array | None = None) -> Factor:
+    def process_of(cls, family: str, process: BoundModel, beside: Array | None = None) -> Factor:
         """What joins variables and is no outlier."""
         return cls(family, process=process, beside=beside)
 
@@ -187,23 +192,23 @@ class Factor:
         """For a gtsam graph; of a vectorised factor a new one at every call."""
         if self.native is not None:
             return self.native
-        vectorized = self.vectorized
-        assert vectorized is not None
-        return vectorized.factor
+        bound = self.bound
+        assert bound is not None
+        return bound.factor
 
     @property
     def keys(self) -> list[int]:
         """The variables."""
-        return list(self.factor.keys()) if self.vectorized is None else self.vectorized.keys
+        return list(self.factor.keys()) if self.bound is None else self.bound.keys
 
     @property
-    def vectorized(self) -> VectorizedFactor | None:
+    def bound(self) -> BoundModel | None:
         """The vectorised factor behind it, whichever it is."""
         return self.measurement or self.process
 
     def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
         """About the values."""
-        return self.factor.linearize(values) if self.vectorized is None else self.vectorized.linearized(values)
+        return self.factor.linearize(values) if self.bound is None else self.bound.linearized(values)
 
 
 def _no_values() -> gtsam.Values:
@@ -293,7 +298,7 @@ class Problem:
             other minima. None: the method has no such.
         layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
-        may_step: variable that may change at one moment, as a mount that slips; None: none is looked at.
+        may_step: rotations that may change at one moment, as a mount that slips.
         finer: the graph for noise levels, where keyframes stand closer than in this one; None: where this one serves.
         beliefs: joint priors from elsewhere than data sheets; the last one about a number is in force.
     """
@@ -317,7 +322,7 @@ class Problem:
     elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
     layout: ChainLayout | None = None
     marginal_likelihood: bool = False
-    may_step: int | None = None
+    may_step: tuple[int, ...] = ()
     finer: Callable[[Sequence[Level]], Problem | None] | None = None
     beliefs: tuple[Belief, ...] = ()
 
@@ -491,21 +496,48 @@ class Minimum:
     chi_square: float
 
 
+# Chi-square of three numbers beyond which a step by motion alone is another one than with the chain: one in a hundred.
+APART = 11.345
+
+
 @dataclass(frozen=True)
 class StepEstimate:
-    """The step of some parameters, at one moment of a recording, that explains it best.
+    """A step of some parameters, at one moment of a recording, that explains it.
 
     Attributes:
-        time_s: when, s.
+        time_s, since_s: of the first measurement after it, and of the last one before, s.
         steps: parameter -> its step and the sigma of that, SI.
-        fall: of -2 log L with the step and noise levels found anew.
-        ratio: of sandwich to nominal sigmas with the step, the largest of its parameters, at least 1.
+        size, sigma: of the step as a rotation, rad.
+        fall: of -2 log L with the step and noise levels found anew, less what a wide prior of it pays.
+        by_motion: chi-square of the step by motion alone: the attitude is free to jump with it.
+        apart: chi-square of the difference of both steps.
+        ratio: of sandwich to nominal sigmas, the largest of any direction of both, at least 1.
+        ratio_by_motion: the same by motion alone.
     """
 
     time_s: float
+    since_s: float
     steps: Mapping[str, tuple[float, float]]
+    size: float
+    sigma: float
     fall: float
+    by_motion: float
+    apart: float
     ratio: float
+    ratio_by_motion: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both are the same step: but for chance, or by more than half of what motion alone shows.
+
+        What the reference errs slowly moves both, and is more than chance where the step itself is large.
+        """
+        return self.apart <= max(APART * self.ratio_by_motion**2, 0.25 * self.by_motion)
+
+    @property
+    def statistic(self) -> float:
+        """Chi-square: the smaller of both tests where they agree."""
+        return min(self.fall, self.by_motion) / self.ratio**2 if self.agrees else 0.0
 
 
 # Ratio of sandwich to nominal sigmas from which on it counts: over 25 blocks chance makes 1.3 in one of a hundred.
@@ -539,7 +571,7 @@ class Estimate:
         sandwich: (n,) ratio of sandwich to nominal sigma, at least 1, where noise levels maximise the likelihood: what
             errs slowly and is no noise of the model makes it large. Above SLOW_ERROR it is in the covariance. None: not
             looked for.
-        step: the step that explains the recording best, where noise levels maximise the likelihood: levels hide steps.
+        steps: those that explain the recording best, the most significant first; None: not looked for.
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
         told: what the graph says without the device's priors; None: not asked for.
         second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
@@ -567,7 +599,7 @@ class Estimate:
     colours: Mapping[str, float] = field(default_factory=dict)
     inflation: Array | None = None
     sandwich: Array | None = None
-    step: StepEstimate | None = None
+    steps: tuple[StepEstimate, ...] | None = None
     told: Told | None = None
     second: Minimum | None = None
     concluded: bool = False

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.display.table import Table
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration

@@ -36,6 +36,7 @@ COMMON: Mapping[str, str] = {
     r"(accel|gyro|mag)_k([123])\2": "{0} gain, {1}.",
     r"(accel|gyro|mag)_k([123])([123])": "{0} cross-axis term ({2} into {1}).",
     r"(accel|gyro|mag)_b([123])": "{0} offset, {1} (after K).",
+    r"accel_square_([123])": "Accelerometer quadratic nonlinearity, {0}.",
     r"accel_arm_([xyz])": "Lever arm from the point of rotation to the accelerometer, {0}.",
     r"field_([enu])": "Local magnetic field, {0} component.",
     r"field_strength": "Strength of the local magnetic field.",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from alidade.factors.earth import magnetic_field
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.assumptions import Assumption
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import Topic, wanted
 from alidade.pipelines.settings import Config, first_given
 

@@ -10,8 +10,7 @@ from alidade.pipelines.estimation.assumptions import Assumption, parameter
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
-from alidade.pipelines.recording.reading import Recording
-from alidade.pipelines.recording.temperature import Temperature, read_temperature
+from alidade.pipelines.recording.streams import StreamReader, Temperature
 from alidade.pipelines.recording.topics import TEMPERATURE, wanted
 from alidade.pipelines.settings import Config
 
@@ -19,16 +18,14 @@ from alidade.pipelines.settings import Config
 FIRST = "first_temperature"
 
 
-def read(
-    recording: Recording, config: Config, slopes: Sequence[Assumption], sensor_t: Array, dropped: dict[str, int]
-) -> Temperature | None:
-    """That of a recording; None without the topic, and where the config fixes all slopes over it.
+def read(reader: StreamReader, config: Config, slopes: Sequence[Assumption], sensor_t: Array) -> Temperature | None:
+    """Temperature of a sensor with samples at sensor_t (N,), s; None without the topic, or if all slopes are fixed.
 
-    Raises InputError as alidade.pipelines.recording.temperature does.
+    Raises InputError as StreamReader.temperature does.
     """
-    if not wanted(recording, config, TEMPERATURE) or parameter(0, slopes, config) is None:
+    if not wanted(reader.recording, config, TEMPERATURE) or parameter(0, slopes, config) is None:
         return None
-    return read_temperature(recording, config.topic(TEMPERATURE), sensor_t, dropped)
+    return reader.temperature(config.topic(TEMPERATURE), sensor_t)
 
 
 def reference(temperature: Temperature | None) -> float | None:

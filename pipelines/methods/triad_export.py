@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from io import StringIO
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.triads import TRIADS, triad_of
 from alidade.pipelines.reports.calibration import SavedCalibration
 
@@ -136,8 +136,6 @@ def _ros2(saved: SavedCalibration) -> str:
 
     Where noise was measured, the covariance that its messages may state: of one sample, calibrated, by rows.
     """
-    from ruamel.yaml import YAML
-
     noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
     parameters: dict[str, dict[str, list[float]]] = {}
     for name, (K, b) in _triads(saved).items():
@@ -145,13 +143,9 @@ def _ros2(saved: SavedCalibration) -> str:
         if name in noise and min(noise[name]["density"]) > 0.0:
             variance = noise[name]["rate_hz"] * np.square(noise[name]["density"])
             parameters[name]["covariance"] = [float(x) for x in np.diag(variance).ravel()]
-    text = StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.dump({"/**": {"ros__parameters": parameters}}, text)
     return (
         "# calibrated = gain raw + bias, gain a 3x3 matrix by rows; covariance, by rows, of one calibrated sample\n"
-        + text.getvalue()
+        + dump_yaml({"/**": {"ros__parameters": parameters}})
     )
 
 

@@ -72,7 +72,7 @@ def clean(
     in_file = t_ns[keep]
     backward = int(np.count_nonzero(in_file < np.maximum.accumulate(in_file)))
     keep = keep[np.argsort(in_file, kind="stable")]
-    copies = _copies(t_ns[keep], taken(values, keep))
+    copies = _copies(t_ns[keep], take_rows(values, keep))
     count(dropped, f"{topic}{COPIED}", int(np.count_nonzero(copies)))
     keep = keep[~copies]
     stamps = t_ns[keep]
@@ -127,7 +127,7 @@ def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
     return None
 
 
-def taken(values: Array, rows: NDArray[np.int64]) -> Array:
+def take_rows(values: Array, rows: NDArray[np.int64]) -> Array:
     """Rows of an array; of the array itself where they are all, or where it never changes and takes no memory."""
     if values.strides[0] == 0:
         return np.broadcast_to(values[0], (len(rows), *values.shape[1:]))

@@ -1,218 +1,339 @@
-"""Many messages of one topic into columns, all at once where they are alike."""
+"""Messages of one channel into columns, all at once where they are laid out alike, and one by one where they are not.
+
+Messages in ROS' own encodings are decoded as they are; protobuf, JSON and Foxglove's types are translated into CDR of
+the ROS 2 type first, so that there is one decoder. The time of a message is its header stamp. Log times stand in where
+a topic has none; where only few messages lack one (sent before a clock was there) they are left out.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.recording.container import Rows
-from alidade.pipelines.recording.mcap_records import windows
-from alidade.pipelines.recording.messages import Array, Definition, Layout, Leaf, MessageError, Wire, at
+from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording.container import Channel, MessageBlock, Schema, byte_windows
+from alidade.pipelines.recording.messages import Array, Definition, Language, Layout, Leaf, MessageError, Wire, at
+from alidade.pipelines.recording.translation import Translation, is_foxglove, ros_type
 
-# Which numbers of a field, as indexes, given the message; None if the message has not got them.
+# Indexes of the numbers of a field that are meant, given the message; None if it does not have them.
 Order = Callable[[Any], Sequence[int] | None]
-
-# Stamps and log times, ns, in the file's order.
+# Stamps and log times (N,), Unix ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
-
 Stamps = NDArray[np.int64]
 
-# Up to so many messages of a topic without a stamp are left out; of more the log times are taken.
-_FEW_UNSTAMPED = 0.1
-# What every message with a header starts with: CDR encapsulation, in ROS 1 a sequence number; then the stamp.
+# Message and schema encoding as ROS 2 records.
+ENCODING = "cdr/ros2msg"
+# Encoding of the messages and of their definitions -> byte layout, and language of the definitions.
+_ROS: dict[str, tuple[Wire, Language]] = {
+    ENCODING: ("cdr", "msg"),
+    "cdr/ros2idl": ("cdr", "idl"),
+    "ros1/ros1msg": ("ros1", "msg"),
+}
+_TRANSLATED = ("protobuf/protobuf", "json/jsonschema")
+READABLE = (*_ROS, *_TRANSLATED)
+# Encoding that is not read -> how to get one that is.
+_CONVERSIONS = {
+    "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
+    "the messages as JSON, which `flatc --json --raw-binary` makes of each with its .fbs, into another MCAP file",
+}
+# Largest share of messages without a stamp that are left out; where there are more, log times stand in for all of them.
+MAX_UNSTAMPED_SHARE = 0.1
+# Layouts of a topic's messages (they differ in frame names, say) that are decoded at once; others one by one.
+_MAX_LAYOUTS = 8
+# Largest message of numbers, bytes; usual ones have some hundred.
+MAX_NUMERIC_BYTES = 1 << 20
+# What a message with a header begins with: CDR encapsulation, in ROS 1 a sequence number; then the stamp.
 _STAMP = {
     order: np.dtype([("kind", "u1", 2), ("options", "u1", 2), ("sec", f"{order}i4"), ("nanosec", f"{order}u4")])
     for order in "<>"
 }
+_COLUMNS: Mapping[str, Mapping[str, series.Column]] = {
+    name: columns
+    for kind in (
+        series.ImuSeries,
+        series.MagneticSeries,
+        series.VectorSeries,
+        series.QuaternionSeries,
+        series.PoseSeries,
+        series.FixSeries,
+        series.TemperatureSeries,
+    )
+    for name, columns in ({kind.TYPE: kind.COLUMNS} | kind.OTHERS).items()
+}
+# Message types that become columns.
+NUMERIC_TYPES = {*_COLUMNS, messages.JOINT_STATE}
 
-# A topic with more kinds of messages than this (frame names, say) has its further ones decoded one by one.
-_MAX_LAYOUTS = 8
-# Bytes; messages of numbers have some hundred.
-_LARGEST = 1 << 20
 
+class DecodedMessage(NamedTuple):
+    """One message: its time, Unix ns, whether that is its log time, its content, the definition of its type."""
 
-class Table:
-    """Columns filled from the messages of a topic, step by step. One whose values never change takes no memory."""
-
-    def __init__(self, rows: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        self.filled = np.zeros(rows, dtype=bool)
-        self._t_ns = np.zeros(rows, dtype=np.int64)
-        self._log_ns = np.zeros(rows, dtype=np.int64)
-        self._shapes = shapes
-        self._frame = np.zeros(rows, dtype=np.int32)
-        self._frames: dict[str, int] = {}
-        self._constant: dict[str, Array] = {}
-        self._full: dict[str, Array] = {}
-        self._next = 0
-
-    def advance(self, log_ns: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Take up the next messages: their log times, and their stamps (0: none). Returns their row numbers."""
-        new = slice(self._next, self._next + len(log_ns))
-        self._next = new.stop
-        self._log_ns[new], self._t_ns[new] = log_ns, t_ns
-        if not self._shapes:
-            self.filled[new] = True
-        return np.arange(new.start, new.stop)
-
-    def put(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]], frame: str = "") -> None:
-        """Fill these rows, in order: (rows, numbers) for every column, all of one frame. KeyError at another width."""
-        # Rows that follow each other are written in half the time.
-        first, last = int(rows[0]), int(rows[-1])
-        where = slice(first, last + 1) if last - first == len(rows) - 1 else rows
-        for name, column in values.items():
-            self._put(name, where, column)
-        self.filled[where] = True
-        self._frame[where] = self._frames.setdefault(frame, len(self._frames))
-
-    def frames(self) -> dict[str, NDArray[np.bool_]]:
-        """Frames of the messages and the rows, of those filled, that have them; where they are mixed, more than one."""
-        found = {name: self.filled & (self._frame == i) for name, i in self._frames.items()}
-        return {name: rows for name, rows in found.items() if rows.any()}
-
-    def keep(self, rows: NDArray[np.bool_]) -> None:
-        """Let go of all other rows."""
-        self.filled &= rows
-
-    @property
-    def taken(self) -> int:
-        """Messages taken up so far: rows beyond them are those of damaged chunks."""
-        return self._next
-
-    def drop_unstamped(self) -> int:
-        """Let go of the rows without a stamp where they are few; returns how many they are."""
-        few = few_unstamped(self._t_ns[: self._next], self._log_ns[: self._next])
-        self.filled[: self._next] &= ~few
-        return int(np.count_nonzero(few))
-
-    def times(self, filled: bool = True) -> Times:
-        """Stamps, log times where there are none, and log times of the rows that were filled, or of all taken up."""
-        rows: Any = self.filled if filled and not self.filled.all() else slice(self._next)
-        return with_log_times(self._t_ns[rows], self._log_ns[rows])
-
-    def sorted(self) -> tuple[NDArray[np.int64], int, dict[str, Any]]:
-        """Stamps, how many of them are log times, and the columns, of the rows that were filled, by log time."""
-        by_log = is_unstamped(self._t_ns, self._log_ns) & self.filled
-        t_ns = np.where(by_log, self._log_ns, self._t_ns)
-        keep: Any = slice(None)
-        if not self.filled.all() or (np.diff(self._log_ns) < 0).any():
-            keep = np.argsort(self._log_ns, kind="stable")
-            keep = keep[self.filled[keep]]
-        t_ns = t_ns[keep]
-        columns = {
-            name: self._full[name][keep]
-            if name in self._full
-            else np.broadcast_to(constant, (len(t_ns), len(constant)))
-            for name, constant in self._constant.items()
-        }
-        shaped = {name: column.reshape(len(t_ns), *self._shapes[name]) for name, column in columns.items()}
-        return t_ns, int(np.count_nonzero(by_log)), shaped
-
-    def _put(self, name: str, rows: slice | NDArray[np.int64], values: NDArray[Any]) -> None:
-        width = int(np.prod(self._shapes[name], dtype=int))
-        if values.shape[1] != width:
-            raise KeyError(f"{name}: {values.shape[1]} numbers instead of {width}")
-        constant = self._constant.setdefault(name, values[0].astype(float))
-        if name not in self._full:
-            if (values == constant).all():
-                return
-            self._full[name] = np.empty((len(self.filled), width))
-            self._full[name][:] = constant
-        self._full[name][rows] = values
+    t_ns: int
+    from_log_time: bool
+    content: Any
+    definition: Definition
 
 
 class _Plan(NamedTuple):
-    """Where the fields are in messages of a layout: a run of numbers, and their order. No layout: nowhere."""
+    """Runs of numbers of the fields in messages of a layout, with their order. No layout: decoded one by one."""
 
     layout: Layout | None
     fields: dict[str, tuple[Leaf, Any]]
     frame: str = ""
 
 
-class Decoder:
-    """Takes fields, name -> (path in the message, order of its numbers or None), out of the messages of one channel.
+class ColumnTable:
+    """Columns of a topic, filled block by block. A column whose values never change takes no memory.
 
-    A field the messages do not have is a KeyError or an AttributeError, a message that cannot be read a MessageError.
+    Args:
+        kind: message type, one of NUMERIC_TYPES.
+        count: largest number of messages.
+        joints: of a sensor_msgs/JointState those whose positions are read.
+
+    Attributes:
+        fields: column -> path of the field in a message, and the order of its numbers or None.
+        joint_names: names of joints met in the messages.
+        filled: (count,) rows that have values.
+        count: rows added: rows beyond them are messages of damaged chunks.
+        plans: channel -> layouts of its messages met so far.
     """
 
-    def __init__(self, definition: Definition, fields: Mapping[str, tuple[str, Order | None]]) -> None:
-        self._definition = definition
-        self._fields = fields
-        self._plans: list[_Plan] = []
+    def __init__(self, kind: str, count: int, joints: Sequence[str] = ()) -> None:
+        self.joint_names: dict[str, None] = {}
+        self.fields: dict[str, tuple[str, Order | None]]
+        if kind == messages.JOINT_STATE:
+            self._shapes: dict[str, tuple[int, ...]] = {"position": (len(joints),)}
+            self.fields = {"position": ("position", partial(self._joint_order, joints))}
+        else:
+            self._shapes = {name: column.shape for name, column in _COLUMNS[kind].items()}
+            self.fields = {name: (column.path, _constant(column.order)) for name, column in _COLUMNS[kind].items()}
+        self.filled = np.zeros(count, dtype=bool)
+        self.count = 0
+        self.plans: dict[int, list[_Plan]] = {}
+        self._t_ns = np.zeros(count, dtype=np.int64)
+        self._log_ns = np.zeros(count, dtype=np.int64)
+        self._frame = np.zeros(count, dtype=np.int32)
+        self._frames: dict[str, int] = {}
+        self._constant: dict[str, Array] = {}
+        self._varying: dict[str, Array] = {}
 
-    def append(self, rows: Rows, table: Table) -> None:
-        """Append the messages to the table; those for which an order is None stay unfilled."""
-        if not len(rows.start):
+    def add_rows(self, log_ns: Stamps, t_ns: Stamps) -> NDArray[np.int64]:
+        """Add messages with these log times and stamps (0: none), Unix ns. Returns their row numbers."""
+        new = slice(self.count, self.count + len(log_ns))
+        self.count = new.stop
+        self._log_ns[new], self._t_ns[new] = log_ns, t_ns
+        return np.arange(new.start, new.stop)
+
+    def fill(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]], frame: str = "") -> None:
+        """Fill increasing rows: column -> (rows, numbers), all of one frame. Raises KeyError at another width."""
+        # Rows that follow each other are written in half the time.
+        first, last = int(rows[0]), int(rows[-1])
+        where = slice(first, last + 1) if last - first == len(rows) - 1 else rows
+        for name, column in values.items():
+            self._fill_column(name, where, column)
+        self.filled[where] = True
+        self._frame[where] = self._frames.setdefault(frame, len(self._frames))
+
+    def frames(self) -> dict[str, NDArray[np.bool_]]:
+        """Frame -> the filled rows that have it."""
+        found = {name: self.filled & (self._frame == i) for name, i in self._frames.items()}
+        return {name: rows for name, rows in found.items() if rows.any()}
+
+    def drop_unstamped(self) -> int:
+        """Drop the rows without a stamp where they are few; returns their number."""
+        few = few_unstamped(self._t_ns[: self.count], self._log_ns[: self.count])
+        self.filled[: self.count] &= ~few
+        return int(np.count_nonzero(few))
+
+    def times(self, filled: bool = True) -> Times:
+        """Stamps, log times where there are none, and log times of the filled rows, or of all that were added."""
+        rows: Any = self.filled if filled and not self.filled.all() else slice(self.count)
+        return with_log_times(self._t_ns[rows], self._log_ns[rows])
+
+    def sorted(self) -> tuple[Stamps, int, dict[str, Any]]:
+        """Stamps, the number of them that are log times, and the columns; the filled rows by log time."""
+        from_log = is_unstamped(self._t_ns, self._log_ns) & self.filled
+        t_ns = np.where(from_log, self._log_ns, self._t_ns)
+        rows: Any = slice(None)
+        if not self.filled.all() or (np.diff(self._log_ns) < 0).any():
+            rows = np.argsort(self._log_ns, kind="stable")
+            rows = rows[self.filled[rows]]
+        t_ns = t_ns[rows]
+        columns = {
+            name: self._varying[name][rows]
+            if name in self._varying
+            else np.broadcast_to(constant, (len(t_ns), len(constant)))
+            for name, constant in self._constant.items()
+        }
+        shaped = {name: column.reshape(len(t_ns), *self._shapes[name]) for name, column in columns.items()}
+        return t_ns, int(np.count_nonzero(from_log)), shaped
+
+    def _fill_column(self, name: str, rows: slice | NDArray[np.int64], values: NDArray[Any]) -> None:
+        width = int(np.prod(self._shapes[name], dtype=int))
+        if values.shape[1] != width:
+            raise KeyError(f"{name}: {values.shape[1]} numbers instead of {width}")
+        constant = self._constant.setdefault(name, values[0].astype(float))
+        if name not in self._varying:
+            if (values == constant).all():
+                return
+            self._varying[name] = np.empty((len(self.filled), width))
+            self._varying[name][:] = constant
+        self._varying[name][rows] = values
+
+    def _joint_order(self, joints: Sequence[str], message: Any) -> list[int] | None:
+        self.joint_names.update(dict.fromkeys(map(str, message.name)))
+        if not set(joints) <= set(message.name) or len(message.position) != len(message.name):
+            return None
+        return [message.name.index(name) for name in joints]
+
+
+class MessageFormat:
+    """Encoding and type of a channel's messages.
+
+    Attributes:
+        type: name of the ROS 2 type, of translated messages that of the translation; as recorded where there is none.
+        encoding: of the messages and of their definitions, `cdr/ros2msg` in ROS 2.
+        is_readable: whether messages of this encoding and type are read.
+    """
+
+    def __init__(self, channel: Channel, schema: Schema | None) -> None:
+        self._schema = schema
+        self.encoding = f"{channel.message_encoding}/{schema.encoding if schema else ''}"
+        self._recorded_type = schema.name if schema else ""
+        self._wire: Wire | None
+        self._language: Language
+        self._wire, self._language = _ROS.get(self.encoding, (None, "msg"))
+        if self._wire == "ros1":
+            self._recorded_type = _ros2_name(self._recorded_type)
+        is_ros = self.encoding not in _TRANSLATED and not (self._wire and is_foxglove(self._recorded_type))
+        translated = None if is_ros else ros_type(self._recorded_type)
+        self._is_translated = translated is not None
+        self.type = translated or self._recorded_type
+        self.is_readable = self._wire is not None or self._is_translated
+
+    @property
+    def advice(self) -> str:
+        """How to get an encoding that is read in place of this one, as the end of a sentence; may be empty."""
+        return f": {_CONVERSIONS[self.encoding]}" if self.encoding in _CONVERSIONS else ""
+
+    @cached_property
+    def definition(self) -> Definition:
+        """Definition of the type. Raises MessageError where it cannot be used."""
+        return messages.known(self.type) if self._is_translated else self._recorded
+
+    def stamps(self, block: MessageBlock) -> Stamps:
+        """Header stamps, Unix ns: 0 where there is none; the log times of messages that are not read."""
+        if not self.is_readable:
+            return block.log_ns
+        try:
+            return self._header_stamps(self._translated(block))
+        except MessageError:
+            return block.log_ns
+
+    def append(self, block: MessageBlock, table: ColumnTable) -> None:
+        """Append messages to the table; those that lack one of its joints stay unfilled.
+
+        Raises KeyError or AttributeError at a field that the messages do not have, and MessageError.
+        """
+        if not len(block.start):
             return
-        largest = int(np.argmax(rows.size))
-        if rows.size[largest] > _LARGEST:
-            with logged_at(int(rows.log_ns[largest])):
-                raise MessageError(f"a message of {rows.size[largest]} bytes, which is no {self._definition.name}")
-        into = table.advance(rows.log_ns, header_stamps(self._definition.has_header, rows, self._definition.wire))
-        left = np.arange(len(into) if self._fields else 0)
-        for plan in self._plans:
-            left = left[~self._append_alike(plan, rows, left, table, into)]
-        while len(left) and len(self._plans) < _MAX_LAYOUTS:
-            with logged_at(int(rows.log_ns[left[0]])):
-                self._plans.append(self._plan(rows.message(left[0])))
-            left = left[~self._append_alike(self._plans[-1], rows, left, table, into)]
+        block = self._translated(block)
+        largest = int(np.argmax(block.size))
+        if block.size[largest] > MAX_NUMERIC_BYTES:
+            with at_log_time(int(block.log_ns[largest])):
+                raise MessageError(f"a message of {block.size[largest]} bytes, which is no {self.definition.name}")
+        rows = table.add_rows(block.log_ns, header_stamps(self.definition.has_header, block, self.definition.wire))
+        plans = table.plans.setdefault(block.channel, [])
+        left = np.arange(len(rows))
+        for plan in plans:
+            left = left[~_append_alike(plan, block, left, table, rows)]
+        while len(left) and len(plans) < _MAX_LAYOUTS:
+            with at_log_time(int(block.log_ns[left[0]])):
+                plans.append(self._plan(block.message(left[0]), table))
+            left = left[~_append_alike(plans[-1], block, left, table, rows)]
         for i in left.tolist():
-            with logged_at(int(rows.log_ns[i])):
-                message = self._definition.decode(rows.message(i))
-                values = self._one(message)
+            with at_log_time(int(block.log_ns[i])):
+                message = self.definition.decode(block.message(i))
+                values = self._values(message, table)
             if values is not None:
-                table.put(into[i : i + 1], values, _frame_of(message))
+                table.fill(rows[i : i + 1], values, _frame(message))
 
-    def _plan(self, data: bytes) -> _Plan:
-        """Work out the layout of a message and where in it the fields are."""
-        layout = self._definition.layout(data)
+    def decode(self, block: MessageBlock) -> Iterator[DecodedMessage]:
+        """Messages one by one. Raises MessageError."""
+        definition, block = self.definition, self._translated(block)
+        stamps = header_stamps(definition.has_header, block, definition.wire)
+        absent = is_unstamped(stamps, block.log_ns)
+        t_ns = np.where(absent, block.log_ns, stamps)
+        for i, (stamp, log_ns) in enumerate(zip(t_ns.tolist(), block.log_ns.tolist(), strict=True)):
+            with at_log_time(log_ns):
+                content = definition.decode(block.message(i))
+            yield DecodedMessage(stamp, bool(absent[i]), content, definition)
+
+    @cached_property
+    def _recorded(self) -> Definition:
+        """The recorded definition, in ROS."""
+        assert self._schema is not None
+        assert self._wire is not None
+        text = self._schema.data.decode(errors="replace") or messages.definition_text(self._recorded_type)
+        language = self._language if self._schema.data else "msg"
+        found = messages.definition(self._recorded_type, text, self._wire, language)
+        found.check()
+        return found
+
+    @cached_property
+    def _has_header(self) -> bool:
+        """Whether messages begin with a header: by the text alone where there is one, which may be no definition."""
+        if not self._is_translated and self._language == "msg" and self._schema is not None and self._schema.data:
+            return messages.has_header(self._schema.data.decode(errors="replace"))
+        return self.definition.has_header
+
+    def _header_stamps(self, block: MessageBlock) -> Stamps:
+        return header_stamps(self._has_header, block, "cdr" if self._is_translated else self._wire or "cdr")
+
+    @cached_property
+    def _translation(self) -> Translation:
+        assert self._schema is not None
+        return Translation(self._schema if self._wire is None else self._recorded, self.definition)
+
+    def _translated(self, block: MessageBlock) -> MessageBlock:
+        """The messages as `definition` defines them. Raises MessageError at one that cannot be translated."""
+        if not self._is_translated:
+            return block
+        translated = []
+        for i, log_ns in enumerate(block.log_ns.tolist()):
+            with at_log_time(log_ns):
+                translated.append(self._translation(block.message(i)))
+        return MessageBlock.pack(block.channel, translated, block.log_ns)
+
+    def _plan(self, data: bytes, table: ColumnTable) -> _Plan:
+        """Layout of a message and the places of the table's fields in it."""
+        layout = self.definition.layout(data)
         if layout is None:
             return _Plan(None, {})
-        message = self._definition.decode(data)
-        orders = {name: order(message) if order else slice(None) for name, (_, order) in self._fields.items()}
+        message = self.definition.decode(data)
+        orders = {name: order(message) if order else slice(None) for name, (_, order) in table.fields.items()}
         if None in orders.values():
             return _Plan(None, {})
-        runs = {name: (layout.run(path), orders[name]) for name, (path, _) in self._fields.items()}
-        return _Plan(layout, runs, _frame_of(message))
+        runs = {name: (layout.run(path), orders[name]) for name, (path, _) in table.fields.items()}
+        return _Plan(layout, runs, _frame(message))
 
-    def _append_alike(
-        self, plan: _Plan, rows: Rows, left: NDArray[np.int64], table: Table, into: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
-        """Append those of the messages `left` that have the layout, all at once. Returns which ones those are."""
-        if plan.layout is None or not len(left):
-            return np.zeros(len(left), dtype=bool)
-        size = len(plan.layout.first)
-        alike = rows.size[left] == size
-        data = windows(rows.buffer, size)[rows.start[left[alike]]].view(np.uint8).reshape(-1, size)
-        agrees = plan.layout.agrees(data)
-        alike[alike] = agrees
-        data = data if agrees.all() else data[agrees]
-        if len(data):
-            values = {name: run.of(data)[:, order] for name, (run, order) in plan.fields.items()}
-            table.put(into[left[alike]], values, plan.frame)
-        return alike
-
-    def _one(self, message: Any) -> dict[str, NDArray[Any]] | None:
+    def _values(self, message: Any, table: ColumnTable) -> dict[str, NDArray[Any]] | None:
         values = {}
-        for name, (path, order) in self._fields.items():
+        for name, (path, order) in table.fields.items():
             chosen = order(message) if order else slice(None)
             if chosen is None:
                 return None
-            values[name] = self._definition.numbers(at(message, path))[None, chosen]
+            values[name] = self.definition.numbers(at(message, path))[None, chosen]
         return values
 
 
-def _frame_of(message: Any) -> str:
-    """The frame in a message's header, empty where it has none."""
-    return str(getattr(getattr(message, "header", None), "frame_id", "")).lstrip("/")
-
-
 @contextmanager
-def logged_at(log_ns: int) -> Iterator[None]:
-    """Notes the log time of the message that cannot be read in the error that says so."""
+def at_log_time(log_ns: int) -> Iterator[None]:
+    """Note the log time of the message in a MessageError about it."""
     try:
         yield
     except MessageError as error:
@@ -221,29 +342,29 @@ def logged_at(log_ns: int) -> Iterator[None]:
 
 
 def is_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
-    """Which messages have no stamp: zero, but for those that were logged at zero, too, as rows of a table are."""
+    """Messages without a stamp: it is zero, and they were not logged at zero, as rows of a table may be."""
     return np.asarray((stamps == 0) & (log_ns != 0))
 
 
 def few_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
-    """The messages without a stamp where they are few among others: sent before a clock was there. Otherwise none."""
+    """Messages without a stamp where they are at most MAX_UNSTAMPED_SHARE of all; otherwise none."""
     without = is_unstamped(stamps, log_ns)
-    return without & (np.count_nonzero(without) <= _FEW_UNSTAMPED * len(without))
+    return without & (np.count_nonzero(without) <= MAX_UNSTAMPED_SHARE * len(without))
 
 
 def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
-    """Stamps and log times: these stand in for stamps that are not there; where those are few they are left out."""
+    """Stamps and log times: these stand in for missing stamps; where those are few, the messages are left out."""
     kept: Any = ~few if (few := few_unstamped(stamps, log_ns)).any() else slice(None)
     stamps, log_ns = stamps[kept], log_ns[kept]
     return (stamps if stamps.all() else np.where(stamps == 0, log_ns, stamps)), log_ns
 
 
-def header_stamps(has_header: bool, rows: Rows, wire: Wire) -> NDArray[np.int64]:
-    """Header stamps of messages, ns; 0 where the stamp is zero or the messages have no header."""
-    stamps = np.zeros(len(rows.start), dtype=np.int64)
-    long = rows.size >= _STAMP["<"].itemsize
+def header_stamps(has_header: bool, block: MessageBlock, wire: Wire) -> Stamps:
+    """Header stamps of messages, Unix ns; 0 where the stamp is zero or the messages have no header."""
+    stamps = np.zeros(len(block.start), dtype=np.int64)
+    long = block.size >= _STAMP["<"].itemsize
     if has_header and long.any():
-        heads = windows(rows.buffer, _STAMP["<"].itemsize)[rows.start[long]]
+        heads = byte_windows(block.buffer, _STAMP["<"].itemsize)[block.start[long]]
         little, big = heads.view(_STAMP["<"]), heads.view(_STAMP[">"])
         is_little = (little["kind"][:, 1] == 1) | (wire == "ros1")
         stamps[long] = little["sec"].astype(np.int64) * 1_000_000_000 + little["nanosec"]
@@ -251,3 +372,35 @@ def header_stamps(has_header: bool, rows: Rows, wire: Wire) -> NDArray[np.int64]
             other = big["sec"].astype(np.int64) * 1_000_000_000 + big["nanosec"]
             stamps[long] = np.where(is_little, stamps[long], other)
     return stamps
+
+
+def _append_alike(
+    plan: _Plan, block: MessageBlock, left: NDArray[np.int64], table: ColumnTable, rows: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Append those of the messages `left` that have a layout, all at once. Returns which of them these are."""
+    if plan.layout is None or not len(left):
+        return np.zeros(len(left), dtype=bool)
+    size = len(plan.layout.first)
+    alike = block.size[left] == size
+    data = byte_windows(block.buffer, size)[block.start[left[alike]]].view(np.uint8).reshape(-1, size)
+    agrees = plan.layout.agrees(data)
+    alike[alike] = agrees
+    data = data if agrees.all() else data[agrees]
+    if len(data):
+        values = {name: run.of(data)[:, order] for name, (run, order) in plan.fields.items()}
+        table.fill(rows[left[alike]], values, plan.frame)
+    return alike
+
+
+def _frame(message: Any) -> str:
+    """Frame in a message's header, empty where it has none."""
+    return str(getattr(getattr(message, "header", None), "frame_id", "")).lstrip("/")
+
+
+def _constant(order: tuple[int, ...] | None) -> Order | None:
+    return (lambda _: order) if order else None
+
+
+def _ros2_name(name: str) -> str:
+    package, _, kind = name.partition("/")
+    return name if kind.startswith("msg/") else f"{package}/msg/{kind}"

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.arrays import ArrayContainer
-from alidade.pipelines.recording.container import sha256_of, sha256_together
+from alidade.pipelines.recording.array_container import ArrayContainer
+from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.recording.table_times import nanoseconds
 from alidade.pipelines.recording.tables import numbers, read_columns, table_form
 
@@ -32,34 +32,35 @@ def find_euroc(path: Path) -> Path | None:
 def read_euroc(path: Path, root: Path) -> ArrayContainer:
     """All sensors of a data set."""
     topics: dict[str, series.Topic] = {}
-    remarks = []
+    assumptions = []
     for table in sorted(root.glob("*/data.csv")):
         sensor = _sensor(table.with_name("sensor.yaml"))
         found = _topics(table, f"/{table.parent.name}", sensor)
         topics |= found
         if not found:
-            remarks.append(f"{table.parent.name} is not used: columns {', '.join(table_form(table, table).names)}")
-    return _DataSet(path, topics, remarks, sorted(root.glob("*/data.csv")))
+            assumptions.append(f"{table.parent.name} is not used: columns {', '.join(table_form(table, table).names)}")
+    return _DataSet(path, topics, assumptions, sorted(root.glob("*/data.csv")))
 
 
 class _DataSet(ArrayContainer):
     """A folder of tables."""
 
     def __init__(
-        self, path: Path, topics: Mapping[str, series.Topic], remarks: Sequence[str], tables: Sequence[Path]
+        self, path: Path, topics: Mapping[str, series.Topic], assumptions: Sequence[str], tables: Sequence[Path]
     ) -> None:
-        super().__init__(path, topics, remarks)
-        self.data, self._tables = tables[0], tables
+        super().__init__(path, topics, assumptions, tables[0])
+        self._tables = tables
 
     def sha256(self) -> str:
         """SHA-256 of the tables' own digests, in the order of their names."""
-        return sha256_together(map(sha256_of, self._tables))
+        return combined_sha256(map(file_sha256, self._tables))
 
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
     """What a sensor's table holds."""
-    names = table_form(table, table).names
-    columns, _ = read_columns(table, table, names)
+    layout = table_form(table, table)
+    names = layout.names
+    columns, _ = read_columns(table, table, layout, names)
     t_ns = nanoseconds(table, columns[names[0]], "ns")
 
     def chosen(letter: str) -> list[str]:

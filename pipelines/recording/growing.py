@@ -4,96 +4,91 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.container import Container, Rows, rows_of
-from alidade.pipelines.recording.data_loss import DataLoss
-from alidade.pipelines.recording.mcap_file import McapFile
-from alidade.pipelines.recording.mcap_index import Block, McapIndex
-from alidade.pipelines.recording.mcap_records import MAGIC, windows
+from alidade.pipelines.recording.container import Container, MessageBlock, MultiPartContainer, byte_windows
+from alidade.pipelines.recording.mcap_file import Block, McapFile
+from alidade.pipelines.recording.mcap_records import MAGIC
 from alidade.pipelines.recording.opening import open_container
-from alidade.pipelines.recording.parts import Parts
 
-# Messages of numbers are shorter, bytes; longer ones are not kept from look to look.
-_LARGE = 1 << 14
+# Longer messages, bytes, are not kept from one refresh to the next; those of numbers are shorter.
+MAX_KEPT_BYTES = 1 << 14
 
 
 class GrowingMcap(McapFile):
-    """An MCAP file as far as it has been written, and of that the end alone, if it is asked for so.
+    """An MCAP file as far as it has been written; `refresh` restricts what is read to its end.
 
     Raises InputError when it is no MCAP, or hostile.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = self.data = path
-        self._strict = False
-        self._lost: dict[int, int] = {}
-        self._index = index = McapIndex(str(path))
-        self.profile, self.channels, self.schemas = "", index.channels, index.schemas
-        self.counts: dict[int, int] = {}
-        self.losses: list[DataLoss] = index.losses
+        self._view: list[Block] = []  # the blocks that are read
         self._checked = 0  # blocks
-        self._blocks: list[Block] = []
-        self._kept: dict[int, tuple[int, dict[int, Rows]]] = {}  # start of a block -> its end when read, its messages
-        with self._open() as stream:
-            self._check_magic(stream)
+        # Start of a block -> its end when it was read, and its messages by channel.
+        self._kept: dict[int, tuple[int, dict[int, MessageBlock]]] = {}
+        super().__init__(path)
 
-    def look(self, since_ns: int | None) -> None:
-        """Take what has come, and have in view what was logged since a time, Unix ns, a little before included."""
+    def _read_index(self, stream: BinaryIO) -> None:
+        """Nothing; see `refresh`."""
+
+    def refresh(self, since_ns: int | None) -> None:
+        """Walk what is new; read from now on what was logged since a time, Unix ns, a little before included."""
         with self._open() as stream:
-            self._index.grow(stream)
-            blocks = self._index.blocks
-            # Of the last one the index may not have been written yet.
-            for block in blocks[max(0, self._checked - 1) :]:
-                if block.is_chunk and not (block.index_at and block.index_at.keys() <= self.channels.keys()):
-                    self._verify(stream, block)
-            self._checked = len(blocks)
-        # Blocks overlap little: those after the last one that is over by then.
-        first = len(blocks)
-        while first and not _is_over(blocks[first - 1], since_ns):
+            self._walk_new(stream)
+            # The last block's message index may not have been written yet.
+            self._verify_unindexed(stream, self._blocks[max(0, self._checked - 1) :])
+            self._checked = len(self._blocks)
+        # Blocks overlap little: those after the last one that ends before.
+        first = len(self._blocks)
+        while first and not _ends_before(self._blocks[first - 1], since_ns):
             first -= 1
-        self._blocks = blocks[first:]
-        self._kept = {block.start: self._kept[block.start] for block in self._blocks if block.start in self._kept}
-        self.profile = self._index.profile
-        self.counts = {number: n for number, n in self._counted().items() if self._defined(number)}
+        self._view = self._blocks[first:]
+        self._kept = {block.start: self._kept[block.start] for block in self._view if block.start in self._kept}
+        self.counts = {number: n for number, n in self._count(self._view).items() if self.is_defined(number)}
 
     def last_log_ns(self) -> int | None:
-        """Log time of the last messages there are by now, in view or not, as their block states it; None: of none."""
+        """Log time of the last message written by now, as its block states it, Unix ns; None without one."""
         with self._open() as stream:
-            self._index.grow(stream)
-        return next((block.span[1] for block in reversed(self._index.blocks) if block.span is not None), None)
+            self._walk_new(stream)
+        return next((block.log_span_ns[1] for block in reversed(self._blocks) if block.log_span_ns is not None), None)
 
     @property
     def first_log_ns(self) -> int:
-        """As the first block in view states it."""
-        return next((block.span[0] for block in self._blocks if block.span is not None), 0)
+        """Log time of the first message that is read, as its block states it, Unix ns."""
+        return next((block.log_span_ns[0] for block in self._view if block.log_span_ns is not None), 0)
 
-    def rows(self, channels: set[int]) -> Iterator[Rows]:
-        """The messages in view: each channel's at once, however small the recorder's chunks are, but for large ones."""
-        found: dict[int, list[Rows]] = {}
+    def _walk_new(self, stream: BinaryIO) -> None:
+        self.size = stream.seek(0, 2)
+        self._walk(stream, self.size, is_growing=True)
+
+    def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
+        """Messages of each channel in one block, however small the recorder's chunks are, but for large messages."""
+        found: dict[int, list[MessageBlock]] = {}
         with self._open() as stream:
-            for block in self._blocks:
+            for block in self._view:
                 wanted = channels & block.counts.keys()
                 end, kept = self._kept.get(block.start, (block.end, {}))
                 if end != block.end:
                     kept = {}
-                for rows in self._block_rows(stream, block, wanted - kept.keys()):
-                    if rows.size.max(initial=0) > _LARGE:
-                        yield rows
+                for messages in self._messages(stream, block, wanted - kept.keys()):
+                    if messages.size.max(initial=0) > MAX_KEPT_BYTES:
+                        yield messages
                     else:
-                        kept[rows.channel] = _compact(rows)
+                        kept[messages.channel] = _compact(messages)
                 self._kept[block.start] = block.end, kept
                 for number in wanted & kept.keys():
                     found.setdefault(number, []).append(kept[number])
-        for number, pieces in found.items():
-            size, log_ns = (np.concatenate(parts) for parts in zip(*((p.size, p.log_ns) for p in pieces), strict=True))
-            yield Rows(number, np.concatenate([p.buffer for p in pieces]), np.cumsum(size) - size, size, log_ns)
+        for number, parts in found.items():
+            size, log_ns = (np.concatenate(each) for each in zip(*((p.size, p.log_ns) for p in parts), strict=True))
+            buffer = np.concatenate([part.buffer for part in parts])
+            yield MessageBlock(number, buffer, np.cumsum(size) - size, size, log_ns)
 
 
-class Growing:
-    """The files of a recording, by and by. Those that are not MCAP are read anew every time."""
+class GrowingFiles:
+    """The files of a growing recording. Those that are not MCAP are read anew every time."""
 
     def __init__(self) -> None:
         self._files: dict[Path, GrowingMcap] = {}
@@ -103,41 +98,40 @@ class Growing:
         """Names of all attachments met."""
         return [name for file in self._files.values() for name in file.attachments]
 
-    def last_log_ns(self, where: Sequence[Path]) -> int | None:
-        """Log time of the last messages there are by now, without reading them; None where that cannot be told."""
-        last = self._files.get(where[-1]) if where else None
+    def last_log_ns(self, paths: Sequence[Path]) -> int | None:
+        """Log time of the last message written by now, without reading it; None where that is unknown."""
+        last = self._files.get(paths[-1]) if paths else None
         return None if last is None else last.last_log_ns()
 
-    def look(self, where: Sequence[Path], since_ns: int | None) -> Container:
-        """What the files hold by now: all, or what was logged since a time, Unix ns. Raises InputError."""
+    def refresh(self, paths: Sequence[Path], since_ns: int | None) -> Container:
+        """The recording by now: all of it, or what was logged since a time, Unix ns. Raises InputError."""
         files: list[Container] = []
-        for path in where:
+        for path in paths:
             if not _is_mcap(path):
                 files.append(open_container(path))
                 continue
             if path not in self._files:
                 self._files[path] = GrowingMcap(path)
             file = self._files[path]
-            file.look(since_ns)
+            file.refresh(since_ns)
             if file.counts:
                 files.append(file)
         if not files:
-            raise InputError(f"{where[0]}: no messages yet")
-        return files[0] if len(files) == 1 else Parts(where[0], files)
+            raise InputError(f"{paths[0]}: no messages yet")
+        return files[0] if len(files) == 1 else MultiPartContainer(paths[0], files)
 
 
-def _is_over(block: Block, since_ns: int | None) -> bool:
-    """Whether all of its messages were logged before."""
-    return since_ns is not None and block.span is not None and block.span[1] < since_ns
+def _ends_before(block: Block, since_ns: int | None) -> bool:
+    return since_ns is not None and block.log_span_ns is not None and block.log_span_ns[1] < since_ns
 
 
-def _compact(rows: Rows) -> Rows:
-    """The messages side by side, without what stands between them."""
-    size = int(rows.size[0]) if len(rows.size) else 0
-    if size and (rows.size == size).all():
-        data = windows(rows.buffer, size)[rows.start].view(np.uint8)
-        return rows._replace(buffer=data, start=size * np.arange(len(rows.size)))
-    return rows_of(rows.channel, [rows.message(i) for i in range(len(rows.size))], rows.log_ns)
+def _compact(block: MessageBlock) -> MessageBlock:
+    """The messages side by side, without the bytes between them."""
+    size = int(block.size[0]) if len(block.size) else 0
+    if size and (block.size == size).all():
+        data = byte_windows(block.buffer, size)[block.start].view(np.uint8)
+        return block._replace(buffer=data, start=size * np.arange(len(block.size)))
+    return MessageBlock.pack(block.channel, [block.message(i) for i in range(len(block.size))], block.log_ns)
 
 
 def _is_mcap(path: Path) -> bool:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.recording.message_reader import Topic as RecordedTopic
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording, TopicInfo
 from alidade.pipelines.recording.topics import Need, Setting, Topic
 from alidade.pipelines.settings import Config
 
@@ -62,7 +61,13 @@ def facts_of(recording: Recording, config: Config, needs: Mapping[str, Sequence[
     topics = tuple(_facts(recording.topics[name], epoch, *times[name]) for name in recording.topics)
     missing = {method: lacking(wanted, recording, config) for method, wanted in needs.items()}
     return SessionFacts(
-        epoch, recording.duration_s, recording.attachments, topics, missing, recording.missing, recording.notes
+        epoch,
+        recording.duration_s,
+        recording.container.attachments,
+        topics,
+        missing,
+        recording.container.missing,
+        recording.notes,
     )
 
 
@@ -76,7 +81,7 @@ def lacking(needs: Sequence[Need], recording: Recording, config: Config) -> tupl
     return tuple(phrases)
 
 
-def _facts(topic: RecordedTopic, epoch_ns: int, t_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> TopicFacts:
+def _facts(topic: TopicInfo, epoch_ns: int, t_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> TopicFacts:
     stamps = t_ns[np.argsort(log_ns, kind="stable")] - epoch_ns
     backward = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps))) if len(stamps) else 0
     stamps = np.sort(stamps)

@@ -89,10 +89,10 @@ class Leaf:
     dtype: np.dtype[Any]
     count: int
 
-    def of(self, rows: NDArray[np.uint8], head: int = 0) -> NDArray[Any]:
-        """The numbers in rows of bytes, each `head` bytes and a message, as a view of shape (n, count)."""
+    def of(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
+        """The numbers in messages, rows of bytes (n, size), as a view (n, count)."""
         strides = (rows.shape[1], self.dtype.itemsize)
-        return np.ndarray((len(rows), self.count), self.dtype, rows, head + self.offset, strides)
+        return np.ndarray((len(rows), self.count), self.dtype, rows, self.offset, strides)
 
 
 @dataclass(frozen=True)

@@ -16,28 +16,27 @@ import zstandard
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes, require_regular
 from alidade.pipelines.recording import ros1_bag
-from alidade.pipelines.recording.arrays import ArrayContainer
-from alidade.pipelines.recording.container import Container
+from alidade.pipelines.recording.array_container import ArrayContainer
+from alidade.pipelines.recording.container import Container, MultiPartContainer
+from alidade.pipelines.recording.images import is_video
 from alidade.pipelines.recording.mcap_file import McapFile
 from alidade.pipelines.recording.mcap_records import MAGIC
-from alidade.pipelines.recording.parts import Parts
-from alidade.pipelines.recording.video import is_video
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
-# So much of a file's beginning tells what it is, B.
+# Bytes of a file's beginning by which its form is recognised.
 _START = 1024
 # How tables may be called, in a folder that has nothing else of a recording.
 _TABLES = (".csv", ".txt", ".tsv", ".tum", ".log", ".dat")
 # How the parts of a recording may be called.
 PARTS = (".mcap", ".db3", ".bag", ".zstd", ".zst")
-# The bytes of a file that tell it from others of its form and stay as they are while it grows: the heads of some forms
-# count what has come. ROS 1: behind the bag's header; SQLite: of the first page, which defines the tables.
+# The bytes of a file that distinguish it from others of its form and stay as they are while it grows: the heads of some
+# forms count messages. ROS 1: behind the bag's header; SQLite: of the first page, which defines the tables.
 _IDENTITY = {ros1_bag.MAGIC: (4096, 8192), _SQLITE: (100, 4096)}
 _USUAL_IDENTITY = (0, 4096)
 # A compressed file may unpack to so many times its size, beyond so many bytes.
 _LARGEST_RATIO, _SMALL = 100, 1 << 28
 METADATA, BAG = "metadata.yaml", "rosbag2_bagfile_information"
-# What tells the parts of one recording from each other: their number, and their suffix.
+# What distinguishes the parts of one recording: their number, and their suffix.
 _PART_NAME = re.compile(r"(_\d+)?(\.[a-z0-9]+)+$")
 
 Where = Path | str | Sequence[Path | str]
@@ -47,22 +46,29 @@ def open_container(where: Where, strict: bool = False) -> Container:
     """The container that a path, a pattern or a list of paths names.
 
     Raises InputError when something is missing, is no recording, or cannot be read; with `strict` also when anything
-    is lost.
+    is lost, for which everything is read once.
     """
+    container = _open(where)
+    if strict:
+        container.require_complete()
+    return container
+
+
+def _open(where: Where) -> Container:
     if not isinstance(where, (str, Path)):
-        return _together([Path(one) for one in where], strict)
+        return _together([Path(one) for one in where])
     path = Path(where)
     if path.is_dir():
-        return _folder(path if path.name else path.resolve(), strict)
+        return _folder(path if path.name else path.resolve())
     if not path.exists() and any(letter in str(path) for letter in "*?["):
         found = [Path(name) for name in sorted(glob.glob(str(path)))]
         if not found:
             raise InputError(f"{path}: no file is named so")
-        return _together(found, strict)
-    return _together([path], strict)
+        return _together(found)
+    return _together([path])
 
 
-def recordings_of(paths: Sequence[Path]) -> list[Where]:
+def group_recordings(paths: Sequence[Path]) -> list[Where]:
     """The recordings that several paths name: each is one, but for parts of one bag, by the metadata.yaml beside them.
 
     Folders and patterns stand for all of their parts.
@@ -82,27 +88,26 @@ def recordings_of(paths: Sequence[Path]) -> list[Where]:
     return [parts[0] if len(parts) == 1 else parts for parts in found]
 
 
-def told(recordings: Sequence[Where]) -> str:
+def describe_recordings(recordings: Sequence[Where]) -> str:
     """Recordings in words, parts of one side by side."""
     each = [[one] if isinstance(one, (str, Path)) else list(one) for one in recordings]
     return ", ".join(" + ".join(Path(part).name for part in parts) for parts in each)
 
 
-def _together(paths: Sequence[Path], strict: bool, at: Path | None = None, remarks: Sequence[str] = ()) -> Container:
+def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
     """Several files as one recording."""
     if not paths:
         raise InputError("a recording of no files")
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise InputError(f"{paths[0]}: the same file is named twice")
-    parts = [_file(path, strict) for path in paths]
-    if at is None:
-        remarks = _part_of(paths)
-    whole = parts[0] if len(parts) == 1 else Parts(at or paths[0], parts)
-    whole.remarks = (*remarks, *whole.remarks)
+    parts = [_file(path) for path in paths]
+    whole = parts[0] if len(parts) == 1 else MultiPartContainer(folder or paths[0], parts)
+    if folder is None:
+        whole.assumptions = (*_part_of(paths), *whole.assumptions)
     return whole
 
 
-def _file(path: Path, strict: bool) -> Container:
+def _file(path: Path) -> Container:
     """One file, by what it begins with."""
     require_regular(path)
     try:
@@ -110,23 +115,25 @@ def _file(path: Path, strict: bool) -> Container:
             start = stream.read(16)
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
-    return _unpacked(path, strict) if start.startswith(_ZSTD) else _by_content(path, path, strict)
+    container = _decompressed(path) if start.startswith(_ZSTD) else _by_content(path, path)
+    container.require_readable()
+    return container
 
 
-def _by_content(path: Path, data: Path, strict: bool) -> Container:
+def _by_content(path: Path, data: Path) -> Container:
     """The container in a file `data`, which is named `path`."""
     with data.open("rb") as stream:
         start = stream.read(_START)
     if start.startswith(ros1_bag.MAGIC):
-        return ros1_bag.Ros1Bag(path, strict, data)
+        return ros1_bag.Ros1Bag(path, data)
     if start.startswith(_SQLITE):
         from alidade.pipelines.recording.sqlite_file import SqliteFile
 
-        return SqliteFile(path, strict, data)
+        return SqliteFile(path, data)
     if start.startswith(_ULOG):
         from alidade.pipelines.recording.ulog import read_ulog
 
-        return read_ulog(path, strict, data)
+        return read_ulog(path, data)
     if start.startswith(_ARDUPILOT):
         raise InputError(
             f"{path}: an ArduPilot log; make CSV of it (`mavlogdump.py --format csv`, from pymavlink) and say under "
@@ -139,10 +146,10 @@ def _by_content(path: Path, data: Path, strict: bool) -> Container:
     from alidade.pipelines.recording.tables import looks_like_text, read_table
 
     is_table = looks_like_text(start) and not start.startswith(MAGIC)
-    return read_table(path, data) if is_table else McapFile(path, strict, data)
+    return read_table(path, data) if is_table else McapFile(path, data)
 
 
-def _unpacked(path: Path, strict: bool) -> Container:
+def _decompressed(path: Path) -> Container:
     """A file compressed as a whole: unpacked into a temporary one, which goes with the container."""
     whole = tempfile.NamedTemporaryFile(prefix="alidade-", suffix=".unpacked")  # noqa: SIM115
     limit = _SMALL + _LARGEST_RATIO * path.stat().st_size
@@ -157,16 +164,16 @@ def _unpacked(path: Path, strict: bool) -> Container:
         except zstandard.ZstdError:
             damaged = "its compression is damaged, what is behind cannot be read"
     whole.flush()
-    if damaged and (strict or whole.tell() == 0):
+    if damaged and whole.tell() == 0:
         raise InputError(f"{path}: {damaged}: record again")
-    container = _by_content(path, Path(whole.name), strict)
-    container.unpacked = (container.unpacked, whole)
+    container = _by_content(path, Path(whole.name))
+    container.temporary = (container.temporary, whole)
     if damaged:
-        container.remarks = (*container.remarks, damaged)
+        container.incomplete = (*container.incomplete, damaged)
     return container
 
 
-def _folder(path: Path, strict: bool) -> Container:
+def _folder(path: Path) -> Container:
     """A folder: of a bag with its metadata.yaml, of the parts of one recording, or of a data set in EuRoC's form."""
     metadata = _metadata(path / METADATA)
     listed = parts_of_bag(metadata)
@@ -175,15 +182,12 @@ def _folder(path: Path, strict: bool) -> Container:
         lost = [name for name in listed if _stored(path / name) is None]
         if not there:
             raise InputError(f"{path}: none of the files is there that its {METADATA} names: {', '.join(lost)}")
-        remarks = [f"{len(lost)} of {len(listed)} parts are not there: {', '.join(lost)}"] if lost else []
-        if remarks and strict:
-            raise InputError(f"{path}: {remarks[0]}; --strict reads nothing of which anything is lost")
-        whole = _together(there, strict, path, remarks)
-        if str(metadata.get("compression_mode")).lower() != "message":
-            return whole
-        from alidade.pipelines.recording.packed import PackedMessages
-
-        return PackedMessages(whole)
+        whole = _together(there, path)
+        if lost:
+            absent = f"{len(lost)} of {len(listed)} parts are not there: {', '.join(lost)}"
+            whole.incomplete = (absent, *whole.incomplete)
+        whole.message_compression = str(metadata.get("compression_mode")).lower() == "message"
+        return whole
     from alidade.pipelines.recording.euroc import find_euroc, read_euroc
 
     root = find_euroc(path)
@@ -192,11 +196,11 @@ def _folder(path: Path, strict: bool) -> Container:
     there = parts_in(path) or _tables_in(path)
     if not there:
         raise InputError(f"{path}: a folder without a recording")
-    return _together(there, strict, path)
+    return _together(there, path)
 
 
-def identity(path: Path) -> str:
-    """What tells a file from others while it grows, in a few letters."""
+def file_identity(path: Path) -> str:
+    """Identity of a file that may still grow, twelve hexadecimal digits."""
     with path.open("rb") as stream:
         start = stream.read(16)
         first, last = next((at for mark, at in _IDENTITY.items() if start.startswith(mark)), _USUAL_IDENTITY)
@@ -241,7 +245,7 @@ def _tables_in(path: Path) -> list[Path]:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """What a bag's metadata.yaml says; nothing if it is not there or is something else."""
+    """Content of a bag's metadata.yaml; empty if it is not there or is something else."""
     if not path.is_file():
         return {}
     try:
@@ -251,7 +255,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def bag_metadata(text: bytes | str) -> dict[str, Any]:
-    """What a bag's metadata.yaml says, by its text; nothing if that is something else."""
+    """Content of a bag's metadata.yaml, by its text; empty if that is something else."""
     try:
         content = load_yaml(text, METADATA)
     except InputError:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.recording.sources import matrices
+from alidade.factors import so3
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -119,7 +119,7 @@ def pair(
 
     way = int(np.argmax([share for share, _ in fits(offset)]))
     middle = directions[way][stride // 2 :][: len(steps)][whole]
-    seen = _Seen(a, b, ways[way], matrices(middle).swapaxes(1, 2))
+    seen = _Seen(a, b, ways[way], so3.matrix(middle).swapaxes(1, 2))
     offset = _refined(offset, seen, ours, [_Gyro(t_ns, rates, start) for t_ns, rates in others])
     fit, angle = fits(offset)[way]
     if way == 1 and angle > MAX_MOUNT:
@@ -206,24 +206,13 @@ def _delay(middle: Array, norm: Array, a: Array, b: Array, gyro: _Gyro) -> tuple
 
 
 def _rates(first: Array, second: Array, steps: Array) -> Array:
-    """Rates in the body, rad/s, between quaternions."""
-    w1, v1 = first[:, :1], -first[:, 1:]
-    w2, v2 = second[:, :1], second[:, 1:]
-    w = (w1 * w2)[:, 0] - np.einsum("ni,ni->n", v1, v2)
-    v = w1 * v2 + w2 * v1 + np.cross(v1, v2)
-    v = np.where(w[:, None] < 0.0, -v, v)
-    sine = np.linalg.norm(v, axis=1)
-    angle = 2.0 * np.arctan2(sine, np.abs(w))
-    scale = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
-    return np.asarray(v * (scale / steps)[:, None])
+    """Rates in the body (n, 3), rad/s, between quaternions that are steps (n,), s, apart."""
+    return so3.log(so3.multiply(so3.inverse(first), second)) / steps[:, None]
 
 
 def _fit(ours: Array, theirs: Array) -> tuple[float, float]:
-    """Share of the squared rates explained by the rotation that fits best (Wahba's problem, by SVD), and its angle."""
-    u, s, vt = np.linalg.svd(ours.T @ theirs)
-    sign = np.sign(np.linalg.det(u @ vt))
-    s[-1] *= sign
+    """Share of the squared rates (n, 3) explained by the rotation that fits best (Wahba's problem), and its angle."""
+    rotation = so3.align(ours, theirs)
     total = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
-    trace = float(np.trace(u @ np.diag([1.0, 1.0, sign]) @ vt))
-    angle = float(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
-    return (float(s.sum()) / total if total > 0.0 else 0.0), angle
+    explained = float((ours * so3.rotate(rotation, theirs)).sum())
+    return (explained / total if total > 0.0 else 0.0), float(np.linalg.norm(so3.log(rotation)))

@@ -17,8 +17,7 @@ import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.container import Channel, Container, Rows, Schema
-from alidade.pipelines.recording.data_loss import DataLoss, described
+from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema
 from alidade.pipelines.recording.mcap_records import DamagedError
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -47,21 +46,19 @@ class Ros1Bag(Container):
 
     Args:
         path: of the file, as it is named.
-        strict: raise InputError at the first loss.
         data: the file to read instead.
 
-    Raises InputError when nothing in it can be read, or when it is hostile.
+    Raises InputError when it is hostile.
     """
 
-    def __init__(self, path: Path, strict: bool = False, data: Path | None = None) -> None:
-        self.path, self.data, self._strict = path, data or path, strict
-        self.profile = "ros1"
+    def __init__(self, path: Path, data: Path | None = None) -> None:
+        super().__init__(path)
+        self.data = data or path
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
         self.losses: list[DataLoss] = []
         self._chunks: list[_Chunk] = []
-        self._lost: dict[int, int] = {}
-        self._size = self.data.stat().st_size
+        self.size = self.data.stat().st_size
         with self.data.open("rb") as stream:
             self._walk(stream)
             for chunk in self._chunks:
@@ -75,20 +72,8 @@ class Ros1Bag(Container):
         if undefined:
             self.losses.append(DataLoss("definition", 0, undefined))
             self.counts = {number: n for number, n in self.counts.items() if number in self.channels}
-        if self.losses and (strict or not self.counts):
-            self._refuse()
 
-    @property
-    def missing(self) -> dict[str, int]:
-        """Topic -> messages known to be lost."""
-        missing: dict[str, int] = {}
-        for number, n in self._lost.items():
-            if number in self.channels:
-                topic = self.channels[number].topic
-                missing[topic] = missing.get(topic, 0) + n
-        return missing
-
-    def rows(self, channels: set[int]) -> Iterator[Rows]:
+    def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
         """The messages of these connections, chunk by chunk."""
         with self.data.open("rb") as stream:
             for chunk in self._chunks:
@@ -96,7 +81,7 @@ class Ros1Bag(Container):
                     continue
                 try:
                     found = self._messages(stream, chunk)
-                    if {number: len(rows.start) for number, rows in found.items()} != chunk.counts:
+                    if {number: len(block.start) for number, block in found.items()} != chunk.counts:
                         raise DamagedError("its index is wrong")
                 except DamagedError as damaged:
                     self._lose(chunk, str(damaged))
@@ -104,16 +89,12 @@ class Ros1Bag(Container):
                 for number in sorted(channels & found.keys()):
                     yield found[number]
 
-    def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
-        """Sentences about what is lost, and when."""
-        return described(self.losses, self.missing, self._size, start_ns, duration_s)
-
     def _walk(self, stream: BinaryIO) -> None:
         """Note where the chunks are, what connections there are, and where the file ends too early."""
         position, unpacked, indexed = len(MAGIC), 0, 0
-        while position < self._size:
+        while position < self.size:
             try:
-                header, start, end = _record(stream, position, self._size)
+                header, start, end = _record(stream, position, self.size)
                 (op,) = header.get(b"op", b"\0")[:1] or b"\0"
                 if op == _BAG:
                     indexed = int.from_bytes(header.get(b"index_pos", b""), "little")
@@ -121,7 +102,7 @@ class Ros1Bag(Container):
                     size = int.from_bytes(header.get(b"size", b""), "little")
                     compression = header.get(b"compression", b"").decode(errors="replace")
                     unpacked += size
-                    if unpacked > _LARGEST_CHUNK + 100 * self._size:
+                    if unpacked > _LARGEST_CHUNK + 100 * self.size:
                         raise InputError(
                             f"{self.path}: its chunks say that they unpack to over {unpacked >> 20} MiB, 100 times "
                             "the file; it may be made to exhaust the memory"
@@ -141,11 +122,11 @@ class Ros1Bag(Container):
                     raise DamagedError(f"a record of unknown kind {op}")
             except DamagedError as damaged:
                 kind, reason = ("damage", str(damaged)) if indexed else ("cut", "")
-                self.losses.append(DataLoss(kind, position, self._size - position, reason=reason))  # type: ignore[arg-type]
+                self.losses.append(DataLoss(kind, position, self.size - position, reason=reason))  # type: ignore[arg-type]
                 return
             position = end
         if not indexed:
-            self.losses.append(DataLoss("cut", self._size, 0))
+            self.losses.append(DataLoss("cut", self.size, 0))
 
     def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
         if len(data) > _LONGEST_TEXT:
@@ -160,7 +141,7 @@ class Ros1Bag(Container):
         self.schemas[number] = Schema(number, kind, "ros1msg", fields.get(b"message_definition", b""))
         self.channels[number] = Channel(number, topic, "ros1", number)
 
-    def _messages(self, stream: BinaryIO, chunk: _Chunk) -> dict[int, Rows]:
+    def _messages(self, stream: BinaryIO, chunk: _Chunk) -> dict[int, MessageBlock]:
         """The messages in a chunk, by connection. Raises DamagedError."""
         stream.seek(chunk.start)
         data = _unpacked(stream.read(chunk.end - chunk.start), chunk.compression, chunk.size)
@@ -183,26 +164,20 @@ class Ros1Bag(Container):
                 times.append(sec * 1_000_000_000 + nanosec)
             position = end
         buffer = np.frombuffer(data, np.uint8)
-        return {number: Rows(number, buffer, *map(np.array, parts)) for number, parts in found.items()}
+        return {number: MessageBlock(number, buffer, *map(np.array, parts)) for number, parts in found.items()}
 
     def _verify(self, stream: BinaryIO, chunk: _Chunk) -> None:
         """Count the messages of a chunk whose index is missing."""
         try:
-            chunk.counts = {number: len(rows.start) for number, rows in self._messages(stream, chunk).items()}
+            chunk.counts = {number: len(block.start) for number, block in self._messages(stream, chunk).items()}
         except DamagedError as damaged:
             self._lose(chunk, str(damaged))
 
     def _lose(self, chunk: _Chunk, reason: str) -> None:
         for number, n in chunk.counts.items():
-            self._lost[number] = self._lost.get(number, 0) + n
+            self.lost_messages[number] = self.lost_messages.get(number, 0) + n
         chunk.counts = {}
         self.losses.append(DataLoss("damage", chunk.start, chunk.end - chunk.start, 1, reason=reason))
-        if self._strict:
-            self._refuse()
-
-    def _refuse(self) -> None:
-        what = "--strict reads nothing that is damaged" if self._strict else "nothing in it can be read"
-        raise InputError(f"{self.path}: {'; '.join(self.notes(None))}; {what}: record again")
 
 
 def is_closed(stream: BinaryIO) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_serializer, model_validator
 
+from alidade.factors import so3
 from alidade.pipelines.recording import series
 
 Array = NDArray[np.float64]
@@ -115,7 +116,7 @@ def inverted(poses: series.PoseSeries) -> series.PoseSeries:
     The covariance of the rotation is that of delta in R*Exp(delta) before and after: of R' = R^T it is R*cov*R^T.
     Positions' covariances are left out, zero.
     """
-    rotation = matrices(poses.wxyz)
+    rotation = so3.matrix(poses.wxyz)
     cov = np.zeros_like(poses.cov)
     cov[:, 3:, 3:] = rotation @ poses.cov[:, 3:, 3:] @ rotation.swapaxes(1, 2)
     position = -np.einsum("nji,nj->ni", rotation, poses.position)
@@ -137,14 +138,3 @@ def joined(gyro: series.VectorSeries, accel: series.VectorSeries | None) -> seri
         values = np.stack(columns, axis=1)
     by_log = gyro.stamped_by_log + (0 if accel is None else accel.stamped_by_log)
     return series.ImuSeries(gyro.t_ns, gyro.vector, values, stamped_by_log=by_log)
-
-
-def matrices(wxyz: Array) -> Array:
-    """Rotation matrices (N, 3, 3) of unit quaternions."""
-    w, x, y, z = wxyz.T
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)

@@ -18,8 +18,7 @@ from typing import Any
 from urllib.parse import quote
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.container import Channel, Container, Rows, Schema, rows_of
-from alidade.pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema
 
 # No message, definition or number of topics of a recording comes near these.
 _LARGEST, _MOST_TOPICS = 1 << 28, 10_000
@@ -34,18 +33,16 @@ class SqliteFile(Container):
 
     Args:
         path: of the file, as it is named.
-        strict: raise InputError at the first loss.
         data: the file to read instead.
 
     Raises InputError when it cannot be opened or is no recording.
     """
 
-    def __init__(self, path: Path, strict: bool = False, data: Path | None = None) -> None:
-        self.path, self.data, self._strict = path, data or path, strict
-        self.profile = "ros2"
+    def __init__(self, path: Path, data: Path | None = None) -> None:
+        super().__init__(path)
+        self.data = data or path
         self.losses: list[DataLoss] = []
         self._keep_whole_pages()
-        self._lost: dict[int, int] = {}
         self._idle = 0  # instructions since the last row
         try:
             with self._open() as database:
@@ -54,15 +51,10 @@ class SqliteFile(Container):
                 self.counts = self._counted(database)
         except (sqlite3.Error, ValueError, OverflowError, MemoryError) as error:
             raise InputError(f"{path}: not a recording, or damaged: SQLite says: {error}") from error
-        if strict or not self.counts:
-            self._refuse()
+        if not self.counts and not self.channels and not self.losses:
+            raise InputError(f"{path}: nothing in it can be read")
 
-    @property
-    def missing(self) -> dict[str, int]:
-        """Topic -> messages known to be lost."""
-        return {self.channels[number].topic: n for number, n in self._lost.items() if n}
-
-    def rows(self, channels: set[int]) -> Iterator[Rows]:
+    def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
         """The messages of these channels in the order they were recorded."""
         left = {number: self.counts.get(number, 0) for number in channels}
         reason = ""
@@ -90,20 +82,12 @@ class SqliteFile(Container):
                     size, taken = size + len(data), taken + 1
                 if row is None or size > _BLOCK or taken > _MOST:
                     for number, (messages, times) in sorted(found.items()):
-                        yield rows_of(number, messages, times)
+                        yield MessageBlock.pack(number, messages, times)
                     found, size, taken = {}, 0, 0
                 if row is None:
                     break
         if reason or any(left.values()):
             self._lose(left, reason or "fewer messages than it says")
-
-    def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:  # noqa: ARG002
-        """Sentences about what is lost."""
-        lost = ", ".join(f"{n} of {topic}" for topic, n in self.missing.items())
-        return tuple(
-            f"the recording is damaged ({loss.reason}){f'; messages lost: {lost}' if lost else ''}"
-            for loss in self.losses[:1]
-        )
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
@@ -136,7 +120,7 @@ class SqliteFile(Container):
 
         As it is, SQLite would refuse it, or take what is missing of the last page for zeros.
         """
-        size = self.data.stat().st_size
+        self.size = size = self.data.stat().st_size
         with self.data.open("rb") as stream:
             head = stream.read(100)
         page = int.from_bytes(head[16:18], "big")
@@ -153,7 +137,7 @@ class SqliteFile(Container):
         copy.seek(28)
         copy.write(whole.to_bytes(4, "big"))
         copy.flush()
-        self.data, self.unpacked = Path(copy.name), copy
+        self.data, self.temporary = Path(copy.name), copy
         self.losses.append(DataLoss("cut", whole * page, size - whole * page, reason="it is cut short"))
 
     def _check_tables(self, database: sqlite3.Connection) -> None:
@@ -200,19 +184,9 @@ class SqliteFile(Container):
             self.losses.append(DataLoss("damage", 0, 0, reason=f"SQLite says: {error}"))
         undefined = sum(n for number, n in counts.items() if number not in self.channels)
         if undefined:
-            self.losses.append(DataLoss("definition", 0, undefined, reason=f"{undefined} messages of unknown topics"))
+            self.losses.append(DataLoss("definition", 0, undefined))
         return {number: n for number, n in counts.items() if number in self.channels}
 
     def _lose(self, left: dict[int, int], reason: str) -> None:
-        for number, n in left.items():
-            if n:
-                self._lost[number] = n
+        self.lost_messages |= left
         self.losses.append(DataLoss("damage", 0, 0, reason=reason))
-        if self._strict:
-            self._refuse()
-
-    def _refuse(self) -> None:
-        if self.losses:
-            raise InputError(f"{self.path}: {'; '.join(self.notes(None))}: record again")
-        if not self.counts and not self.channels:
-            raise InputError(f"{self.path}: nothing in it can be read")

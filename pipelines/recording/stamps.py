@@ -1,41 +1,151 @@
-"""How stamps came about, as far as they show it: taken on arrival, or counted instead of measured.
+"""What the stamps of a topic show: clocks that were set, stamps taken on arrival, stamps counted instead of measured.
 
-Samples that a driver gets several at a time, and stamps as they arrive, have their stamps in bunches. Stamps that are
+Three things show a clock that was set during a recording. Times that run twice: after a step back, whole runs of
+samples lie between samples taken before it, while messages that are merely late fill a hole. Stamps that step while log
+times run on: the sensor's clock was set. And a pause no recording makes. A step forward of both stamps and log times
+looks like a gap, and is read as one.
+
+Samples that a driver gets several at a time, and stamps as they arrive, have their stamps in bursts. Stamps that are
 exactly an interval apart while the log times beside them jitter were made by counting samples, or by a clock that also
-triggers them. Where log times are as even as the stamps (simulated, or written later) nothing can be told.
+triggers them. Where log times are as even as the stamps (simulated, or written later) nothing can be concluded.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.errors import InputError
+
 Stamps = NDArray[np.int64]
 
-# A sample follows another of its bunch within this part of the usual interval, which shows over so many samples.
-_WITHIN, _ACROSS = 0.1, 100
-# Fewer in bunches are a recorder's hiccup.
-_MOST_BUNCHED = 0.01
-# An interval is even to so many ns: Unix time as a float has no more, neither in s nor in ns.
-_EXACT_NS = 500
-# So much of the stamps, and at most so much of the log times beside them.
-_MOST_EVEN, _FEW_EVEN = 0.9, 0.5
+# Smallest step of a clock, s, and as a share of the usual interval.
+MIN_CLOCK_STEP_S, _MIN_STEP_SHARE = 0.02, 0.5
+# Messages on either side that have to agree on a step.
+_AROUND = 20
+# Messages in order, most of them between others, that are a time that runs twice.
+_MIN_RUN = 3
+# No sensor pauses so long within a session, s.
+MAX_PAUSE_S = 3600.0
+# A sample within this share of the usual interval after another is of its burst; the usual interval is that over so
+# many samples.
+_BURST_SHARE, _INTERVAL_SAMPLES = 0.1, 100
+# A smaller share in bursts is a recorder's hiccup.
+_MAX_HICCUPS = 0.01
+# Tolerance of an even interval, ns: Unix time as a float resolves no more, neither in s nor in ns.
+_EVEN_NS = 500
+# Share of even intervals of counted stamps, and the largest one of the log times beside them.
+_MIN_EVEN_STAMPS, _MAX_EVEN_LOGS = 0.9, 0.5
 # Fewer messages show nothing.
-_FEWEST = 50
+_MIN_MESSAGES = 50
+
+
+class Step(NamedTuple):
+    """A step of a clock: by how much, s, after which time, ns, and what stepped."""
+
+    size: float
+    after_ns: int
+    what: str
+
+
+def check_clock(topic: str, t_ns: Stamps, log_ns: Stamps, epoch_ns: int) -> None:
+    """Raise InputError if the clock was set between these stamps and log times, ns, in the order of the file."""
+    step = find_clock_step(t_ns, log_ns)
+    if step is not None:
+        way = "back" if step.size < 0.0 else "forward"
+        raise InputError(
+            f"topic {topic}: {step.what} jump {way} by {abs(step.size):.3f} s after "
+            f"{(step.after_ns - epoch_ns) * 1e-9:.3f} s (clock adjusted). Split the recording there, or record again "
+            "with the clock free-running"
+        )
+
+
+def find_clock_step(t_ns: Stamps, log_ns: Stamps) -> Step | None:
+    """The first step of the clock, from stamps and log times in the order of the file; None if there is none."""
+    if len(t_ns) < 2 * _MIN_RUN:
+        return None
+    twice = _runs_twice(log_ns)
+    if twice is not None:
+        return Step(twice[1], int(log_ns[twice[0]]), "the log times")
+    if not _is_sorted(log_ns):
+        order = np.argsort(log_ns, kind="stable")
+        t_ns, log_ns = t_ns[order], log_ns[order]
+    twice = _runs_twice(t_ns)
+    if twice is not None:
+        return Step(twice[1], int(t_ns[twice[0]]), "the stamps")
+    sorted_ns = t_ns if _is_sorted(t_ns) else np.sort(t_ns)
+    pause = np.diff(sorted_ns)
+    i = int(np.argmax(pause))
+    if pause[i] * 1e-9 > MAX_PAUSE_S:
+        return Step(float(pause[i]) * 1e-9, int(sorted_ns[i]), "the stamps")
+    return _against_log(t_ns, log_ns)
+
+
+def _is_sorted(times: Stamps) -> bool:
+    return bool((times[1:] >= times[:-1]).all())
+
+
+def _runs_twice(times: Stamps) -> tuple[int, float] | None:
+    """Index of the last time before a step back, and its size, s."""
+    if _is_sorted(times):
+        return None
+    late = times < np.maximum.accumulate(times)
+    if np.count_nonzero(late) < _MIN_RUN:
+        return None
+    edges = np.flatnonzero(np.diff(late.astype(np.int8), prepend=0, append=0))
+    everything = np.sort(times)
+    for start, stop in edges.reshape(-1, 2).tolist():
+        run = times[start:stop]
+        if len(run) < _MIN_RUN or np.mean(np.diff(run) > 0) < 0.9:
+            continue
+        # How many times of others lie within the run, and how many of its own are nobody else's.
+        within = np.searchsorted(everything, run.max(), "right") - np.searchsorted(everything, run.min()) - len(run)
+        copies = np.searchsorted(everything, run, "right") - np.searchsorted(everything, run)
+        if within >= 0.5 * len(run) and np.mean(copies > 1) < 0.5:
+            return start - 1, float(run[0] - times[start - 1] - np.median(np.abs(np.diff(run)))) * 1e-9
+    return None
+
+
+def _against_log(t_ns: Stamps, log_ns: Stamps) -> Step | None:
+    """A step of the stamps that the log times do not make, and that lasts."""
+    ahead = t_ns - log_ns
+    if ahead.max() - ahead.min() <= MIN_CLOCK_STEP_S * 1e9:
+        return None
+    jumps = np.flatnonzero(np.abs(np.diff(ahead)) > MIN_CLOCK_STEP_S * 1e9)
+    if not len(jumps):
+        return None
+    usual = float(np.median(np.diff(t_ns)))
+    for i in jumps.tolist():
+        by_stamp, by_log = (float(times[i + 1] - times[i]) - usual for times in (t_ns, log_ns))
+        jump = by_stamp - by_log
+        if abs(jump) < _MIN_STEP_SHARE * usual or abs(by_log) > 0.5 * abs(jump) or abs(by_stamp) < 0.5 * abs(jump):
+            continue
+        before, after = ahead[max(0, i + 1 - _AROUND) : i + 1], ahead[i + 1 : i + 1 + _AROUND]
+        if min(len(before), len(after)) < _MIN_RUN:
+            continue
+        lasting = float(np.median(after) - np.median(before))
+        if ((t_ns > t_ns[i]) & (t_ns < t_ns[i + 1])).any():
+            continue  # messages that are late fill the hole
+        runs_on = np.median(np.diff(t_ns[i + 1 : i + 1 + _AROUND])) > 0.5 * usual
+        if runs_on and abs(lasting - jump) < 0.5 * abs(jump):
+            return Step(jump * 1e-9, int(t_ns[i]), "the stamps")
+    return None
 
 
 def stamp_notes(topic: str, t_ns: Stamps, log_ns: Stamps) -> tuple[str, ...]:
-    """Sentences about the stamps of a topic, from them and the log times, ns (N,); none where nothing can be told."""
-    if len(t_ns) < _FEWEST:
+    """Sentences about the stamps of a topic, from them and its log times, (N,) ns each; none without a conclusion."""
+    if len(t_ns) < _MIN_MESSAGES:
         return ()
     steps, logged = _steps(t_ns), _steps(log_ns)
     found = []
-    if (share := _bunched(steps)) > _MOST_BUNCHED:
+    if (share := _burst_share(steps)) > _MAX_HICCUPS:
         found.append(
             f"topic {topic}: {100.0 * share:.0f} % of stamps in bursts (interval below 10 % of the median): stamped on "
             "arrival, not on measurement"
         )
-    if (share := _even(steps)) > _MOST_EVEN and _even(logged) < _FEW_EVEN:
+    if (share := _even_share(steps)) > _MIN_EVEN_STAMPS and _even_share(logged) < _MAX_EVEN_LOGS:
         found.append(
             f"topic {topic}: {100.0 * share:.0f} % of the stamps are exactly {np.median(steps) * 1e-6:.6g} ms apart "
             f"while log times jitter by {jitter_ns(logged) * 1e-6:.2g} ms (sigma): if they were counted and not "
@@ -53,14 +163,14 @@ def _steps(times: Stamps) -> Stamps:
     return np.asarray(np.diff(np.sort(times)), dtype=np.int64)
 
 
-def _bunched(steps: Stamps) -> float:
-    """The share of steps within bunches; those of zero are duplicates, and counted as such."""
-    across = min(_ACROSS, len(steps))
+def _burst_share(steps: Stamps) -> float:
+    """Share of steps within bursts; steps of zero are duplicates, and counted as such."""
+    across = min(_INTERVAL_SAMPLES, len(steps))
     time = np.concatenate([[0], np.cumsum(steps)])
     usual = float(np.median(time[across:] - time[:-across])) / across
-    return float(np.mean((steps > 0) & (steps < _WITHIN * usual)))
+    return float(np.mean((steps > 0) & (steps < _BURST_SHARE * usual)))
 
 
-def _even(steps: Stamps) -> float:
-    """The share of steps that are the usual one."""
-    return float(np.mean(np.abs(steps - np.median(steps)) <= _EXACT_NS))
+def _even_share(steps: Stamps) -> float:
+    """Share of steps that are the usual one."""
+    return float(np.mean(np.abs(steps - np.median(steps)) <= _EVEN_NS))

@@ -7,7 +7,9 @@ without a date counts from midnight, over midnight.
 from __future__ import annotations
 
 import datetime
+import math
 import re
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -35,25 +37,18 @@ def nanoseconds(path: Path, texts: NDArray[np.str_], unit: str) -> Stamps:
     if any(":" in text for text in texts[:2].tolist()):
         return _of_clock(path, texts)
     size = TIME_UNITS[unit]
-    ticks = _whole(path, texts, unit)
-    if ticks is not None:
+    try:
+        ticks = texts.astype(np.int64)
         _check_size(path, float(np.abs(ticks).max()) * size, unit)
         return _unwrapped(ticks) * size
+    except (ValueError, OverflowError):  # with a fraction or an exponent, or too large
+        pass
     try:
-        whole, _, rest = np.char.partition(texts, ".").T
-        digits = len(str(size)) - 1
-        exact = np.char.isdigit(np.char.lstrip(whole, "-")) & (np.char.isdigit(rest) | (rest == ""))
-        if not exact.all():  # with an exponent, say
-            values = texts.astype(float) * size
-            if np.isnan(values).any():
-                raise _no_time(path, texts[np.isnan(values)], unit)
-            _check_size(path, float(np.abs(values).max()), unit)
-            return np.rint(values).astype(np.int64)
-        _check_size(path, float(np.abs(whole.astype(float)).max()) * size, unit)
-        fraction = np.array([one[:digits].ljust(digits, "0") or "0" for one in rest.tolist()], dtype=np.int64)
-        sign = np.where(np.char.startswith(whole, "-"), -1, 1)
-        return whole.astype(np.int64) * size + sign * fraction
-    except (ValueError, OverflowError) as error:
+        numbers = [Decimal(text) for text in texts.tolist()]
+        _check_size(path, float(max(map(abs, numbers))) * size, unit)
+        # What is beyond the nanosecond is left out.
+        return np.array([int(number * size) for number in numbers], dtype=np.int64)
+    except (ArithmeticError, ValueError) as error:
         raise _no_time(path, texts, unit) from error
 
 
@@ -94,20 +89,6 @@ def _check_size(path: Path, largest_ns: float, unit: str) -> None:
     raise InputError(
         f"{path}: a time of {largest_ns / TIME_UNITS[unit]:.4g} {unit} is no date; is the unit {meant}? `unit: {meant}`"
     )
-
-
-def _whole(path: Path, texts: NDArray[np.str_], unit: str) -> Stamps | None:
-    """Whole numbers; None where any has a fraction."""
-    if unit == "ns":
-        # What is beyond the nanosecond is nothing.
-        texts = np.char.partition(texts, ".")[:, 0] if np.char.isdigit(texts[0].replace(".", "")) else texts
-    try:
-        return texts.astype(np.int64)
-    except OverflowError:
-        _check_size(path, float(np.abs(texts.astype(float)).max()) * TIME_UNITS[unit], unit)
-    except ValueError:
-        pass
-    return None
 
 
 def _unwrapped(ticks: Stamps) -> Stamps:
@@ -155,9 +136,12 @@ def _clock_ns(hour: str, minute: str, second: str | None, fraction: str | None) 
 
 
 def _no_time(path: Path, texts: NDArray[np.str_], unit: str) -> InputError:
-    for text in texts.tolist():
-        try:
-            float(text)
-        except ValueError:
-            return InputError(f"{path}: a time that is no number in {unit}: {text[:40]!r}")
-    return InputError(f"{path}: a time that is no number in {unit}: {str(texts[0])[:40]!r}")
+    wrong = next((text for text in texts.tolist() if not _is_finite(text)), str(texts[0]))
+    return InputError(f"{path}: a time that is no number in {unit}: {wrong[:40]!r}")
+
+
+def _is_finite(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False

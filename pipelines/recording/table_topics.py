@@ -20,15 +20,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
-from alidade.pipelines.recording.container import Container, sha256_of, sha256_together
-from alidade.pipelines.recording.parts import Parts
+from alidade.pipelines.recording.container import Container, MultiPartContainer, combined_sha256, file_sha256
+from alidade.pipelines.recording.images import VideoFile
 from alidade.pipelines.recording.sources import Axes, along
 from alidade.pipelines.recording.table_times import check_steps, nanoseconds, of_rate
 from alidade.pipelines.recording.table_units import COMPATIBLE, TIME_UNITS, UNITS, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns, table_form
-from alidade.pipelines.recording.video import VideoFile
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]
@@ -106,16 +105,27 @@ class TableTopic(BaseModel):
             raise ValueError("axes go with gyro, accel or field")
         return self
 
-    def read(self, path: Path, data: Path, topic: str = "") -> tuple[series.Topic, list[str]]:
-        """The topic, and sentences about what was concluded or left out.
+    @property
+    def names(self) -> list[str]:
+        """The columns that are needed."""
+        stamps = [] if self.time is None else [self.time]
+        return [*stamps, *self.where, *(name for found in self._given.values() for name in found)]
+
+    def to_series(
+        self, topic: str, path: Path, form: TableForm, columns: Mapping[str, NDArray[np.str_]]
+    ) -> tuple[series.Topic, list[str]]:
+        """The topic as a series, and sentences about what was concluded or left out.
 
         Rows without a number in any of its columns are left out. Raises InputError.
+
+        Args:
+            topic: its name.
+            path: of the table.
+            form: of the table.
+            columns: texts of its columns, `names` at least.
         """
-        given = {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
-        form = table_form(path, data)
-        stamps = [] if self.time is None else [self.time]
-        names = [*stamps, *self.where, *(name for found in given.values() for name in found)]
-        columns, notes = read_columns(path, data, list(dict.fromkeys(names)))
+        given, notes = self._given, list[str]()
+        columns = {name: columns[name] for name in self.names}
         rows = self._rows(path, columns)
         columns = {name: column[rows] for name, column in columns.items()}
         values = {name: numbers(path, columns, found) for name, found in given.items()}
@@ -150,6 +160,11 @@ class TableTopic(BaseModel):
         if kind is series.ImuSeries:
             shaped |= _absent({"gyro", "accel"} - values.keys())
         return kind(t_ns, **shaped), notes
+
+    @property
+    def _given(self) -> dict[str, list[str]]:
+        """Quantity -> its columns."""
+        return {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
 
     @property
     def _is_slow(self) -> bool:
@@ -236,8 +251,7 @@ _NUMBERS = (
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:
     """A container with its tables read as the config describes them. Raises InputError at a table that is not there."""
     tables = tables_of(container)
-    of: dict[str, dict[str, series.Topic]] = {name: {} for name in tables}
-    remarks: list[str] = []
+    by_file: dict[str, dict[str, TableTopic]] = {}
     for topic, table in columns.items():
         if (table.file is None and len(tables) != 1) or (table.file is not None and table.file not in tables):
             there = ", ".join(tables) or "none"
@@ -245,11 +259,20 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
                 f"no table {table.file}{nearest(table.file, list(tables))}" if table.file else "which table is meant?"
             )
             raise InputError(f"{container.path}: columns.{topic}.file: {wanted}; tables there: {there}")
-        name = table.file or next(iter(tables))
-        of[name][topic], notes = table.read(tables[name].path, tables[name].data, topic)
-        remarks += [note for note in notes if note not in remarks]
+        by_file.setdefault(table.file or next(iter(tables)), {})[topic] = table
+    of: dict[str, dict[str, series.Topic]] = {}
+    notes: list[str] = []
+    for name, topics in by_file.items():
+        path, data = tables[name].path, tables[name].data
+        form = table_form(path, data)
+        needed = dict.fromkeys(column for table in topics.values() for column in table.names)
+        texts, left_out = read_columns(path, data, form, list(needed))
+        notes += left_out
+        found = {topic: table.to_series(topic, path, form, texts) for topic, table in topics.items()}
+        of[name] = {topic: made for topic, (made, _) in found.items()}
+        notes += [note for _, concluded in found.values() for note in concluded]
     whole = _with_topics(container, of)
-    whole.remarks = (*whole.remarks, *(remark for remark in remarks if remark not in whole.remarks))
+    whole.assumptions = tuple(dict.fromkeys([*whole.assumptions, *notes]))
     return whole
 
 
@@ -257,18 +280,18 @@ def tables_of(container: Container) -> dict[str, CsvFile]:
     """The CSV files in a container, by name."""
     if isinstance(container, CsvFile):
         return {container.path.name: container}
-    parts = container.parts if isinstance(container, Parts) else ()
+    parts = container.parts if isinstance(container, MultiPartContainer) else ()
     return {name: table for part in parts for name, table in tables_of(part).items()}
 
 
 def _with_topics(container: Container, of: Mapping[str, Mapping[str, series.Topic]]) -> Container:
     if isinstance(container, CsvFile) and of.get(container.path.name):
         return _Described(container, of[container.path.name])
-    if isinstance(container, Parts):
+    if isinstance(container, MultiPartContainer):
         used = {video.path.resolve() for topics in of.values() for video in _videos(topics)}
         there = [part for part in container.parts if part.path.resolve() not in used]
-        whole = Parts(container.path, [_with_topics(part, of) for part in there])
-        whole.unpacked = container.unpacked
+        whole = MultiPartContainer(container.path, [_with_topics(part, of) for part in there])
+        whole.temporary, whole.incomplete = container.temporary, container.incomplete
         return whole
     return container
 
@@ -277,13 +300,13 @@ class _Described(ArrayContainer):
     """A table whose columns are known, with the videos that it has the stamps of."""
 
     def __init__(self, table: CsvFile, topics: Mapping[str, series.Topic]) -> None:
-        super().__init__(table.path, topics)
-        self.data, self._video_paths = table.data, [video.path for video in _videos(topics)]
+        super().__init__(table.path, topics, data=table.data)
+        self._video_paths = [video.path for video in _videos(topics)]
 
     def sha256(self) -> str:
         """SHA-256 of the table; with videos, of its digest and theirs, in order."""
         digest = super().sha256()
-        return sha256_together([digest, *map(sha256_of, self._video_paths)]) if self._video_paths else digest
+        return combined_sha256([digest, *map(file_sha256, self._video_paths)]) if self._video_paths else digest
 
 
 def _videos(topics: Mapping[str, series.Topic]) -> list[VideoFile]:

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.table_units import unit_in, unit_named
 
 Array = NDArray[np.float64]
@@ -99,14 +99,13 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
 class CsvFile(ArrayContainer):
     """A table; without topics until `table_topics.described` says which column is what."""
 
-    def __init__(self, path: Path, data: Path, remarks: Sequence[str] = ()) -> None:
-        super().__init__(path, {}, remarks)
-        self.data = data
+    def __init__(self, path: Path, data: Path, assumptions: Sequence[str] = ()) -> None:
+        super().__init__(path, {}, assumptions, data)
 
 
-def _unknown(path: Path, why: str = "") -> InputError:
+def _unknown(path: Path, why: str = "") -> NotARecordingError:
     named = "an MCAP file" if path.suffix == ".mcap" else "a table"
-    return InputError(f"{path}: not {named}, nor any other recording that is known{why}")
+    return NotARecordingError(f"{path}: not {named}, nor any other recording that is known{why}")
 
 
 def looks_like_text(start: bytes) -> bool:
@@ -154,7 +153,9 @@ def table_form(path: Path, data: Path) -> TableForm:
     )
 
 
-def read_columns(path: Path, data: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+def read_columns(
+    path: Path, data: Path, form: TableForm, names: Sequence[str]
+) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
     """The named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
@@ -163,7 +164,6 @@ def read_columns(path: Path, data: Path, names: Sequence[str]) -> tuple[dict[str
     Raises:
         InputError: a column is missing, or more rows are too short; the first of them is named.
     """
-    form = table_form(path, data)
     wanted = [form.index(path, name) for name in names]
     rows, notes = _whole_rows(path, data, form, wanted)
     table = np.array(rows, dtype=np.str_).reshape(len(rows), len(names))

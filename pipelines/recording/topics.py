@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from alidade.pipelines.recording import messages
 
 if TYPE_CHECKING:
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.settings import Config
 
 

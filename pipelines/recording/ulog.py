@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.array_container import ArrayContainer
 
 Array = NDArray[np.float64]
 # Columns of one topic of a log, by name.
@@ -29,12 +30,11 @@ _GAUSS = 1e-4
 _ENU_FROM_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 
 
-def read_ulog(path: Path, strict: bool, data: Path) -> ArrayContainer:
+def read_ulog(path: Path, data: Path) -> ArrayContainer:
     """The sensors, attitudes and fixes in a log, each under the name of its topic there, `/sensor_combined`.
 
     Further instances of a sensor are `/sensor_gyro/1` and so on, a sensor's temperature `/sensor_gyro/temperature`.
-    Raises InputError when pyulog is not installed or the file is damaged beyond reading; with `strict` when it is
-    damaged at all.
+    Raises InputError when pyulog is not installed or the file is damaged beyond reading.
     """
     try:
         from pyulog import ULog
@@ -43,22 +43,22 @@ def read_ulog(path: Path, strict: bool, data: Path) -> ArrayContainer:
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             log = ULog(str(data), [*_READERS, *_CLOCKS, _STATUS])
-        offset = _unix_offset(log.data_list)
-        topics = {name: read for found in log.data_list for name, read in _topics(found, offset)}
     except Exception as error:  # a parser on bytes that may be anything
         raise InputError(f"{path}: a PX4 log that cannot be read ({' '.join(str(error).split())[:200]})") from error
-    remarks = []
-    if log.file_corruption:
-        remarks.append("the log is damaged; what could be read of it is used")
-        if strict:
-            raise InputError(f"{path}: {remarks[0]}: --strict reads nothing that is damaged")
+    try:
+        offset = _unix_offset(log.data_list)
+        topics = {name: read for found in log.data_list for name, read in _topics(found, offset)}
+    except (KeyError, ValueError, IndexError) as error:  # fields that are missing or have another size
+        raise InputError(f"{path}: a PX4 log without the fields of its topics ({error})") from error
+    assumptions = []
     dropped = sum(dropout.duration for dropout in log.dropouts)
     if dropped:
-        remarks.append(f"the logger says that it lost {dropped} ms of messages, {len(log.dropouts)} times")
+        assumptions.append(f"the logger says that it lost {dropped} ms of messages, {len(log.dropouts)} times")
     if not offset:
-        remarks.append("no fix says what time it was: times are those since the autopilot was switched on")
-    container = ArrayContainer(path, topics, remarks)
-    container.data = data
+        assumptions.append("no fix says what time it was: times are those since the autopilot was switched on")
+    container = ArrayContainer(path, topics, assumptions, data)
+    if log.file_corruption:
+        container.incomplete = ("the log is damaged; what could be read of it is used",)
     return container
 
 
@@ -136,10 +136,7 @@ def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
 
 
 def _attitude(data: Columns, offset: int) -> series.QuaternionSeries:
-    w, x, y, z = _indexed(data, "q", 4).T
-    _, a, b, _ = _ENU_FROM_NED
-    turned = np.stack([-a * x - b * y, a * w + b * z, b * w - a * z, a * y - b * x], axis=1)
-    return series.QuaternionSeries(_stamps(data, offset), turned)
+    return series.QuaternionSeries(_stamps(data, offset), so3.multiply(_ENU_FROM_NED, _indexed(data, "q", 4)))
 
 
 def _odometry(data: Columns, offset: int) -> series.PoseSeries:

@@ -377,11 +377,11 @@ def _stability(c: Calibration) -> tuple[Block, ...]:
     """The result of the change test, where it was made."""
     if c.stability is None:
         return ()
-    changes = [sentences.sentence(f, c.quantities) for f in c.findings if f.kind == "change"]
+    changes = [sentences.sentence(f, c.quantities) for f in c.findings if f.kind in ("change", "jump")]
     name = next(iter(c.stability.departures), "")
     unchanged = (
-        "No significant change: the largest difference of the estimate until some moment from the final one is at "
-        f"{c.stability.time_s:.0f} s, mostly of {name} (p = {min(c.stability.level, 1.0):.2g})."
+        f"No significant change: the largest is at {c.stability.time_s:.0f} s, mostly of {name} "
+        f"(p = {min(c.stability.level, 1.0):.2g})."
     )
     return (Card((Text(changes[0] if changes else unchanged, soft=False),), id="stability"),)
 

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.display.figure import COLORS, PALETTE
 from alidade.pipelines.estimation.problem import Array, History
-from alidade.pipelines.recording.mcap_records import MESSAGE_HEAD
-from alidade.pipelines.recording.message_source import message_source
+from alidade.pipelines.recording.array_container import encode_series
 from alidade.pipelines.recording.messages import JOINT_STATE, definition_text
 from alidade.pipelines.recording.series import JointSeries
 from alidade.pipelines.reports.plots import variables
@@ -78,7 +77,8 @@ def write_estimates(path: Path, calibration: Calibration, history: History) -> N
                 topic, "cdr", joints, {"unit": unit, "method": calibration.problem.method}
             )
             series = JointSeries(stamps, numbers, names)
-            messages += [(t, channel, row) for t, row in zip(stamps.tolist(), _cdr(series), strict=True)]
+            encoded = encode_series(series).take(len(series))
+            messages += [(t, channel, row.tobytes()) for t, row in zip(stamps.tolist(), encoded, strict=True)]
         for k, (t_ns, channel, message) in enumerate(sorted(messages, key=lambda m: m[0])):
             # Log times are unsigned: what was stamped before 1970 is logged at its beginning.
             writer.add_message(channel, max(t_ns, 0), message, max(t_ns, 0), k)
@@ -96,12 +96,6 @@ def _plots(calibration: Calibration, history: History) -> Iterator[tuple[str, st
         edges = tuple(f"{q.name}{edge}" for q in members for edge in ("", "_lower", "_upper"))
         yield f"/plot/{variable}", unit, edges, bands
         yield f"/sigma/{variable}", unit, tuple(q.name for q in members), sigmas
-
-
-def _cdr(series: JointSeries) -> list[bytes]:
-    """Of all messages of a topic."""
-    source = message_source(0, series)
-    return [row[MESSAGE_HEAD.itemsize :].tobytes() for row in source.take(len(series))]
 
 
 def _stamps(epoch_ns: int, over_time: History) -> NDArray[np.int64]:

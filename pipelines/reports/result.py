@@ -182,7 +182,7 @@ class Calibration:
     @property
     def verdicts(self) -> dict[str, Verdict]:
         """Parameter -> verdict, of those with a required accuracy."""
-        return verdicts(quantities_of(self.problem, self.estimate), self.estimate.covariance)
+        return verdicts(quantities_of(self.problem, self.estimate), self.estimate.covariance, self.findings)
 
     @property
     def quantities(self) -> dict[str, Quantity]:

@@ -140,7 +140,7 @@ class LearningResult(_Record):
 
 
 class StabilityResult(_Record):
-    """Largest difference between an estimate during the recording and the final one, with its p-value."""
+    """Largest change during the recording, with its p-value."""
 
     statistic: float  # its size as a standard normal number
     level: float  # p-value

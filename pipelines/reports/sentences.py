@@ -8,12 +8,13 @@ Present tense, standard terms, numbers with units: those of `display/units.py`, 
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
-from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded
+from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.finding import Finding, Severity, status
 from alidade.pipelines.estimation.problem import Quantity
 
@@ -150,18 +151,36 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
     unit, factor = human_unit(q)
     prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
     numbers = f"{format_estimate(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
-    if not q.assumed:
+    if not (q.assumed or q.tight):
         return f"{q.name} is far from its prior", f"{numbers}; {_FAR}"
     inseparable = f" (or {', '.join(e['inseparable'])}, inseparable from it)" if e["inseparable"] else ""
     what = f"{q.name} contradicts its {'data sheet' if q.sheet else 'prior'}{inseparable}"
-    # Its largest effect on another parameter, in units of the requirement.
-    shifts = {name: shift / quantities[name].require for name, shift in e["effect"].items() if name != q.name}
-    moved = max(shifts, key=lambda name: abs(shifts[name]), default="")
+    return what, numbers + _shift(e["effect"], q.name, quantities, "its departure")
+
+
+def _shift(effect: Mapping[str, float], name: str, quantities: Quantities, what: str) -> str:
+    """The largest effect of a parameter on another one, in units of the requirement; empty where there is none."""
+    shifts = {other: effect[other] / quantities[other].require for other in effect if other != name}
+    moved = max(shifts, key=lambda other: abs(shifts[other]), default="")
     if not moved:
-        return what, numbers
+        return ""
     unit, factor = human_unit(quantities[moved])
-    shift = f"{rounded(factor * abs(e['effect'][moved]))} {unit}".rstrip()
-    return what, f"{numbers}; its departure shifts {moved} by {shift}, {abs(shifts[moved]):.2g} of its requirement"
+    shift = f"{rounded(factor * abs(effect[moved]))} {unit}".rstrip()
+    return f"; {what} shifts {moved} by {shift}, {abs(shifts[moved]):.2g} of its requirement"
+
+
+def _contradiction(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
+    return f"{': '.join(_fixed(e, severity, quantities))}."
+
+
+def _fixed(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[str, str]:
+    q = quantities.get(e["parameter"]) or Quantity(e["parameter"], e["unit"], 0.0, 1.0, math.inf)
+    unit, factor = human_unit(q)
+    stated = f"{to_digits_of(factor * e['stated'], factor * e['sigma'])} {unit}".strip()
+    inseparable = f" (or {', '.join(e['inseparable'][:_MAX_NAMED])})" if e["inseparable"] else ""
+    what = f"{q.name} is fixed at {stated} by the config, and the recording contradicts it{inseparable}"
+    numbers = f"{format_estimate(q, e['value'], e['sigma'])} if free (z = {e['z']:.1f})"
+    return what, numbers + _shift(e["effect"], q.name, quantities, "freeing it")
 
 
 def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
@@ -169,7 +188,18 @@ def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) ->
         f"{name} by {format_estimate(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]
     ]
     small = " Immaterial; included in the sigmas." if severity == Severity.NOTE else ""
-    return f"Change at {e['time_s']:.0f} s{': ' if steps else ''}{', '.join(steps)}.{small}"
+    return f"Change {_when(e)}{': ' if steps else ''}{', '.join(steps)}.{small}"
+
+
+def _jump(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    size, sigma = (to_digits_of(math.degrees(e[name]), math.degrees(e["sigma"])) for name in ("size", "sigma"))
+    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}: mount or reference, the motion does not tell."
+
+
+def _when(e: Mapping[str, Any]) -> str:
+    """Where measurements are more than a second apart, between which."""
+    since, until = e["since_s"], e["time_s"]
+    return f"between {since:.0f} and {until:.0f} s" if until - since > 1.0 else f"at {until:.0f} s"
 
 
 def _device_change(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
@@ -259,7 +289,9 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "direction": _direction,
     "hypothesis": _hypothesis,
     "prior_conflict": _prior_conflict,
+    "contradiction": _contradiction,
     "change": _change,
+    "jump": _jump,
     "device_change": _device_change,
     "rejection": _rejection,
     "noise": _noise,
@@ -275,7 +307,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
 }
 
 
-_CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict}
+_CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict, "contradiction": _fixed}
 
 
 def between(recordings: Sequence[str], dates: Sequence[str]) -> str:

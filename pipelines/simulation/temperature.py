@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from alidade.pipelines.estimation.assumptions import Assumption
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import Temperature
 
 Array = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0)]

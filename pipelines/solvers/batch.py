@@ -43,13 +43,14 @@ from alidade.pipelines.solvers.error_budget import (
     most_influential,
 )
 from alidade.pipelines.solvers.layout import Layout, Values
-from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
-from alidade.pipelines.solvers.linearization import Group, Linearization
-from alidade.pipelines.solvers.marginal_likelihood import largest_step, sandwich_of, solve_likelihood
-from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise, group_weights
+from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize, without_rejected
+from alidade.pipelines.solvers.linearization import Linearization
+from alidade.pipelines.solvers.marginal_likelihood import sandwich_of, solve_likelihood
+from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
 from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+from alidade.pipelines.solvers.step_test import largest_steps
 from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
 
@@ -178,18 +179,6 @@ def solve_batch(
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
 
 
-def without_rejected(engine: Engine, values: Values) -> Engine:
-    """The measurements that count at some values, in full, whatever they are elsewhere."""
-    return engine.with_groups([_counting(group, values) for group in engine.groups])
-
-
-def _counting(group: Group, values: Values) -> Group:
-    if group.loss is None:
-        return group
-    used = group.used(group.evaluate(values)[0]) > 0.5
-    return replace(group, loss=None, weights=group_weights(group) * used[:, None])
-
-
 def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[Solution, Minimum | None]:
     """The solution or, if another minimum is deeper, that one; and the second best if it is close."""
     problem, layout = compiled.problem, compiled.layout
@@ -228,10 +217,10 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
         added = added_variance(influence, correlations)
     by = inflation(names, posterior.covariance, influence.names if influence else (), added)
-    sandwich, step, wide = None, None, by
+    sandwich, steps, wide = None, None, by
     if problem.marginal_likelihood and isinstance(engine, Linearization) and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
-        step = largest_step(compiled, solved.levels, solved.solution)
+        steps = largest_steps(compiled, solved.levels, solved.solution)
         wide = by * np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
     covariance = posterior.covariance * np.outer(wide, wide)
     system, course = posterior.system, None
@@ -246,7 +235,7 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         covariance=covariance,
         inflation=by,
         sandwich=sandwich,
-        step=step,
+        steps=steps,
         colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in correlations.items()},
         converged=solved.solution.converged,
         message=solved.solution.message,
@@ -338,7 +327,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     if not np.array_equal(other.layout.key, solved.compiled.layout.key) or shapes[0] != shapes[1]:
         return {}
     kept = [
-        replace(new, loss=None, weights=group_weights(new) * (g.used(g.evaluate(values)[0]) > 0.5)[:, None])
+        replace(new, loss=None, weights=new.all_weights * (g.used(g.evaluate(values)[0]) > 0.5)[:, None])
         for g, new in zip(own.groups, engine.groups, strict=True)
     ]
     moves = influence.moves(engine.with_groups(kept))

@@ -11,7 +11,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,9 @@ import numpy as np
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level, Noise
-from alidade.pipelines.estimation.problem import Array, Factor
-from alidade.pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
+from alidade.pipelines.estimation.problem import Array, Factor, Step
+from alidade.pipelines.solvers.gtsam_engine import undetermined
+from alidade.pipelines.solvers.smoother import ordering_of
 from alidade.pipelines.solvers.window import Keyframes
 
 _SCHEMA = "alidade.checkpoint/5"
@@ -56,7 +57,7 @@ class MarginalState:
         """The marginal of a linear system about the values.
 
         Raises:
-            IndeterminateError: a variable that is marginalised out is not determined.
+            IndeterminateStateError: a variable that is marginalised out is not determined.
         """
         kept = set(keys)
         rest = [key for key in linear.keyVector() if key not in kept]
@@ -65,10 +66,9 @@ class MarginalState:
             remaining = linear.eliminatePartialMultifrontal(rest, gtsam.EliminateQR)[1] if rest else linear
             conditional, _ = gtsam.EliminateQR(remaining, ordering_of(keys))
         except RuntimeError as error:
-            raise IndeterminateError(explain(str(error))) from None
+            raise undetermined(error) from None
         own = gtsam.Values()
-        for key in keys:
-            _copy(values, key, own)
+        _copy(values, keys, own)
         return cls(time, own, gtsam.JacobianFactor(conditional), {k: t for k, t in stamps.items() if k in kept})
 
     @property
@@ -84,11 +84,13 @@ class MarginalState:
         return Factor("prior", gtsam.LinearContainerFactor(self.linear, self.values))
 
 
-def _copy(values: gtsam.Values, key: int, out: gtsam.Values) -> None:
-    try:
-        out.insert(key, values.atRot3(key))
-    except RuntimeError:
-        out.insert(key, values.atVector(key))
+def _copy(values: gtsam.Values, keys: Iterable[int], out: gtsam.Values) -> None:
+    """Insert some variables, vectors or rotations, into other values."""
+    for key in keys:
+        try:
+            out.insert(key, values.atRot3(key))
+        except RuntimeError:
+            out.insert(key, values.atVector(key))
 
 
 def require_known_variables(factors: Iterable[Factor], values: gtsam.Values, time: float) -> None:
@@ -110,13 +112,22 @@ def require_finite(factors: Sequence[Factor], values: gtsam.Values, time: float)
     """
     require_known_variables(factors, values, time)
     for f in factors:
-        linear = f.linearized(values)
-        if linear is not None and not np.isfinite(linear.augmentedJacobian()).all():
+        if not _is_finite(f, values):
             moment = time if f.measurement is None else float(f.measurement.model.time[0])
             raise InputError(
                 f"{f.family} at {moment:.3f} s: residual or Jacobian is not a finite number; look for NaN, infinite or "
                 "absurd values in the recording around that time"
             )
+
+
+def finite_measurements(step: Step, values: gtsam.Values) -> Step:
+    """A step without the measurements that give no finite numbers at the values."""
+    return replace(step, factors=[f for f in step.factors if f.measurement is None or _is_finite(f, values)])
+
+
+def _is_finite(factor: Factor, values: gtsam.Values) -> bool:
+    linear = factor.linearized(values)
+    return linear is None or bool(np.isfinite(linear.augmentedJacobian()).all())
 
 
 @dataclass(frozen=True, eq=False)

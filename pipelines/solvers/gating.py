@@ -22,10 +22,7 @@ from numpy.typing import NDArray
 from alidade.factors.chi_square import gate
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Problem, Residuals
 from alidade.pipelines.solvers.error_budget import autocorrelation
-from alidade.pipelines.solvers.linear_system import linear_graph_of
-from alidade.pipelines.solvers.marginals import ordering_of
-from alidade.pipelines.solvers.smoother import Smoother, slices
-from alidade.pipelines.solvers.system import residuals_of
+from alidade.pipelines.solvers.smoother import Smoother, linear_graph_of, ordering_of, slices
 
 # Steps in a row that are rejected whole before one is taken nevertheless: by then it is the prediction that is wrong.
 MAX_REJECTED_IN_A_ROW = 10
@@ -225,9 +222,9 @@ class InnovationGate:
         rows = self.families.setdefault(factor.family, RowBuffer())
         rows.add(np.column_stack([time, used, whitened.reshape(len(time), -1)]))
 
-    def adopt_inliers(self, factors: Sequence[Factor], values: gtsam.Values) -> None:
-        """Adopt the inlier set of a solution, and its residuals where the gate had decided otherwise."""
-        for family, found in residuals_of(factors, values).items():
+    def adopt_inliers(self, residuals: Mapping[str, Residuals]) -> None:
+        """Adopt the inlier set of a solution, and its residuals by family where the gate had decided otherwise."""
+        for family, found in residuals.items():
             rows = np.column_stack([found.time, found.used, found.whitened])
             live = self.families.setdefault(family, RowBuffer()).array
             if len(live):

@@ -18,8 +18,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from alidade.factors.bridge import jacobian_factor
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.vectorized import jacobian_factor
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
@@ -133,7 +133,7 @@ class GtsamSystem:
         try:
             tree, left = graph.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:
-            raise _undetermined(error) from error
+            raise undetermined(error) from None
         columns = {int(key): layout.root_columns(int(key)) for key in layout.key[last]}
         rows = [np.zeros((0, c + s + 1))]
         for i in range(left.size()):
@@ -181,8 +181,8 @@ class GtsamSystem:
         return graph
 
 
-def _undetermined(error: RuntimeError) -> IndeterminateStateError:
-    """Names the state that gtsam was working near."""
+def undetermined(error: RuntimeError) -> IndeterminateStateError:
+    """What gtsam's text about an indeterminate system says, with the name of the state that it was working near."""
     found = re.search(r"Symbol: (\w+)", str(error))
     return IndeterminateStateError(UNDETERMINED.replace("a state", f"state {found[1]}") if found else UNDETERMINED)
 

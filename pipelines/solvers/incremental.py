@@ -25,7 +25,7 @@ at their priors, too, until it does.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -44,35 +44,40 @@ from alidade.pipelines.estimation.problem import (
     Problem,
     Step,
 )
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-from alidade.pipelines.solvers.checkpoint import MarginalState, SavedRun, require_finite, require_known_variables
-from alidade.pipelines.solvers.curvature import second_order
+from alidade.pipelines.solvers.batch import Solved, residuals_by_family, solve
+from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, IndeterminateError
+from alidade.pipelines.solvers.checkpoint import (
+    MarginalState,
+    SavedRun,
+    finite_measurements,
+    require_finite,
+    require_known_variables,
+)
+from alidade.pipelines.solvers.curvature import SecondOrder, beyond_second_order
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
-from alidade.pipelines.solvers.history import sequential_history
-from alidade.pipelines.solvers.marginals import (
-    IndeterminateError,
-    coordinate_inverse,
-    explain,
-    information_of,
-    joint_covariance,
-    prior_units,
-    reported,
+from alidade.pipelines.solvers.gtsam_engine import GtsamEngine, undetermined
+from alidade.pipelines.solvers.levenberg import without_rejected
+from alidade.pipelines.solvers.linearization import Linearization
+from alidade.pipelines.solvers.posterior import WIDEST, Reported
+from alidade.pipelines.solvers.posterior_history import posterior_history
+from alidade.pipelines.solvers.smoother import (
+    FixedLagSmoother,
+    Isam2,
+    Smoother,
+    inliers,
+    linearized,
+    slices,
+    weigh,
+    without_loss,
 )
-from alidade.pipelines.solvers.noise_levels import weigh
-from alidade.pipelines.solvers.smoother import FixedLagSmoother, Isam2, Smoother, inliers, linearized, without_loss
-from alidade.pipelines.solvers.system import Linear
-from alidade.pipelines.solvers.weighing import optimize, with_levels
+from alidade.pipelines.solvers.weak_directions import MAX_SIGMA
 from alidade.pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
 # Steps freed with each new one, of those marginalised out: a thousand at once take longer than an update.
 _FREED = 10
-# Posterior sigma of a calibrated direction, in units of its usual prior's, above which it is weak: linear Gaussians are
-# wrong about it, and turn the noise of states into information about it.
-MAX_SIGMA = 0.3
-# Largest sigma of a direction, in units of its usual prior's.
-_WIDEST = 1e4
 # Elements of a unit vector below this are rounding.
 _ROUNDING = 1e-9
 
@@ -170,38 +175,26 @@ class MomentRecorder:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Posterior:
-    """Mean and covariance of the free reported numbers, in units of their usual priors' sigmas.
+    """Mean and covariance of the free reported numbers u, in units of their usual priors' sigmas.
 
     Attributes:
-        values: (n,) all reported numbers, SI.
-        mean: (m,) of the free ones, less their prior means.
-        covariance: (m, m), with terms of second order.
-        prior: (m, m) their prior covariance; infinite variances: no prior.
-        calibrated: (m,) whether they are calibrated, and no nuisance parameters.
-        free: (m,) their places among the reported numbers.
-        scale: (m,) the usual priors' sigmas.
-        extra: (m,) sigmas of errors that the graph does not model, SI.
+        reported: the numbers.
+        covariance: (m, m) of u, with terms of second order.
     """
 
-    values: Array
-    mean: Array
+    reported: Reported
     covariance: Array
-    prior: Array
-    calibrated: NDArray[np.bool_]
-    free: NDArray[np.intp]
-    scale: Array
-    extra: Array
 
     def weak(self, unknown: NDArray[np.bool_] | bool = False) -> Array:
         """(m, w) orthonormal weak directions: of calibrated numbers but some unknown, with sigmas above MAX_SIGMA.
 
         Nuisance parameters are small whatever they are: nothing is nonlinear across their priors.
         """
-        own = np.flatnonzero(self.calibrated & ~np.asarray(unknown))
+        own = np.flatnonzero(self.reported.calibrated & ~np.asarray(unknown))
         variance, vectors = np.linalg.eigh(self.covariance[np.ix_(own, own)])
-        weak = np.zeros((len(self.mean), int((variance > MAX_SIGMA**2).sum())))
+        weak = np.zeros((len(self.covariance), int((variance > MAX_SIGMA**2).sum())))
         weak[own] = vectors[:, len(own) - weak.shape[1] :]
         return weak
 
@@ -214,17 +207,13 @@ class _Posterior:
         Args:
             directions: (m, w), orthonormal.
         """
-        E = directions[:, ~(np.abs(directions[np.isinf(np.diag(self.prior))]) > _ROUNDING).any(axis=0)]
-        others = np.eye(len(self.mean)) - E @ E.T
-        own = others @ self.covariance @ others + (E @ E.T) @ _finite(self.prior) @ (E @ E.T)
-        values, covariance = self.values.copy(), np.zeros((len(self.values), len(self.values)))
-        values[self.free] -= self.scale * (E @ (E.T @ self.mean))
-        covariance[np.ix_(self.free, self.free)] = own * np.outer(self.scale, self.scale) + np.diag(self.extra**2)
-        return values, covariance
-
-
-def _finite(variance: Array) -> Array:
-    return np.where(np.isinf(variance), 0.0, variance)
+        reported = self.reported
+        E = directions[:, ~(np.abs(directions[~reported.bounded]) > _ROUNDING).any(axis=0)]
+        others = np.eye(len(self.covariance)) - E @ E.T
+        own = others @ self.covariance @ others + E @ (E.T @ np.linalg.inv(reported.prior) @ E) @ E.T
+        values = reported.numbers.copy()
+        values[reported.free] -= reported.scale * (E @ (E.T @ reported.u))
+        return values, reported.covariance(own)
 
 
 class IncrementalSolver:
@@ -271,7 +260,7 @@ class IncrementalSolver:
         self._before = 0.0  # number of keyframes before these
         self._solved = 0, 0.0  # number of steps in the last batch solution, and their time, s
         self._fewest_weak = len(problem.quantities)  # number of weak directions seen until now, at least
-        self._second: Array | None = None  # (n, n) covariance of second order in the last batch solution
+        self._second: Array | None = None  # (m, m) covariance of second order in the last batch solution, prior units
         self._beyond = np.ones(len(problem.quantities), dtype=bool)  # numbers that need more than second order
         self._course: Callable[[], Course | None] = lambda: None  # of the last batch solution
 
@@ -406,7 +395,7 @@ class IncrementalSolver:
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
         history, n = self.history.array.copy(), len(values)
-        to_tangents = coordinate_inverse(self.problem.parameters, self._current(), self.keys)
+        to_tangents = np.asarray(np.linalg.pinv(self._reported().jacobian), dtype=float)
         grown, lengths = correlation_inflation(self.problem, covariance, self.gate, to_tangents)
         inflation = sigma_ratio(np.diag(covariance), np.diag(grown))
         attitudes = self.attitudes.array.copy()
@@ -442,40 +431,31 @@ class IncrementalSolver:
         outliers cannot be told from measurements.
         """
         posterior = self._posterior()
-        unknown = np.zeros(len(posterior.mean), dtype=bool)
+        unknown = np.zeros(len(posterior.covariance), dtype=bool)
         if self.initialising and not decided:
-            unknown = self._beyond[posterior.free] | self.gate.too_few_to_decide()
+            unknown = self._beyond[posterior.reported.free] | self.gate.too_few_to_decide()
         return posterior.at_prior(np.hstack([np.eye(len(unknown))[:, unknown], posterior.weak(unknown)]))
 
     def _posterior(self) -> _Posterior:
         """The smoother's posterior of the reported numbers. Raises IndeterminateError when it is singular."""
-        values = self._current()
+        reported = self._reported()
         assert self._smoother is not None
+        J = reported.jacobian[reported.free] / reported.scale[:, None]
         try:
-            information = information_of(self._smoother.covariance(self.keys))
+            covariance = J @ self._smoother.covariance(self.keys) @ J.T
         except (RuntimeError, np.linalg.LinAlgError) as error:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is singular: {error}") from error
-        if not np.isfinite(information).all():
+        if not np.isfinite(covariance).all():
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
-        quantities = self.problem.quantities
-        numbers = reported(self.problem, values, self.current_keys)
-        free, scale, unit = prior_units(self.problem.parameters, values, self.keys)
-        known, axes = np.linalg.eigh(unit.T @ information @ unit)
-        covariance = (axes / np.maximum(known, _WIDEST**-2)) @ axes.T
-        if self._second is not None:
-            covariance += self._second[np.ix_(free, free)] / np.outer(scale, scale)
-        own = [quantities[i] for i in free]
-        sigmas = np.array([np.inf if q.prior_sigma is None else q.prior_sigma for q in own])
-        return _Posterior(
-            values=numbers,
-            mean=(numbers[free] - [q.prior_mean for q in own]) / scale,
-            covariance=covariance,
-            prior=self.problem.prior_covariance([q.name for q in own], sigmas) / np.outer(scale, scale),
-            calibrated=np.array([not q.assumed for q in own], dtype=bool),
-            free=free,
-            scale=scale,
-            extra=np.array([q.extra_sigma for q in own]),
-        )
+        variances, axes = np.linalg.eigh(covariance)
+        covariance = (axes * np.clip(variances, 0.0, WIDEST**2)) @ axes.T
+        return _Posterior(reported, covariance if self._second is None else covariance + self._second)
+
+    def _reported(self) -> Reported:
+        """The reported numbers now, with their Jacobian by the tangents of the variables that hold them."""
+        values, keys = self._current(), self.keys
+        where, dims = slices(keys, values.dims()), sum(values.dims()[key] for key in keys)
+        return Reported.at(self.problem, values, keys, [np.eye(dims)[where[key]] for key in keys])
 
     # -- step by step
 
@@ -557,104 +537,103 @@ class IncrementalSolver:
     def _solve_batch(self) -> None:
         """Solve everything since the marginal in batch, and start the smoother from the solution, without outliers."""
         from_start = self.marginal is None
-        whole = self._assembled()
-        about = self._batch_solution(whole)
-        values, system = about.values, about.system
+        steps = self._all_steps_since()
+        stamps = self._ages({key: time for step in self.steps_since for key, time in step.timestamps.items()})
+        if self.marginal is not None:
+            stamps = {**self.marginal.stamps, **stamps}
+        solved = self._batch_solution(steps)
+        values = solved.compiled.layout.to_gtsam(solved.solution.values)
         if from_start:
-            with system.at(values):
-                self.gate.adopt_inliers(system.factors, values)
+            self.gate.adopt_inliers(residuals_by_family(solved.engine, solved.solution.values))
         since = self.time - self.steps_since[0].time if from_start and self.steps_since else 0.0
         last = self.steps_since[-1].keyframes if self.steps_since else range(0)
-        self._restart(about, whole.timestamps, since)
+        self._restart(solved, values, stamps, since)
         if from_start:
             self.moments += 1
-            ends = whole.boundaries
-            self._course = cache(
-                lambda: sequential_history(
-                    self.problem, system.linearize(values), system.ordering, values, ends, ends[0].time
-                )
-            )
+            self._course = cache(lambda: _course_of(solved))
             if not self.initialising:
                 self.recorder, self._course = MomentRecorder.after(self._course()), lambda: None
             self.attitudes.clear()
-        self._record(whole.keyframes if from_start else last, values)
+        self._record(solved.compiled.keyframes if from_start else last, values)
         self._solved = len(self.steps_since), since
         self._count_weak()
         self.gate.begin_count()
 
-    def _assembled(self) -> Assembly:
-        """The steps since the marginal as one graph, the marginal with them."""
-        whole = Assembly.of(self._all_steps_since())
-        whole.timestamps = self._ages(whole.timestamps)
-        if self.marginal is not None:
-            whole.factors.append(self.marginal.factor)
-            whole.initial.insert(self.marginal.estimate)
-            whole.timestamps = {**self.marginal.stamps, **whole.timestamps}
-        return whole
+    def _all_steps_since(self) -> list[Step]:
+        """The steps since the marginal, the marginal as the first of them."""
+        if self.marginal is None:
+            return self.steps_since
+        start = Step(self.marginal.time, self.marginal.estimate, [self.marginal.factor])
+        start.current_keys.update(self.current_keys)
+        return [start, *self.steps_since]
 
-    def _all_steps_since(self) -> Iterator[Step]:
-        """The steps since the marginal; those since the start with many measurements in each, which solve faster."""
-        now = -np.inf
-        for step in self.problem.steps(CHUNK) if self.marginal is None else ():
-            if step.time > self.time:
-                break
-            now = step.time
-            yield step
-        yield from (step for step in self.steps_since if step.time > now)
+    def _batch_solution(self, steps: Sequence[Step]) -> Solved:
+        """The most probable values of some steps; noise levels are estimated until something was marginalised out.
 
-    def _batch_solution(self, whole: Assembly) -> Linear:
-        """The most probable values, with noise levels estimated; linearised there."""
-        solution = optimize(
-            weigh(whole.factors, self.levels),
-            whole.initial,
-            self.keys,
-            self.problem.loss,
-            held=self.problem.assumed,
-        )
-        about = None
-        if solution.converged:
-            solution, self.levels, about, _ = with_levels(self.problem, whole.factors, solution, self.levels)
-        if not solution.converged:
-            require_finite(whole.factors, whole.initial, self.time)
-        self.trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
-        return about or solution.system.linearized(solution.values)
+        Raises:
+            InputError: a factor gives no finite numbers.
+            IndeterminateError: something is not determined.
+        """
+        problem = replace(self.problem, finer=None, elsewhere=None)
+        compiled = Compiled.of(problem, steps=steps)
+        if not np.isfinite(compiled.engine.cost(compiled.initial)):
+            compiled = Compiled.of(problem, steps=self._finite(steps, compiled.layout.to_gtsam(compiled.initial)))
+        try:
+            solved = solve(compiled, levels=None if self.marginal is None else self.levels)
+        except np.linalg.LinAlgError as error:
+            raise IndeterminateError(f"the first {self.time:.3f} s do not determine the parameters: {error}") from error
+        self.levels = solved.levels
+        found = solved.solution
+        self.trouble = "" if found.converged else f"the first {self.time:.1f} s: {found.message}"
+        return solved
 
-    def _restart(self, about: Linear, stamps: Mapping[int, float], since: float) -> None:
+    def _finite(self, steps: Sequence[Step], values: gtsam.Values) -> list[Step]:
+        """The steps without the measurements that the gate has found unusable: no finite numbers at the values.
+
+        Raises:
+            InputError: another factor gives none.
+        """
+        if self._smoother is not None:
+            steps = [finite_measurements(step, values) for step in steps]
+        require_finite([f for step in steps for f in step.factors], values, self.time)
+        return list(steps)
+
+    def _restart(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float], since: float) -> None:
         """Start the smoother from a batch solution `since` s after the first step; may end the initialisation phase."""
         before = self._posterior() if self._smoother is not None else None
-        self._start_from(about, stamps)
+        self._start_from(solved, values, stamps)
         if not self.initialising:
             return
-        covariance = joint_covariance(self.problem, about, self.current_keys)
-        second = second_order(self.problem, about, covariance, self.current_keys)
-        self._second = None if second is None else second.covariance
+        second = SecondOrder.of(solved.posterior)
+        self._second = second.covariance
         # Second order that has once gone far enough does so from then on.
-        if second is None:
-            self._beyond[:] = False
-        elif self._beyond.any():
-            self._beyond &= second.beyond()
-        is_curved = second is not None and second.share() > self.config.max_curvature
+        if self._beyond.any() and np.isfinite(second.share):
+            self._beyond &= beyond_second_order(solved)
+        is_curved = second.share > self.config.max_curvature
         if since >= self.config.max_initialisation or (not is_curved and self._is_settled(before)):
             self.initialising = False
-            self._start_from(about, stamps)
+            self._start_from(solved, values, stamps)
 
     def _is_settled(self, before: _Posterior | None) -> bool:
         """Whether no calibrated direction is weak, and a batch solution agrees with the smoother's posterior before."""
         if self.trouble or before is None or len(self.steps_since) < self.config.min_steps:
             return False
         now = self._posterior()
-        change = np.abs(now.mean - before.mean) / np.sqrt(np.diag(now.covariance))
+        change = np.abs(now.reported.u - before.reported.u) / np.sqrt(np.diag(now.covariance))
         return now.weak().shape[1] == 0 and bool(change.max() < self.config.max_change)
 
-    def _start_from(self, about: Linear, stamps: Mapping[int, float]) -> None:
+    def _start_from(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float]) -> None:
         """Start the smoother from a solution: from its active variables alone, or without a window from all of it."""
-        values, loss = about.values, about.system.loss
         if self.window is None:
             factors = (f for step in self.steps_since for f in weigh(step.factors, self.levels))
-            used = [without_loss(f) for f in (inliers(f, values, loss) for f in factors) if f is not None]
+            used = [without_loss(f) for f in (inliers(f, values, self.problem.loss) for f in factors) if f is not None]
             self._start(used, values, stamps)
             return
-        state = MarginalState.of(self.time, about.graph, values, active_variables(values, stamps), stamps)
+        at = solved.solution.values
+        engine = without_rejected(solved.engine, at)
+        assert isinstance(engine, Linearization | GtsamEngine)
+        system, _ = (engine if isinstance(engine, GtsamEngine) else GtsamEngine(engine)).at(at)
+        state = MarginalState.of(self.time, system.graph, values, active_variables(values, stamps), stamps)
         if self.initialising:
             self._start([state.factor], state.values, state.stamps)
         else:
@@ -672,10 +651,23 @@ class IncrementalSolver:
         try:
             self._smoother.update(factors, values, stamps)
         except RuntimeError as error:
-            raise IndeterminateError(explain(str(error))) from None
+            raise undetermined(error) from None
 
 
 def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[int]:
     """Keys of the variables that later steps may refer to: those of the last moment and those that never age."""
     latest = max(stamps.values(), default=-np.inf)
     return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]
+
+
+def _course_of(solved: Solved) -> Course | None:
+    """What was known at moments before a batch solution."""
+    compiled, posterior = solved.compiled, solved.posterior
+    engine = without_rejected(solved.engine, solved.solution.values)
+    system, found = engine.at(posterior.values)[0], posterior.factorization
+    if not (isinstance(engine, Linearization) and isinstance(system, ChainSystem)):
+        return None
+    assert isinstance(found, ChainFactorization)
+    final = posterior.reported.numbers, posterior.covariance
+    keys = compiled.current_keys
+    return posterior_history(compiled.problem, engine, system, found, posterior.values, keys, engine.time, final)

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import (
     Block,
@@ -35,7 +36,6 @@ from alidade.factors.model import (
     stack_models,
     stacking_key,
 )
-from alidade.factors.vectorized import VectorizedFactor
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import Array, ChainSystem, Index
 from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Values, insert_value
@@ -124,6 +124,16 @@ class Group:
             blocks.append(np.broadcast_to(array, (n, array.shape[1])))
         return self.model(*blocks)
 
+    @property
+    def all_weights(self) -> Array:
+        """(n, m) weights of the rows beside the loss, a copy."""
+        shape = len(self.model.time), self.model.rows
+        return np.ones(shape) if self.weights is None else self.weights.copy()
+
+    def counting(self, used: NDArray[np.bool_]) -> Group:
+        """Without its loss: those of its n measurements that are used in full, the others not at all."""
+        return self if self.loss is None else replace(self, loss=None, weights=self.all_weights * used[:, None])
+
     def weighted(self, residuals: Array) -> Array:
         """Residuals with the noise weights."""
         return residuals if self.weights is None else self.weights * residuals
@@ -189,9 +199,9 @@ class Linearization:
     @classmethod
     def of(cls, factors: Sequence[Factor], layout: Layout, chain: bool = True) -> Linearization:
         """Compile factors. Raises NotAChainError where they do not fit the chain; without `chain` nothing has to."""
-        kinds: dict[Hashable, list[tuple[int, Factor, VectorizedFactor]]] = {}
+        kinds: dict[Hashable, list[tuple[int, Factor, BoundModel]]] = {}
         for i, factor in enumerate(factors):
-            v = factor.vectorized or _native(factor, layout)
+            v = factor.bound or _native(factor, layout)
             key = stacking_key(v.model), layout.roles(v.columns), factor.family, factor.measurement is None
             kinds.setdefault((*key, v.loss is None, factor.beside is None), []).append((i, factor, v))
         drafts = [_Draft.of(kind, layout, chain) for kind in kinds.values()]
@@ -296,7 +306,7 @@ def _require_cancelled(rows: Array, c: int, family: str) -> None:
         raise NotAChainError(f"{family}: rows join bias nodes and shared variables, and no keyframe")
 
 
-def _native(factor: Factor, layout: Layout) -> VectorizedFactor:
+def _native(factor: Factor, layout: Layout) -> BoundModel:
     """A native gtsam factor as a measurement. Raises NotAChainError where it may reject measurements by itself."""
     import gtsam
 
@@ -336,7 +346,7 @@ class _Draft:
     whole: list[bool]
 
     @classmethod
-    def of(cls, kind: Sequence[tuple[int, Factor, VectorizedFactor]], layout: Layout, chain: bool) -> _Draft:
+    def of(cls, kind: Sequence[tuple[int, Factor, BoundModel]], layout: Layout, chain: bool) -> _Draft:
         _, first, v = kind[0]
         model, lengths = stack_models([each.model for *_, each in kind]), [len(each.model.time) for *_, each in kind]
         n = sum(lengths)

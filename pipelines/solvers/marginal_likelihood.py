@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 
 from alidade.factors.chi_square import gate
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
-from alidade.pipelines.estimation.problem import Problem, StepEstimate
-from alidade.pipelines.solvers.chain import Array, Index
+from alidade.pipelines.estimation.problem import Problem
+from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.noise_estimation import apply_levels, group_weights
+from alidade.pipelines.solvers.noise_estimation import apply_levels
 
 Outliers = Mapping[int, NDArray[np.bool_]]
 
@@ -40,16 +40,13 @@ Outliers = Mapping[int, NDArray[np.bool_]]
 OUTLIER_GATES = 3.0
 # Keyframes that are enough to tell levels: of a longer recording half of them are the liveliest.
 ENOUGH_KEYFRAMES = 6000
-# Newton steps, none longer than this in the logarithm of a level; they stop where none is longer than that.
-_MOST_STEPS, _LONGEST_STEP, _SETTLED = 25, 1.5, 3e-3
+# Newton steps, none longer than this in the logarithm of a level; one that lowers -2 log L by less is the last: levels
+# are then within .2 of their sigmas, as random signs have them.
+_MOST_STEPS, _LONGEST_STEP, _SETTLED = 12, 1.5, 0.05
 # A step may be shortened so often, and raise -2 log L by so much: rounding.
 _HALVINGS, _FINE = 6, 1e-3
 # s, within which errors may be correlated however they are.
 SANDWICH_BLOCK_S = 5.0
-# Times at which a step is looked for, and how wide its prior is, rad.
-_CANDIDATES, _STEP_PRIOR = 40, 0.35
-# Scans, of which each looks closer about the best time of the one before, down to single measurements.
-_SCANS = 3
 _CERTAIN = 3.0
 # Linearisations, of which the first ones widen; levels have settled whose logarithms move by less.
 _MOST_ROUNDS, _WIDENING_ROUNDS, _STEADY = 8, 2, 0.02
@@ -181,37 +178,11 @@ class LinearChain:
         part = replace(self, size=(int(kept.sum()), self.size[1]), rows=some)
         return part, [each[own] for each, own in zip(factors, inside, strict=True)]
 
-    def with_steps(self, columns: Index, times: Array) -> LinearChain:
-        """The same where shared parameters, given by their columns, step at some times: d more for each time."""
-        d, n = len(columns), len(times)
-        some = []
-        for rows in self.rows:
-            late = (rows.time[:, None] >= times) if rows.is_measurement else np.zeros((len(rows.time), n), dtype=bool)
-            steps = late[:, None, :, None] * rows.shared[:, :, None, columns]
-            wide = np.concatenate([rows.shared, steps.reshape(*rows.shared.shape[:2], n * d)], axis=2)
-            some.append(replace(rows, shared=wide))
-        p = self.prior.shape[1] - 1
-        prior = np.zeros((len(self.prior) + n * d, p + n * d + 1))
-        prior[: len(self.prior), :p], prior[: len(self.prior), -1] = self.prior[:, :p], self.prior[:, p]
-        prior[len(self.prior) :, p:-1] = np.eye(n * d) / _STEP_PRIOR
-        return replace(self, rows=tuple(some), prior=prior)
-
-    def step_scores(self, columns: Index, times: Array, variances: Sequence[Array]) -> Array:
-        """Score test (n,) of a step at each of some times, chi-square of d numbers, all other parameters free."""
-        p, d = self.prior.shape[1] - 1, len(columns)
-        limits = [gate(rows.residuals.shape[1]) ** 2 for rows in self.rows]
-        found = self.with_steps(columns, times).innovations(variances, limits, by_shared=True)
-        whole = np.concatenate([each.whitened.reshape(-1, each.whitened.shape[2]) for each in found.values()])
-        e, G = whole[:, 0], whole[:, 1:]
-        H, right = G.T @ G, G.T @ e
-        C = np.linalg.pinv(H[:p, :p] + self.prior[:, :p].T @ self.prior[:, :p], hermitian=True)
-        scores = np.zeros(len(times))
-        for k in range(len(times)):
-            own = slice(p + k * d, p + (k + 1) * d)
-            information = H[own, own] - H[own, :p] @ C @ H[:p, own]
-            score = right[own] - H[own, :p] @ C @ right[:p]
-            scores[k] = score @ np.linalg.pinv(information, hermitian=True) @ score
-        return scores
+    def reversed(self) -> LinearChain:
+        """The same chain with its states in the opposite order."""
+        last = self.size[0] - 1
+        rows = tuple(replace(r, states=tuple((last - i, J) for i, J in r.states[::-1])) for r in self.rows)
+        return replace(self, rows=rows)
 
     def variances(self, levels: Sequence[Level]) -> list[Array]:
         """(n,) of each kind of rows, over what was stated."""
@@ -278,7 +249,7 @@ class LinearChain:
         """
         n, d = self.size
         q = 1 + (self.prior.shape[1] - 1 if by_shared else 0)
-        F, c, Q = self._transitions(variances, by_shared)
+        F, c, Q = self.transitions(variances, by_shared)
         seen = [k for k, rows in enumerate(self.rows) if rows.is_measurement and len(rows.states) == 1]
         queues = {k: _queue(self.rows[k].states[0][0], n) for k in seen}
         found = {k: (np.zeros(len(self.rows[k].time)), np.zeros((*self.rows[k].residuals.shape, q))) for k in seen}
@@ -314,7 +285,7 @@ class LinearChain:
                     P[own] -= K @ J @ P[own]
         return {kind: Innovations(*each) for kind, each in found.items()}
 
-    def _transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
+    def transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
         """x_k = F_k x_k-1 + c_k and the covariance Q_k; a state that nothing joins to the one before is diffuse.
 
         `c` has the derivatives by the shared parameters beside it where they are asked for.
@@ -326,12 +297,13 @@ class LinearChain:
             if len(rows.states) != 2 or rows.residuals.shape[1] != d:
                 continue
             (_, before), (now, after) = rows.states
-            inverse = np.linalg.inv(after)
+            joined = np.isfinite(variance)
+            inverse, now = np.linalg.inv(after[joined]), now[joined]
             right = rows.residuals[..., None]
             if by_shared:
                 right = np.concatenate([right, rows.shared], axis=2)
-            F[now], c[now] = -inverse @ before, -inverse @ right
-            Q[now] = variance[:, None, None] * inverse @ np.swapaxes(inverse, 1, 2)
+            F[now], c[now] = -inverse @ before[joined], -inverse @ right[joined]
+            Q[now] = variance[joined, None, None] * inverse @ np.swapaxes(inverse, 1, 2)
         return F, c, Q
 
 
@@ -365,6 +337,11 @@ class _Solution:
         right = shared - self.border.T @ states
         x = np.linalg.solve(self.small.T, np.linalg.solve(self.small, right))
         return cho_solve_banded((self.root, False), states, check_finite=False) - self.border @ x, x
+
+    def covariance(self, by_shared: Array) -> Array:
+        """(r, r) of numbers that go with the shared parameters by derivatives (r, p)."""
+        half = np.linalg.solve(self.small, by_shared.T)
+        return np.asarray(half.T @ half)
 
     def gathered(self, of_rows: Sequence[Array]) -> tuple[Array, Array]:
         """A'y of whitened rows y (n, m, k) of each kind."""
@@ -449,6 +426,9 @@ def estimate_levels(
         levels: to begin with.
         widening: group -> (n,) as it is, None: none.
         rejected: group -> (n,) measurements that are taken for outliers, which have no say.
+
+    Raises:
+        IndeterminateStateError: states or parameters are not determined at the levels to begin with.
     """
     wide, out = _by_row(chain, widening, 1.0), _by_row(chain, rejected, 0.0)
     factors = [np.where(o > 0.0, np.inf, w**2) for w, o in zip(wide, out, strict=True)]
@@ -481,13 +461,14 @@ def _maximum(
 
     u = np.log([levels[i].scale for i in free])
     value, tried, solution = at(u)
+    if solution is None:
+        raise IndeterminateStateError(UNDETERMINED)
     information = np.diag(known**-2.0)
     for _ in range(_MOST_STEPS):
-        if solution is None:
-            break
         gradient, information = solution.score([_parts(chain, tried, i) for i in free], signs)
         gradient, information = gradient + u / known**2, information + np.diag(known**-2.0)
         move = -np.linalg.solve(information, gradient)
+        foreseen, before = -float(gradient @ move), value
         move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
         for _ in range(_HALVINGS):
             ahead = at(u + move)
@@ -498,7 +479,8 @@ def _maximum(
             break
         u = u + move
         value, tried, solution = ahead
-        if float(np.abs(move).max()) < _SETTLED:
+        assert solution is not None
+        if min(foreseen, before - value) < _SETTLED:
             break
     return LevelEstimate(_known(tried, free, np.sqrt(np.diag(np.linalg.inv(information)))), value)
 
@@ -538,29 +520,39 @@ def step(
 
 
 def sandwich_ratio(
-    chain: LinearChain,
-    levels: Sequence[Level],
-    rejected: Mapping[int, NDArray[np.bool_]],
-    reported: Array,
-    at: Array | None = None,
+    chain: LinearChain, levels: Sequence[Level], rejected: Mapping[int, NDArray[np.bool_]], reported: Array
 ) -> Array:
     """Sandwich over nominal sigma of numbers that are linear in the shared parameters, (r,).
 
-    With innovations e and their derivatives G by the shared parameters, C = (G'G + prior)^-1 is the nominal covariance,
-    and C B C, B the sum over blocks of `SANDWICH_BLOCK_S` of G'e e'G and the prior's information, what it is whatever
-    is correlated within blocks (Liang, Zeger, Biometrika 1986). Above 1 where something errs slowly that no noise of
-    the model has, as with the pose. Less than three of its own sigmas above 1, which for n blocks are 1 / sqrt(2 n), it
-    counts as 1.
+    Above 1 where something errs slowly that no noise of the model has, as with the pose. Less than three of its own
+    sigmas above 1, which for n blocks are 1 / sqrt(2 n), it counts as 1.
 
     Args:
         chain: about the solution.
         levels: in force.
         rejected: group -> (n,) outliers.
         reported: (r, p) derivatives of the numbers.
-        at: (p,) the solution, from where the chain is about it; None: there.
     """
     out = _by_row(chain, rejected, 0.0)
     variances = [np.where(o > 0.0, 1e12 * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
+    nominal, robust, blocks = sandwich(chain, variances)
+    above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
+    ratio = np.sqrt(np.divide(above, below, out=np.ones_like(below), where=below > 0.0))
+    return np.where(ratio > 1.0 + _CERTAIN / np.sqrt(2.0 * max(blocks, 1)), ratio, 1.0)
+
+
+def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = None) -> tuple[Array, Array, int]:
+    """Nominal and sandwich covariance (p, p) of the shared parameters, and the number of blocks.
+
+    With innovations e and their derivatives G by the shared parameters, C = (G'G + prior)^-1 is the nominal covariance,
+    and C B C, B the sum over blocks of `SANDWICH_BLOCK_S` of G'e e'G and the prior's information, what it is whatever
+    is correlated within blocks (Liang, Zeger, Biometrika 1986).
+
+    Args:
+        chain: about the solution.
+        variances: (n,) of each kind of rows.
+        at: (p,) the solution, from where the chain is about it; None: there.
+    """
     limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
     p = chain.prior.shape[1] - 1
     known = chain.prior[:, :p].T @ chain.prior[:, :p]
@@ -575,11 +567,8 @@ def sandwich_ratio(
         sums = np.zeros((blocks, p))
         np.add.at(sums, block, np.einsum("nmi,nm->ni", G, e))
         middle += sums.T @ sums
-    C = np.linalg.pinv(information, hermitian=True)
-    nominal = np.einsum("ri,ij,rj->r", reported, C, reported)
-    robust = np.einsum("ri,ij,rj->r", reported, C @ middle @ C, reported)
-    ratio = np.sqrt(np.divide(robust, nominal, out=np.ones_like(nominal), where=nominal > 0.0))
-    return np.where(ratio > 1.0 + _CERTAIN / np.sqrt(2.0 * max(blocks, 1)), ratio, 1.0)
+    C = np.asarray(np.linalg.pinv(information, hermitian=True))
+    return C, C @ middle @ C, blocks
 
 
 def _square(S: Array, y: Array) -> Array:
@@ -755,7 +744,7 @@ def solution_at(
         if not group.is_measurement:
             groups.append(group)
             continue
-        weights = group_weights(group)
+        weights = group.all_weights
         if i in found.widening:
             weights = weights / found.widening[i][:, None]
         if problem.loss is not None:
@@ -825,56 +814,6 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
         columns.append(J @ layout.root_columns(key)[:, layout.sizes[3] :])
     outliers = rejected(solution.engine, solution.values)
     return np.maximum(sandwich_ratio(chain, levels, outliers, np.concatenate(columns)), 1.0)
-
-
-def largest_step(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> StepEstimate | None:
-    """The step of `Problem.may_step` that explains a recording best, noise levels found anew with it.
-
-    A step passes for gyro noise, so that levels at the solution hide it. One pass of the innovations with the step's
-    derivatives for all candidate times gives the score test of each, all other parameters free; the best one then gets
-    its levels anew at the same linearisation.
-    """
-    key, engine, layout = compiled.problem.may_step, compiled.engine, compiled.layout
-    parameter = next((p for p in compiled.problem.parameters if p.key == key), None)
-    if key is None or parameter is None or not isinstance(engine, Linearization):
-        return None
-    assert isinstance(solution.engine, Linearization)
-    chain, outliers = LinearChain.of(engine, solution.values), rejected(solution.engine, solution.values)
-    columns = np.flatnonzero(layout.root_columns(key)[:, layout.sizes[3] :].any(axis=0))
-    span = [rows.time for rows in chain.rows if rows.is_measurement]
-    if not span:
-        return None
-    at = np.sort(np.concatenate(span))
-    # Times of measurements, lest a candidate in an outage has none near it.
-    times = np.unique(np.quantile(at, np.linspace(0.0, 1.0, _CANDIDATES + 2)[1:-1], method="higher"))
-    when = float(times[0])
-    out = _by_row(chain, outliers, 0.0)
-    variances = [np.where(o > 0.0, 1e12 * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
-    for _ in range(_SCANS):
-        if len(times) < 3:
-            break
-        best = int(np.argmax(chain.step_scores(columns, times, variances)))
-        when, spacing = float(times[best]), float(np.median(np.diff(times)))
-        near = at[np.abs(at - when) <= spacing]
-        times = np.unique(near[np.linspace(0, len(near) - 1, _CANDIDATES).astype(int)])
-    p = chain.prior.shape[1] - 1
-    one = chain.with_steps(columns, np.array([when]))
-    before, after = estimate_levels(chain, levels, {}, outliers), estimate_levels(one, levels, {}, outliers)
-    variances = [np.where(o > 0.0, np.inf, v) for o, v in zip(out, one.variances(after.levels), strict=True)]
-    solved = one.solved(variances)
-    if solved is None:
-        return None
-    covariance = np.linalg.inv(solved.small @ solved.small.T)[p:, p:]
-    _, J = parameter.coordinates(layout.to_gtsam(solution.values, [key]), key)
-    steps, sigmas = J @ solved.shared[p:], np.sqrt(np.diag(J @ covariance @ J.T))
-    ratio = sandwich_ratio(one, after.levels, outliers, np.pad(J, ((0, 0), (p, 0))), solved.shared)
-    named = zip((q.name for q in parameter.quantities), steps.tolist(), sigmas.tolist(), strict=True)
-    fall = before.minus_two_log_likelihood - after.minus_two_log_likelihood
-    # Log det of the step's own information is what a prior of its width would pay: no evidence for a step.
-    fall -= float(np.linalg.slogdet(covariance)[1])
-    return StepEstimate(
-        when, {name: (step_, sigma) for name, step_, sigma in named}, fall, max(1.0, float(ratio.max()))
-    )
 
 
 def _keys(compiled: Compiled) -> list[int]:

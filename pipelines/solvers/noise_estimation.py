@@ -13,7 +13,7 @@ exp(-2 u) and r to stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -117,27 +117,30 @@ def apply_levels(engine: Engine, levels: Sequence[Level]) -> Engine:
 
 def _at_levels(group: Group, levels: Sequence[Level]) -> Group:
     own = [level for level in levels if group.family in level.noise.families]
-    if not own:
-        return group
-    weights = group_weights(group)
-    for level in own:
+    return replace(group, weights=level_weights(group.all_weights, own, group.beside)) if own else group
+
+
+def level_weights(weights: Array, levels: Iterable[Level], beside: Array | None) -> Array:
+    """Weights (n, m) of measurements with their noise at these levels, over what they were whitened by.
+
+    Args:
+        weights: (n, m) beside the levels.
+        levels: of their noises.
+        beside: (n,) what a unit of an additional noise adds to the whitened residuals.
+    """
+    weights = weights.copy()
+    for level in levels:
         if level.noise.beside:
-            weights = (weights**-2.0 + _additional(group, level.used)) ** -0.5
+            weights = (weights**-2.0 + _additional(beside, level.used)) ** -0.5
         else:
             weights[:, _rows(level.noise, weights.shape[1])] /= level.scale
-    return replace(group, weights=weights)
+    return weights
 
 
-def group_weights(group: Group) -> Array:
-    """(n, m) weights of a group's rows beside the loss."""
-    shape = len(group.model.time), group.model.rows
-    return np.ones(shape) if group.weights is None else group.weights.copy()
-
-
-def _additional(group: Group, level: float) -> Array:
-    """(n, 1) variance of a noise beside others, in units of what the group is whitened by."""
-    assert group.beside is not None
-    return ((level * group.beside) ** 2)[:, None]
+def _additional(beside: Array | None, level: float) -> Array:
+    """(n, 1) variance of a noise beside others, in units of what its measurements are whitened by."""
+    assert beside is not None
+    return ((level * beside) ** 2)[:, None]
 
 
 def _far(levels: Sequence[Level], others: Sequence[Level], config: NoiseConfig) -> bool:
@@ -214,8 +217,10 @@ def _found_beside(
     the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. Where outliers are rejected, what is beyond two sigmas
     counts as that: a pose near iron is not to pass for repeatability.
     """
-    unit = np.concatenate([np.broadcast_to(_additional(g, level.noise.stated), _shape(g)).ravel() for g in groups])
-    variance = np.concatenate([group_weights(g).ravel() for g in groups]) ** -2.0
+    unit = np.concatenate(
+        [np.broadcast_to(_additional(g.beside, level.noise.stated), _shape(g)).ravel() for g in groups]
+    )
+    variance = np.concatenate([g.all_weights.ravel() for g in groups]) ** -2.0
     square = np.concatenate([g.evaluate(values)[0].ravel() for g in groups]) ** 2
     rest, share = variance - unit * level.scale**2, redundancy / variance.size
     rejecting = any(g.loss is not None for g in groups)

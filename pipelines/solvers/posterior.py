@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,11 @@ from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, Factorization, System
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group
 
+if TYPE_CHECKING:
+    import gtsam
+
 # A direction without any information gets this many times its prior scale as sigma.
-MAX_SIGMA = 1e4
+WIDEST = 1e4
 # Combinations whose sigma would be more than this many times their prior's are left out of square-root information.
 MAX_TOLD = 1e6
 # Sigma of a prior where the config frees a number, in units of its default prior's sigma; see estimation.priors.
@@ -54,6 +58,7 @@ class Reported:
         prior: (m, m) precision of the priors in force, in units of the scales.
         extra: (n,) sigmas of errors that no measurement model has.
         calibrated: (m,) which free numbers are what is calibrated, and no assumed sensor errors.
+        bounded: (m,) which free numbers have a prior; `prior` has FREE_PRIOR for the others.
     """
 
     names: tuple[str, ...]
@@ -65,6 +70,7 @@ class Reported:
     prior: Array
     extra: Array
     calibrated: NDArray[np.bool_]
+    bounded: NDArray[np.bool_]
 
     @classmethod
     def of(cls, problem: Problem, layout: Layout, values: Values, current_keys: Mapping[int, int]) -> Reported:
@@ -77,8 +83,19 @@ class Reported:
             current_keys: parameter key -> variable that holds its value.
         """
         keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
-        known = layout.to_gtsam(values, keys)
-        pairs = [(key, *p.coordinates(known, key)) for p, key in zip(problem.parameters, keys, strict=True)]
+        return cls.at(problem, layout.to_gtsam(values, keys), keys, [layout.root_columns(key) for key in keys])
+
+    @classmethod
+    def at(cls, problem: Problem, known: gtsam.Values, keys: Sequence[int], columns: Sequence[Array]) -> Reported:
+        """Evaluate the coordinates of all parameters.
+
+        Args:
+            problem: of which the parameters are.
+            known: values of the variables that hold them.
+            keys: of these, one a parameter.
+            columns: (d, c + s) of each, where its tangent is among all.
+        """
+        pairs = [p.coordinates(known, key) for p, key in zip(problem.parameters, keys, strict=True)]
         quantities = problem.quantities
         free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
         # The default priors are the yardstick: an earlier calibration as prior makes nothing weak that it determined.
@@ -88,14 +105,15 @@ class Reported:
         prior = problem.prior_covariance(names, sigma) / np.outer(scale, scale)
         return cls(
             names=tuple(q.name for q in quantities),
-            numbers=np.concatenate([numbers for _, numbers, _ in pairs]),
-            jacobian=np.vstack([J @ layout.root_columns(key) for key, _, J in pairs]),
+            numbers=np.concatenate([numbers for numbers, _ in pairs]),
+            jacobian=np.vstack([J @ own for (_, J), own in zip(pairs, columns, strict=True)]),
             free=free,
             mean=np.array([quantities[i].prior_mean for i in free]),
             scale=scale,
             prior=np.asarray(np.linalg.inv(prior), dtype=float),
             extra=np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma for q in quantities]),
             calibrated=np.array([not quantities[i].assumed for i in free], dtype=bool),
+            bounded=np.array([quantities[i].prior_sigma is not None for i in free], dtype=bool),
         )
 
     @property
@@ -162,7 +180,7 @@ class ReportedRoot:
     def covariance(self) -> Array:
         """(m, m) of u as the linear system has it; works where R is singular."""
         _, sizes, axes = np.linalg.svd(self.R)
-        root = axes.T / np.maximum(sizes, 1.0 / MAX_SIGMA)
+        root = axes.T / np.maximum(sizes, 1.0 / WIDEST)
         return np.asarray(root @ root.T)
 
 

@@ -58,7 +58,8 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
         return minimize(plain, values, config.minimizer)
     count = sum(len(group.model.time) for group in engine.groups if group.is_measurement)
     most = min(config.rough_iterations, config.minimizer.max_iterations)
-    rough = replace(config.minimizer, max_iterations=most, cost_tolerance=config.rough_tolerance * max(count, 1))
+    tolerance = config.rough_tolerance * max(count, 1)
+    rough = replace(config.minimizer, max_iterations=most, cost_tolerance=tolerance, corrections=0)
     found = minimize(plain, values, rough)
     iterations = found.iterations
     truncated = engine.under(loss)
@@ -108,7 +109,7 @@ def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: Robu
             break
         there = engine.layout.retract(values, step)
         if not relaxed.cost(there) < relaxed.cost(values):
-            few = replace(config.minimizer, max_iterations=config.rough_iterations)
+            few = replace(config.minimizer, max_iterations=config.rough_iterations, corrections=0)
             there = minimize(relaxed, values, few).values
         values, iterations = there, iterations + 1
         mu *= config.mu_step

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import cast
 
 import gtsam
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Factor
-from alidade.pipelines.solvers.linear_system import graph_of, linear_graph_of
-from alidade.pipelines.solvers.marginals import ordering_of
+from alidade.pipelines.solvers.noise_estimation import level_weights
 
 # Move of a variable, in its own unit (rad, rad/s, s), above which iSAM2 linearises its factors again.
 _RELINEARIZE_MOVE = 1e-2
@@ -195,6 +196,14 @@ def _is_vector(values: gtsam.Values, key: int) -> bool:
     return True
 
 
+def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
+    """The keys as gtsam's ordering."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
 def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
     """Where each variable stands when their tangents are stacked in this order."""
     found, start = {}, 0
@@ -202,6 +211,22 @@ def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
         found[key] = slice(start, start + dims[key])
         start += dims[key]
     return found
+
+
+def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
+    """The gtsam graph of the factors, in their order."""
+    graph = gtsam.NonlinearFactorGraph()
+    for f in factors:
+        graph.add(f.factor)
+    return graph
+
+
+def linear_graph_of(factors: Sequence[Factor], values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+    """The linear system of the factors about the values, in their order."""
+    graph = gtsam.GaussianFactorGraph()
+    for f in factors:
+        graph.push_back(f.linearized(values))
+    return graph
 
 
 def linearized(factor: Factor, values: gtsam.Values) -> Factor:
@@ -227,3 +252,27 @@ def inliers(factor: Factor, values: gtsam.Values, loss: TruncatedLoss | None) ->
     if not used.any() or not factor.measurement.divisible:
         return None
     return Factor.of(factor.family, factor.measurement.only(used))
+
+
+def weigh(factors: Sequence[Factor], levels: Sequence[Level]) -> list[Factor]:
+    """The factors with their measurements' noise at these levels."""
+    scaled = [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
+    if not scaled:
+        return list(factors)
+    families = {family for level in scaled for family in level.noise.families}
+    return [_weighed(f, scaled) if f.family in families else f for f in factors]
+
+
+def _weighed(factor: Factor, levels: Sequence[Level]) -> Factor:
+    own = [level for level in levels if factor.family in level.noise.families]
+    bound = factor.bound
+    if bound is not None:
+        stated = np.ones((len(bound.model.time), bound.model.rows)) if bound.weights is None else bound.weights
+        of = Factor.process_of if factor.measurement is None else Factor.of
+        return of(factor.family, bound.weighed(level_weights(stated, own, factor.beside)), factor.beside)
+    native = cast(gtsam.NoiseModelFactor, factor.factor)
+    for level in own:
+        noise = cast(gtsam.noiseModel.Gaussian, native.noiseModel())
+        wider = gtsam.noiseModel.Gaussian.Information(noise.information() / level.scale**2)
+        native = native.cloneWithNewNoiseModel(wider)
+    return Factor(factor.family, native)

@@ -255,7 +255,7 @@ def constrained_solution(problem: Problem, minimum: Solution, current_keys: Mapp
     if not found.converged:
         return _unknown(problem, minimum, current_keys)
     for _ in range(ROUNDS):
-        second_order = curvature(found.directions, partial(_roots, problem, engine, found, current_keys))
+        second_order = curvature(found.directions, partial(moved_roots, problem, engine, found, current_keys))
         directions = found.directions.with_curvature(second_order)
         if directions.weak.shape[1] == found.directions.weak.shape[1]:
             break
@@ -325,7 +325,7 @@ def _moved(engine: Engine, factorization: Factorization, values: Values, found: 
     return engine.layout.retract(values, move)
 
 
-def _roots(
+def moved_roots(
     problem: Problem, engine: Engine, at: Posterior, current_keys: Mapping[int, int], moves: Array
 ) -> Iterator[Array]:
     """Square-root information (m, m) of the numbers moved by (m, n) from a solution, all else following."""

@@ -6,11 +6,18 @@ Optical frame: x right, y down, z forward. Integer pixel coordinates are pixel c
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.topics import CAMERA_INFO
+
+if TYPE_CHECKING:
+    from alidade.pipelines.recording.recording import Recording
+    from alidade.pipelines.recording.series import CameraInfo
+    from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
 
@@ -265,3 +272,24 @@ class Camera:
             theta = np.where((miss < _PIXEL_TOLERANCE) & (slope > 0) & (theta <= np.pi), theta, np.nan)
         side = np.sinc(theta / np.pi) * theta / np.where(radius > 0, radius, 1.0)
         return np.concatenate([flat * side[..., None], np.cos(theta)[..., None]], axis=-1)
+
+
+def camera_of(recording: Recording, config: Config) -> Camera:
+    """The camera of a recording. Raises InputError when its topic is missing or states what no camera can be."""
+    info = recording.camera_info(config.topic(CAMERA_INFO))
+    camera = Camera(info.width, info.height, info.k, info.distortion_model, info.d, _rectified(info))
+    if info.distortion_model not in ("", camera.distortion_model):
+        recording.remark(f"camera_info: distortion model {info.distortion_model} is read as {camera.distortion_model}")
+    if len(info.d) > len(camera.coefficients):
+        recording.remark(
+            f"camera_info: {len(info.d)} coefficients, of which the last {len(info.d) - len(camera.coefficients)} are "
+            "zero and none of the model's"
+        )
+    return camera
+
+
+def _rectified(info: CameraInfo) -> Array | None:
+    """The left three columns of P; None where it is not filled in."""
+    P = info.p[:, :3]
+    plain = np.isfinite(P).all() and P[0, 0] > 0.0 and P[1, 1] > 0.0 and P[0, 1] == 0.0
+    return P if plain else None

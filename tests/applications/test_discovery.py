@@ -15,11 +15,12 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.methods.head.recording import read_head
+from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
 from alidade.pipelines.recording import series
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.pairing import pair
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.sources import inverted
-from alidade.pipelines.recording.writing import write_session
 from tests.support import forms
 from tests.support.command import Command
 
@@ -90,13 +91,34 @@ def test_what_is_suggested_reads_as_the_recording_did_under_its_own_names(simula
     assert head.reasons[0].endswith(", inverted")
     assert unused(recording, NONE) == ("/tracker/pose", "/vehicle/imu", "/xsens/data")
     assert load_config(head.yaml.encode()).topics == head.topics
-    config = with_suggested(recording, NONE)
+    recording, config = with_suggested(recording, NONE)
     assert config.method == "head"
     assert recording.notes[0].startswith("topics chosen automatically (head): /tracker/pose matches /xsens/data")
     data, expected = read_head(recording, config), read_head(open_recording(simulated), NONE)
     np.testing.assert_array_equal(data.head_gyro, expected.head_gyro)
     np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz, atol=1e-15)
     assert unused(recording, config) == ()
+
+
+def test_a_topic_that_was_only_looked_at_widens_no_sigma(simulated: Path, tmp_path: Path) -> None:
+    """The delay's sigma and the notes are those of the topics that are used, however these were found."""
+    whole = renamed(simulated, tmp_path / "s.mcap")
+    other = whole.imu("/xsens/data")
+    rows = [
+        (t, forms.ROS2.deserialize_cdr(data, kind))
+        for topic, kind, t, data in forms.raw_messages(tmp_path / "s.mcap")
+        if topic == "/vehicle/imu" and t < other.t_ns[500]
+    ]
+    for _, message in rows:
+        message.header.stamp.sec = message.header.stamp.nanosec = 0
+    unstamped = open_recording(forms.ros2_recording(tmp_path / "u.mcap", {"/other/imu": rows}))
+    assert len(unstamped.imu("/other/imu")) == len(rows)
+    assert unstamped.stamp_sigma_s > 0.005
+    both = open_recording([tmp_path / "s.mcap", tmp_path / "u.mcap"])
+    recording, config = with_suggested(both, NONE, "head")
+    assert config.topic(VISION_ATTITUDE).startswith("/tracker/pose")
+    assert read_head(recording, config).stamp_sigma == 0.0
+    assert not any("have no stamp" in note for note in recording.notes)
 
 
 def test_the_pair_of_frames_that_turns_with_a_gyro_is_found(simulated: Path, tmp_path: Path) -> None:
@@ -135,7 +157,7 @@ def test_the_pair_of_frames_that_turns_with_a_gyro_is_found(simulated: Path, tmp
     assert "/tf (helmet to camera) matches /xsens" in head.reasons[0]
     config = load_config(head.yaml.encode())
     recording = open_recording(path)
-    recording.use(config.topics.values(), config.columns)
+    recording = recording.with_config(config.topics.values(), config.columns)
     data, expected = read_head(recording, config), read_head(open_recording(simulated), NONE)
     np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz[: len(data.vision_wxyz)], atol=1e-12)
 
@@ -163,8 +185,9 @@ def test_a_topic_without_messages_counts_as_not_recorded(simulated: Path, tmp_pa
     write_session(tmp_path / "s.mcap", there)
     recording = open_recording(tmp_path / "s.mcap")
     assert "/truth/attitude" in recording.topics
-    assert Session.read(recording, "head", None).data.truth_t is None
-    assert "topic /truth/attitude has no messages: it counts as not recorded" in recording.notes
+    session = Session.read(recording, "head", None)
+    assert session.data.truth_t is None
+    assert "topic /truth/attitude has no messages: it counts as not recorded" in session.facts.notes
     of_none = series.ImuSeries(none.t_ns, *np.empty((2, 0, 3)))
     write_session(tmp_path / "s.mcap", {**there, "/platform/imu": of_none})
     with pytest.raises(InputError, match="topic /platform/imu has no messages"):
@@ -173,7 +196,7 @@ def test_a_topic_without_messages_counts_as_not_recorded(simulated: Path, tmp_pa
 
 def test_a_recording_that_is_served_is_left_alone(simulated: Path) -> None:
     recording = open_recording(simulated)
-    assert with_suggested(recording, NONE) == NONE
+    assert with_suggested(recording, NONE) == (recording, NONE)
     assert "head" not in {found.method for found in suggestions(recording, NONE)}
 
 

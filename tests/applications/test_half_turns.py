@@ -13,7 +13,7 @@ from alidade.pipelines.applications.session import OpenOptions, Session
 from alidade.pipelines.applications.validate import validate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.recording import HeadData, write_head
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.write import write_results
 
 SCENARIO = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0, "helmet_mount_deg": [180.0, 0.0, 0.0]}

@@ -151,7 +151,7 @@ def test_config_wins_over_message_over_default() -> None:
 
 
 def test_configs_of_the_independent_recordings(shared_data: Path) -> None:
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.recording.recording import open_recording
 
     methods = {}
     for path in (shared_data / "contract").glob("*.mcap"):

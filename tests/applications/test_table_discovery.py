@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.applications.table_discovery import propose_columns
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from tests.support.command import Command
 
 RNG = np.random.default_rng(5)

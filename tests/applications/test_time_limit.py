@@ -19,8 +19,8 @@ from alidade.pipelines.applications.noise import noise_of
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
 from tests.support.command import Command
 
 

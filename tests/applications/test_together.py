@@ -28,7 +28,7 @@ from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Array, Told
-from alidade.pipelines.recording.opening import recordings_of
+from alidade.pipelines.recording.opening import group_recordings
 from alidade.pipelines.reports.joint_report import forecasts, recording_blocks
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.joint import join
@@ -398,7 +398,7 @@ def test_parts_of_one_bag_are_one_recording(tmp_path: Path) -> None:
     text = "rosbag2_bagfile_information: {relative_file_paths: [ride_0.mcap, ride_1.mcap]}"
     (tmp_path / "metadata.yaml").write_text(text)
     paths = [tmp_path / name for name in names]
-    assert recordings_of(paths) == [paths[:2], paths[2]]
-    assert recordings_of([Path(), Path("/")]) == [Path(), Path("/")]
+    assert group_recordings(paths) == [paths[:2], paths[2]]
+    assert group_recordings([Path(), Path("/")]) == [Path(), Path("/")]
     shutil.rmtree(tmp_path)
-    assert recordings_of([tmp_path / "a*.mcap", tmp_path]) == [tmp_path / "a*.mcap", tmp_path]
+    assert group_recordings([tmp_path / "a*.mcap", tmp_path]) == [tmp_path / "a*.mcap", tmp_path]

@@ -10,7 +10,7 @@ import pytest
 from alidade.pipelines.diagnostics import hypothesis_tests
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.trial_fit import TrialFit
-from alidade.pipelines.estimation.finding import Severity
+from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import ChiSquare, Residuals
 from tests.support.builders import make_calibration
@@ -31,8 +31,15 @@ def test_most_of_a_small_family_rejected_is_told(count: int, rejected: int, told
     used = np.arange(count) >= rejected
     family = Residuals(np.arange(float(count)), np.ones((count, 3)), used)
     estimate = replace(calibration.estimate, residuals={"tags": family})
-    found = [each for each in diagnose(estimate, calibration.problem.quantities) if each.kind == "rejection"]
+    findings = diagnose(estimate, calibration.problem.quantities)
+    found = [each for each in findings if each.kind == "rejection"]
     assert [each.severity for each in found if each.severity > Severity.NOTE] == told * [Severity.INCONSISTENT]
+    judged = replace(calibration, findings=findings, estimate=estimate)
+    assert "observable" in calibration.verdicts.values()
+    assert ("observable" not in judged.verdicts.values()) is told
+    assert ("weak" in judged.verdicts.values()) is told
+    joined = Finding("recording", Severity.INCONSISTENT, {"recording": "a.mcap", "findings": findings})
+    assert replace(judged, findings=(joined,)).verdicts == judged.verdicts
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from alidade.pipelines.methods.head.findings import findings
 from alidade.pipelines.methods.head.graph import problem
 from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command

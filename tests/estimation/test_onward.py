@@ -11,7 +11,7 @@ import pytest
 
 from alidade.pipelines.estimation.problem import Problem, Step
 from alidade.pipelines.methods import method
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.temperature import Warming
 
@@ -95,6 +95,9 @@ def test_the_steps_of_the_end_are_those_of_the_whole(name: str, rates: dict[str,
         grown = problem.onward(_between(name, data, base - 2.0, stop), base)
         assert grown is not None
         assert grown.steps_after is not None
+        if start.keyframes is not None:
+            assert grown.keyframes is not None
+            assert grown.keyframes.clock.begun == pytest.approx(start.keyframes.clock.begun), "not that of the tail"
         steps = list(grown.steps_after(base))
         # The last one may still grow.
         for step in steps if stop > 60.0 else [s for s in steps[:-1] if s.time < stop - WARMED]:

@@ -15,7 +15,6 @@ from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, symmet
 from alidade.factors.model import Array
 from alidade.factors.preintegration import GyroPath, Increments
 from alidade.factors.testing import assert_jacobians
-from alidade.factors.vectorized import Ensemble
 from tests.support.numerics import assert_rows_are_independent
 
 N = 15
@@ -244,33 +243,3 @@ def test_equals_the_native_factor_where_the_gyro_is_perfect() -> None:
         _, A = each.rows(values)
         kept = np.concatenate([np.arange(3) + 3 * each.keys.index(key) for key in range(3 * N)])
         np.testing.assert_allclose((A.T @ A)[np.ix_(kept, kept)], expected, atol=1e-7 * np.abs(expected).max())
-
-
-def test_several_factors_are_evaluated_as_one() -> None:
-    """As the solvers do it; each then answers as it does alone."""
-    blocks = _blocks(0.5, 0.02, 15, platform=True)
-    values = gtsam.Values()
-    for k in range(N):
-        values.insert(k, so3.to_gtsam(blocks[0][k]))
-        values.insert(N + k, so3.to_gtsam(blocks[1][k]))
-    for key, block in zip((100, 101, 102), blocks[2:], strict=True):
-        values.insert(key, block[0])
-    whole = _factor(np.arange(N), 15, platform=True)
-    assert whole.platform_turns is not None
-    factors = [
-        GyroIncrementFactor(
-            whole.time[part],
-            whole.turns[part],
-            whole.gyro,
-            whole.sigma[part],
-            whole.platform_turns[part],
-            whole.platform,
-        ).on(part, [N + k for k in part], 100, 101, 102)
-        for part in (range(4), range(4, 11), range(11, N))
-    ]
-    alone = [factor.rows(values) for factor in factors]
-    with Ensemble(factors).at(values):
-        for factor, (residuals, jacobian) in zip(factors, alone, strict=True):
-            together = factor.rows(values)
-            np.testing.assert_allclose(together[0], residuals, atol=1e-12)
-            np.testing.assert_allclose(together[1], jacobian, atol=1e-12)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.support.broad_trials import TRIALS, converted

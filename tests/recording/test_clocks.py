@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.clocks import find_step
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.recording.stamps import find_clock_step
 from tests.support.raw_messages import STORE, T0, random_message, write_raw
 
 Stamps = NDArray[np.int64]
@@ -33,7 +33,7 @@ def after(i: int, ms: float, times: Stamps) -> Stamps:
 @pytest.mark.parametrize("ms", [-60_000.0, -1000.0, -500.0, -100.0, -30.0, 30.0, 100.0, 1000.0, 3e6])
 @pytest.mark.parametrize("i", [30, 700, N - 30])
 def test_a_sensor_whose_clock_is_set_is_found(i: int, ms: float) -> None:
-    step = find_step(after(i, ms, STAMPS), LOGGED)
+    step = find_clock_step(after(i, ms, STAMPS), LOGGED)
     assert step is not None
     assert step.what == "the stamps"
     assert step.size == pytest.approx(ms / 1000, abs=0.006)
@@ -43,7 +43,7 @@ def test_a_sensor_whose_clock_is_set_is_found(i: int, ms: float) -> None:
 @pytest.mark.parametrize("ms", [-2500.0, -1000.0, -100.0])
 def test_a_recorder_whose_clock_is_set_back_is_found(ms: float) -> None:
     """A leap second, say: stamps and log times alike run twice through the same second."""
-    step = find_step(after(700, ms, STAMPS), after(700, ms, LOGGED))
+    step = find_clock_step(after(700, ms, STAMPS), after(700, ms, LOGGED))
     assert step is not None
     assert step.size == pytest.approx(ms / 1000, abs=0.02)
 
@@ -51,7 +51,7 @@ def test_a_recorder_whose_clock_is_set_back_is_found(ms: float) -> None:
 def test_a_clock_set_from_1970_is_found() -> None:
     uptime = after(700, 1.7e12, STAMPS - STAMPS[0] + 20_000 * MS)
     for logged in (LOGGED, uptime + 2 * MS):
-        step = find_step(uptime, logged)
+        step = find_clock_step(uptime, logged)
         assert step is not None
         assert step.size == pytest.approx(1.7e9, rel=1e-6)
 
@@ -127,7 +127,7 @@ def all_forward(times: Stamps) -> tuple[Stamps, Stamps]:
     [late, stalled, with_gaps, twice, slower, lagging, without_stamps, irregular, in_another_order, stuck, all_forward],
 )
 def test_what_is_no_step_is_none(make: Callable[[Stamps], tuple[Stamps, Stamps]]) -> None:
-    assert find_step(*make(STAMPS)) is None
+    assert find_clock_step(*make(STAMPS)) is None
 
 
 @pytest.mark.parametrize(("ms", "way"), [(-400.0, "back"), (400.0, "forward")])

@@ -13,8 +13,8 @@ from mcap.opcode import Opcode
 
 from alidade.pipelines.applications.session import session_facts
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording import writing
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording import mcap_writer
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from tests.support.damage import (
     CONFIG,
@@ -60,8 +60,8 @@ def make(form: str, folder: Path) -> Small:
     path = folder / "s.mcap"
     if form == OWN:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(writing, "_CHUNK", 4000)
-            writing.write_session(path, topics(), {"alidade.yaml": CONFIG})
+            patch.setattr(mcap_writer, "CHUNK_BYTES", 4000)
+            mcap_writer.write_session(path, topics(), {"alidade.yaml": CONFIG})
     else:
         path = write_small(path, form)
     whole = read(open_recording(path))
@@ -105,7 +105,7 @@ def test_a_missing_summary_loses_nothing(small: Small) -> None:
         np.testing.assert_array_equal(t_ns, small.whole[name][0])
         np.testing.assert_array_equal(values, small.whole[name][1])
     assert cut.notes == ("the recording is truncated: it ends without its closing records",)
-    assert not cut.missing
+    assert not cut.container.missing
     with pytest.raises(InputError, match="--strict"):
         open_recording(small.copy, strict=True)
 
@@ -118,7 +118,7 @@ def test_a_damaged_length_loses_one_chunk(small: Small) -> None:
     small.copy.write_bytes(small.data[: at + 4] + b"\xff" + small.data[at + 5 :])
     recording = open_recording(small.copy)
     facts = session_facts(recording, Config())
-    assert [loss.chunks for loss in recording.losses] == [1]
+    assert [loss.chunks for loss in recording.container.losses] == [1]
     assert 2 <= facts.lost["/imu"] <= 10
     imu = next(topic for topic in facts.topics if topic.name == "/imu")
     assert imu.largest_gap_s == pytest.approx(0.005 * (facts.lost["/imu"] + 1), abs=1e-9)

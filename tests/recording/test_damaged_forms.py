@@ -20,10 +20,10 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording import messages, video
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording import images, messages
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.ros1_bag import MAGIC
-from alidade.pipelines.recording.writing import write_session
 from tests.support import forms
 from tests.support.damage import CONFIG, Whole, flips, read, spoilt, topics
 from tests.support.turning import turning, write_csv
@@ -104,7 +104,7 @@ class Small:
         recording = open_recording(path.parents[FOLDERS[self.form]] if self.form in FOLDERS else path)
         if self.form == "csv":
             config = load_config(CSV)
-            recording.use(config.topics.values(), config.columns)
+            recording = recording.with_config(config.topics.values(), config.columns)
         if self.form == "tum":
             poses = recording.poses("/trajectory")
             return {"/trajectory": (poses.t_ns, np.hstack([poses.position, poses.wxyz]))}
@@ -181,7 +181,7 @@ def damaged_videos(whole: list[bytes], number: int, seed: int) -> Counter[str]:
         else:
             packets[at] = next(iter((flips if i % 3 == 1 else spoilt)(packets[at], 1, seed + i)))
         try:
-            pictures = list(video.decoded(enumerate(packets)))
+            pictures = list(images.decode_video(enumerate(packets)))
         except ValueError as error:
             found["refused" if "\n" not in str(error) else "refused in several lines"] += 1
             continue
@@ -211,7 +211,7 @@ def test_damaged_video_files(form: str, number: int, tmp_path: Path) -> None:
     for copy in (*cut, *flips(data, number // 4, 3), *spoilt(data, number // 4, 4)):
         path.write_bytes(copy)
         try:
-            found["read"] += len(list(video.VideoFile(path, 7))) == 7
+            found["read"] += len(list(images.VideoFile(path, 7))) == 7
         except InputError as error:
             found["refused"] += "\n" not in str(error)
     print(form, dict(found))

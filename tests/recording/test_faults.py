@@ -23,7 +23,7 @@ from alidade.pipelines.methods.los.recording import read_los, write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledGyro
 from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch

@@ -16,7 +16,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from datasets.broad import CONFIG as BROAD_CONFIG
 from tests.support import forms
@@ -67,7 +67,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[P
 def read(name: str, path: Path, config: Path) -> Any:
     recording = open_recording(path)
     settings = load_config(config.read_bytes())
-    recording.use(settings.topics.values(), settings.columns)
+    recording = recording.with_config(settings.topics.values(), settings.columns)
     return method(name).read(recording, settings)
 
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording import messages, video
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording import images, messages
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from tests.support import forms
 from tests.support.damage import Whole, check_sound, read, write_small
@@ -174,7 +174,7 @@ def test_bytes_as_a_video(trial: settings) -> None:
     )
     def property_(packets: list[bytes]) -> None:
         with suppress(ValueError):
-            assert len(list(video.decoded(enumerate(packets)))) == len(packets)
+            assert len(list(images.decode_video(enumerate(packets)))) == len(packets)
 
     property_()
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.summary import Summary
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.growing import Growing
-from alidade.pipelines.recording.reading import Recording, open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.growing import GrowingFiles
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import Recording, open_recording
 from tests.support.live import messages, write
 from tests.support.recorded import session
 
@@ -22,13 +25,13 @@ def test_what_grew_by_pieces_is_the_whole(tmp_path: Path, chunk_size: int, count
         write(messages(tmp_path / "s.mcap"), out, chunk_size)
     content = (tmp_path / "whole.mcap").read_bytes()
     whole = open_recording(tmp_path / "whole.mcap")
-    path, growing = tmp_path / "grows.mcap", Growing()
+    path, growing = tmp_path / "grows.mcap", GrowingFiles()
     ends = np.sort(np.random.default_rng(chunk_size).integers(9, len(content), 12)).tolist()
     seen = 0
     for end in [*ends, len(content)]:
         path.write_bytes(content[:end])
         try:
-            recording = Recording(growing.look([path], None), whole.epoch_ns)
+            recording = Recording(growing.refresh([path], None), whole.epoch_ns)
             imu = recording.imu("/imu")
         except InputError:
             assert seen == 0, "it could be read before"
@@ -44,10 +47,10 @@ def test_the_end_alone(tmp_path: Path) -> None:
     write_session(tmp_path / "s.mcap", session(500))
     with (tmp_path / "whole.mcap").open("wb") as out:
         write(messages(tmp_path / "s.mcap"), out, 2_000)
-    whole, growing = open_recording(tmp_path / "whole.mcap"), Growing()
+    whole, growing = open_recording(tmp_path / "whole.mcap"), GrowingFiles()
     imu = whole.imu("/imu")
     for since in (imu.t_ns[len(imu) // 3], imu.t_ns[-10]):
-        late = Recording(growing.look([tmp_path / "whole.mcap"], int(since)), whole.epoch_ns)
+        late = Recording(growing.refresh([tmp_path / "whole.mcap"], int(since)), whole.epoch_ns)
         end = late.imu("/imu")
         assert len(imu) > len(end) >= np.count_nonzero(imu.t_ns >= since)
         np.testing.assert_array_equal(end.gyro, imu.gyro[-len(end) :])
@@ -61,7 +64,31 @@ def test_a_damaged_chunk_is_left_out(tmp_path: Path) -> None:
     content = bytearray((tmp_path / "whole.mcap").read_bytes())
     content[len(content) // 2 : len(content) // 2 + 4] = b"\xff\xff\xff\xff"
     (tmp_path / "whole.mcap").write_bytes(content)
-    late = Recording(Growing().look([tmp_path / "whole.mcap"], None)).imu("/imu")
+    growing = GrowingFiles()
+    for _ in range(3):
+        late = Recording(growing.refresh([tmp_path / "whole.mcap"], None)).imu("/imu")
     wanted = open_recording(tmp_path / "whole.mcap").imu("/imu")
     np.testing.assert_array_equal(late.t_ns, wanted.t_ns)
     np.testing.assert_array_equal(late.gyro, wanted.gyro)
+
+
+def test_a_damaged_last_chunk_is_one_loss_however_often_it_is_looked_at(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", session(500))
+    with (tmp_path / "whole.mcap").open("wb") as out:
+        write(messages(tmp_path / "s.mcap"), out, 2_000)
+    path = tmp_path / "grows.mcap"
+    content = bytearray((tmp_path / "whole.mcap").read_bytes())
+    with (tmp_path / "whole.mcap").open("rb") as stream:
+        last = get_summary(stream).chunk_indexes[-1]
+    middle = last.chunk_start_offset + last.chunk_length // 2
+    content[middle : middle + 4] = b"\xff\xff\xff\xff"
+    path.write_bytes(content[: last.chunk_start_offset + last.chunk_length])  # its index is not written yet
+    growing = GrowingFiles()
+    losses = [len(growing.refresh([path], None).losses) for _ in range(4)]
+    assert losses == [1, 1, 1, 1]
+
+
+def get_summary(stream: BinaryIO) -> Summary:
+    summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary

@@ -22,7 +22,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError, printable
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.mcap_records import HEAD, MAGIC
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from tests.support.raw_messages import STORE, T0, random_message
 
 MIB = 1 << 20

@@ -17,8 +17,8 @@ from alidade.pipelines.applications.fleet.tables import write_csv
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml
-from alidade.pipelines.recording.opening import bag_metadata, recordings_of
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.opening import bag_metadata, group_recordings
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import load_calibration
 from alidade.pipelines.reports.certificate import write_certificate
 from alidade.pipelines.reports.known import load_known
@@ -98,7 +98,7 @@ def test_a_bag_folder_with_any_metadata_is_one_line(case: str, tmp_path: Path) -
         open_recording(tmp_path)
     assert str(refused.value).isprintable()
     (tmp_path / "x.mcap").write_bytes(b"")
-    assert recordings_of([tmp_path / "x.mcap"])
+    assert group_recordings([tmp_path / "x.mcap"])
 
 
 def test_metadata_that_links_to_itself_is_none(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from alidade.factors import preintegration
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.los import recording as los
-from alidade.pipelines.recording.checks import taken
-from alidade.pipelines.recording.placeholders import density
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.checks import take_rows
+from alidade.pipelines.recording.plausibility import density
+from alidade.pipelines.recording.recording import open_recording
 
 # Of los at 1 kHz and 50 pictures a second, bytes a sample of the gyro: with ten hours, 36 million, in 8 GiB.
 READING, READ, PREPARING, PREPARED = 165.0, 73.0, 145.0, 110.0
@@ -49,10 +49,10 @@ def test_checks_of_a_gimbal_look_at_blocks(block: int, monkeypatch: pytest.Monke
 
 def test_rows_that_are_all_of_them_are_no_copy() -> None:
     values = np.arange(12.0).reshape(4, 3)
-    assert taken(values, np.arange(4)) is values
-    np.testing.assert_array_equal(taken(values, np.array([1, 0, 2, 3])), values[[1, 0, 2, 3]])
-    np.testing.assert_array_equal(taken(values, np.array([0, 2])), values[[0, 2]])
-    alike = taken(np.broadcast_to(np.eye(3), (5, 3, 3)), np.array([0, 4]))
+    assert take_rows(values, np.arange(4)) is values
+    np.testing.assert_array_equal(take_rows(values, np.array([1, 0, 2, 3])), values[[1, 0, 2, 3]])
+    np.testing.assert_array_equal(take_rows(values, np.array([0, 2])), values[[0, 2]])
+    alike = take_rows(np.broadcast_to(np.eye(3), (5, 3, 3)), np.array([0, 4]))
     assert alike.shape == (2, 3, 3)
     assert alike.strides[0] == 0
 

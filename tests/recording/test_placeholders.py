@@ -11,9 +11,15 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import clean, tracked
 from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.placeholders import believed, density, is_there, measured_once
-from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, implausible
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.plausibility import (
+    GRAVITY_REMOVED,
+    density,
+    implausible,
+    is_there,
+    measured_once,
+    plausible_covariance,
+)
+from alidade.pipelines.recording.recording import open_recording
 from tests.support import forms
 
 RNG = np.random.default_rng(3)
@@ -40,8 +46,8 @@ def test_a_covariance_in_some_rows_alone_is_that_of_all() -> None:
 
 
 def test_an_attitude_known_to_a_radian_is_not_known() -> None:
-    assert not believed("/pose", "attitude", np.tile(np.eye(3), (5, 1, 1)), 1e-11, {}).any()
-    known = np.asarray(believed("/pose", "attitude", np.tile(1e-4 * np.eye(3), (5, 1, 1)), 1e-11, {}))
+    assert not plausible_covariance("/pose", "attitude", np.tile(np.eye(3), (5, 1, 1)), 1e-11, {}).any()
+    known = np.asarray(plausible_covariance("/pose", "attitude", np.tile(1e-4 * np.eye(3), (5, 1, 1)), 1e-11, {}))
     assert known[..., np.arange(3), np.arange(3)].all()
 
 
@@ -137,12 +143,12 @@ def test_of_several_devices_on_one_topic_one_is_chosen_by_its_frame(tmp_path: Pa
 
     recording = open_recording(path)
     source = TopicSource(topic="/imu", frame="imu_right", axes=("-y", "x", "z"))
-    recording.use([source], {})
+    recording = recording.with_config([source])
     imu = recording.imu(source.name)
     np.testing.assert_array_equal(imu.gyro[:, 1], np.arange(1.0, 60.0, 2.0))
     assert not imu.gyro[:, 0].any()
     wrong = TopicSource(topic="/imu", frame="imu_top")
-    recording.use([wrong], {})
+    recording = recording.with_config([wrong])
     with pytest.raises(InputError, match="no messages of the frame imu_top; there: imu_left"):
         recording.imu(wrong.name)
 

@@ -22,12 +22,12 @@ from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.gyro import read_gyro
-from alidade.pipelines.recording.placeholders import density
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.plausibility import density
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.sources import TopicSource, inverted
+from alidade.pipelines.recording.streams import StreamReader
 from alidade.pipelines.recording.topics import IMU
-from alidade.pipelines.recording.writing import write_session
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.support import forms, live
@@ -164,7 +164,7 @@ def test_a_message_that_does_not_translate_is_one_line(
     text = b""
     if encoding == "protobuf":
         whole = open_recording(forms.mcap_protobuf(source, tmp_path / "p.mcap"))
-        text = next(s.data for s in whole._container.schemas.values() if s.name == "ros.Imu")
+        text = next(s.data for s in whole.container.schemas.values() if s.name == "ros.Imu")
     path = forms.mcap(
         [("/imu", "", T0, b"")],
         tmp_path / "x.mcap",
@@ -406,7 +406,7 @@ def test_csv_with_columns_from_the_config(tmp_path: Path) -> None:
     assert not recording.topics
     assert "a table with the columns t, wx, wy" in recording.notes[0]
     config = load_config(CSV_CONFIG)
-    recording.use(config.topics.values(), config.columns)
+    recording = recording.with_config(config.topics.values(), config.columns)
     imu = recording.imu("/imu")
     np.testing.assert_array_equal(imu.t_ns, t_ns // 1000 * 1000)
     np.testing.assert_array_equal(imu.gyro, gyro * (np.pi / 180.0))
@@ -415,6 +415,20 @@ def test_csv_with_columns_from_the_config(tmp_path: Path) -> None:
     joints = recording.joints("/joints", ["azimuth"])
     assert (len(joints), joints.position[-1, 0]) == (501, pytest.approx(np.deg2rad(3.5)))
     assert recording.notes == ()
+
+
+def test_a_config_can_be_given_again_and_changes_no_other_recording(tmp_path: Path) -> None:
+    t_ns, gyro, _ = turning()
+    table = write_csv(tmp_path / "imu.csv", ["t", "wx", "wy", "wz"], t_ns, gyro)
+    plain = open_recording(table)
+    given = [load_config(f"columns: {{{name}: {{time: t, unit: ns, gyro: [wx, wy, wz]}}}}".encode()) for name in "ab"]
+    first, second = (plain.with_config(config.topics.values(), config.columns) for config in given)
+    again = first.with_config(given[1].topics.values(), given[1].columns)
+    assert [list(each.topics) for each in (plain, first, second, again)] == [[], ["a"], ["b"], ["b"]]
+    np.testing.assert_array_equal(again.imu("b").gyro, gyro)
+    derived = first.with_config([TopicSource(topic="a", axes=("-y", "x", "z"))])
+    assert len(derived.topics) == 2, "columns stay where none are given"
+    assert len(first.topics) == 1
 
 
 @pytest.mark.parametrize(
@@ -440,7 +454,7 @@ def test_columns_that_do_not_fit_are_one_line(columns: str, message: str, tmp_pa
 
     def use() -> None:
         config = load_config(f"columns: {{/imu: {columns}}}".encode())
-        recording.use(config.topics.values(), config.columns)
+        recording.with_config(config.topics.values(), config.columns)
 
     with pytest.raises(InputError, match=message) as found:
         use()
@@ -581,7 +595,7 @@ def test_attitudes_of_all_types(tmp_path: Path) -> None:
         b"topics:\n  vision_attitude: {topic: /tf, frames: [camera, helmet]}\n"
         b"  truth_attitude: {topic: /odometry, invert: true}\n"
     )
-    recording.use(config.topics.values(), config.columns)
+    recording = recording.with_config(config.topics.values(), config.columns)
     assert config.topic(VISION_ATTITUDE) == "/tf (camera to helmet)"
     for topic in ("/pose", "/transform", "/odometry", config.topic(VISION_ATTITUDE)):
         found = recording.poses(topic)
@@ -591,7 +605,7 @@ def test_attitudes_of_all_types(tmp_path: Path) -> None:
     np.testing.assert_array_equal(recording.poses("/odometry").cov[3].ravel(), cov)
     assert recording.topics["/tf (camera to helmet)"].type == messages.POSE
     source = TopicSource(topic="/tf", frames=("camera", "nose"))
-    recording.use([source], {})
+    recording = recording.with_config([source])
     with pytest.raises(InputError, match="no transform from camera to nose; there: camera to helmet, camera to other"):
         recording.poses(source.name)
 
@@ -631,7 +645,7 @@ def test_a_gyro_and_an_accelerometer_make_an_imu(tmp_path: Path) -> None:
     for name in ("/accel", "/imu_accel"):
         recording = open_recording(tmp_path / "s.mcap")
         config = load_config(f"topics: {{imu: {{gyro: /gyro, accel: {name}}}}}".encode())
-        recording.use(config.topics.values(), config.columns)
+        recording = recording.with_config(config.topics.values(), config.columns)
         imu = recording.imu(config.topic(IMU))
         np.testing.assert_array_equal(imu.t_ns, t_ns)
         np.testing.assert_array_equal(imu.gyro, gyro)
@@ -775,7 +789,7 @@ def test_a_video_that_is_not_as_it_should_be_is_one_line(change: Any, form: str,
 def with_video(where: str | Path, name: str, time: str = "column 1") -> Recording:
     recording = open_recording(where)
     config = load_config(f"columns: {{/image: {{file: stamps.txt, time: {time}, video: {name}}}}}".encode())
-    recording.use(config.topics.values(), config.columns)
+    recording = recording.with_config(config.topics.values(), config.columns)
     return recording
 
 
@@ -945,8 +959,8 @@ def test_a_covariance_no_gyro_has_is_not_believed(tmp_path: Path) -> None:
     for variance, believed in ((1e-12, None), (1e-6, 1e-4), (0.0, None), (-1.0, None)):
         imu = series.ImuSeries(t_ns, gyro, gyro_cov=variance * np.eye(3))
         write_session(tmp_path / "s.mcap", {"/imu": imu})
-        dropped: dict[str, int] = {}
-        _, _, density = read_gyro(open_recording(tmp_path / "s.mcap"), "/imu", T0, dropped)
+        reader = StreamReader(open_recording(tmp_path / "s.mcap"), {})
+        density, dropped = reader.density("/imu", "gyro", reader.gyro("/imu")), reader.dropped
         assert density == (None if believed is None else pytest.approx(believed))
         assert (500 in dropped.values()) == (variance in (1e-12, -1.0))
 

@@ -16,8 +16,9 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import mcap_records as records
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.mcap_file import McapFile
-from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.opening import open_container
+from alidade.pipelines.recording.recording import open_recording
 from tests.support.recorded import T0, assert_same, session
 
 
@@ -43,7 +44,7 @@ def test_a_session_written_and_read_back_is_identical(tmp_path: Path) -> None:
     write_session(path, made, {"alidade.yaml": b"method: los\n", "truth.json": b"{}"})
     assert_same(read_all(path), made)
     recording = open_recording(path)
-    assert recording.attachments == ("alidade.yaml", "truth.json")
+    assert recording.container.attachments == ("alidade.yaml", "truth.json")
     assert recording.attachment("alidade.yaml") == b"method: los\n"
     assert recording.attachment("else") is None
     assert recording.epoch_ns == T0
@@ -129,6 +130,14 @@ def test_backward_stamps_stay_in_the_order_they_were_logged(tmp_path: Path) -> N
     write_session(tmp_path / "s.mcap", {"/v": series.VectorSeries(t, np.arange(15.0).reshape(5, 3))})
     found = open_recording(tmp_path / "s.mcap").vector("/v")
     np.testing.assert_array_equal(found.t_ns, t)
+
+
+def test_the_first_log_time_is_that_of_the_earliest_topic(tmp_path: Path) -> None:
+    """Not of the channel that comes first: parts of a recording are ordered by it."""
+    t = T0 + 10_000_000 * np.arange(5)
+    late, early = (series.VectorSeries(t + shift, np.zeros((5, 3))) for shift in (70_000_000, 0))
+    write_session(tmp_path / "s.mcap", {"/late": late, "/early": early})
+    assert open_container(tmp_path / "s.mcap").first_log_ns == T0
 
 
 def test_topics_read_together_take_one_pass_and_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,7 +226,7 @@ def test_a_flipped_bit_in_a_chunk_is_found(imu_file: Path) -> None:
     left = broken.imu("/imu").gyro
     assert 0 < len(left) < len(gyro)
     assert not (left == gyro[150]).all(axis=1).any()
-    assert broken.missing == {"/imu": len(gyro) - len(left)}
+    assert broken.container.missing == {"/imu": len(gyro) - len(left)}
     assert "1 chunk" in broken.notes[0]
     assert "its checksum is another" in broken.notes[0]
     with pytest.raises(InputError, match=r"its checksum is another.*--strict"):

@@ -14,8 +14,8 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
 from alidade.pipelines.recording import checks, series
-from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
 
 T0 = 1_800_000_000_000_000_000
 NONE = load_config(None)

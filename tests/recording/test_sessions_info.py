@@ -12,9 +12,9 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method, names
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.topics import Setting, Topic
-from alidade.pipelines.recording.writing import write_session
 
 T0 = 1_800_000_000_000_000_000
 NONE = load_config(None)

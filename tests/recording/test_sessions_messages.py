@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from alidade.pipelines.applications.session import resolve_method, session_facts
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from tests.support.raw_messages import FLAT, OLD_TAGS, POINT_TAGS, STORE, T0, random_message, read_any, write_raw
 

@@ -12,7 +12,7 @@ import pytest
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.table_times import nanoseconds
 
 N = 60
@@ -30,7 +30,7 @@ def rows(separator: str = ",", decimal: str = ".", time: Callable[[int], str] = 
 def described(path: Path, config: str = CONFIG) -> Recording:
     recording = open_recording(path)
     settings = load_config(config.encode())
-    recording.use(settings.topics.values(), settings.columns)
+    recording = recording.with_config(settings.topics.values(), settings.columns)
     return recording
 
 

@@ -17,9 +17,9 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.temperature import Temperature, read_temperature
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.recording.streams import StreamReader, Temperature
 from alidade.pipelines.reports.calibration import load_calibration
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
@@ -117,8 +117,8 @@ def told(tmp_path: Path, celsius: object, t: object) -> tuple[Temperature, dict[
         "/temperature": series.TemperatureSeries(t_ns, np.asarray(celsius, dtype=float)),
     }
     write_session(tmp_path / "t.mcap", topics)
-    dropped: dict[str, int] = {}
-    return read_temperature(open_recording(tmp_path / "t.mcap"), "/temperature", SENSOR, dropped), dropped
+    reader = StreamReader(open_recording(tmp_path / "t.mcap"), {})
+    return reader.temperature("/temperature", SENSOR), reader.dropped
 
 
 def test_temperatures_are_read_as_written_and_linear_in_between(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.los.recording import write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.recording import writing
+from alidade.pipelines.recording import mcap_writer
 from alidade.pipelines.reports.result_json import truth_errors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.support.builders import IDEAL
@@ -42,7 +42,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("los") / "s.mcap"
     data, truth = simulate_los(LOS, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writing, "_CHUNK", 70_000)
+        patch.setattr(mcap_writer, "CHUNK_BYTES", 70_000)
         write_los(path, data, truth, los_config(LOS))
     return path.read_bytes()
 

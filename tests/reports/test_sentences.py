@@ -62,12 +62,31 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "and the axis order of the sensor, or widen the prior.",
     ),
     (
+        "contradiction",
+        INCONSISTENT,
+        {"parameter": "camera_roll", "unit": "rad", "stated": 1e-12, "value": 0.05, "sigma": 1e-3, "z": 50.0}
+        | {"inseparable": ("collimation",), "effect": {"helmet_mount_z": 7e-3}},
+        "camera_roll is fixed at 0.000 deg by the config, and the recording contradicts it (or collimation): 2.865 ± "
+        "0.057 deg if free (z = 50.0); freeing it shifts helmet_mount_z by 0.40 deg, 0.7 of its requirement.",
+    ),
+    (
         "change",
         INCONSISTENT,
-        {"time_s": 42.2, "steps": {"helmet_mount_z": (8.9e-3, 7e-4)}},
+        {"since_s": 42.1, "time_s": 42.2, "steps": {"helmet_mount_z": (8.9e-3, 7e-4)}},
         "Change at 42 s: helmet_mount_z by 0.510 ± 0.040 deg.",
     ),
-    ("change", NOTE, {"time_s": 42.2, "steps": {}}, "Change at 42 s. Immaterial; included in the sigmas."),
+    (
+        "change",
+        NOTE,
+        {"since_s": 38.2, "time_s": 42.2, "steps": {}},
+        "Change between 38 and 42 s. Immaterial; included in the sigmas.",
+    ),
+    (
+        "jump",
+        Severity.WEAK,
+        {"since_s": 117.5, "time_s": 117.6, "size": 0.0105, "sigma": 0.0018},
+        "Vision jumped by 0.60 ± 0.10 deg at 118 s: mount or reference, the motion does not tell.",
+    ),
     (
         "device_change",
         INCONSISTENT,

@@ -28,7 +28,7 @@ from alidade.pipelines.methods.cube.scenario import (
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.static_intervals import static_intervals
 from alidade.pipelines.methods.cube.topics import CubeConfig
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 
 QUIET = CubeNoise(gyro_density=1e-12, gyro_bias_walk=0.0, accel_density=1e-12, mag_density=1e-18, corner_px=1e-6)

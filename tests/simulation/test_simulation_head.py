@@ -14,7 +14,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.head.recording import read_head, write_head
 from alidade.pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 
 SCENARIOS = ["head_nominal", "head_mounts", "head_outages", "head_turntable"]

@@ -20,7 +20,7 @@ from alidade.pipelines.methods.indexer.simulation import (
     Position,
     simulate_indexer,
 )
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 
 QUIET = IndexerNoise(gyro_density=0.0)

@@ -19,7 +19,7 @@ from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem
 from alidade.pipelines.methods.los.graph import problem
 from alidade.pipelines.methods.los.recording import read_los, write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
@@ -43,7 +43,7 @@ from pathlib import Path
 from alidade.pipelines.methods.los.graph import problem
 from alidade.pipelines.config import load_config
 from alidade.pipelines.methods.los.recording import read_los
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.solvers.checkpoint import load_checkpoint
 from alidade.pipelines.solvers.incremental import IncrementalSolver
 recording = open_recording(Path(sys.argv[1]))

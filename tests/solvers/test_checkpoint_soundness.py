@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from alidade.factors.bridge import BoundModel
 from alidade.factors.model import Model, Residuals
-from alidade.factors.vectorized import VectorizedFactor
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Factor, Problem, Step
 from alidade.pipelines.solvers.incremental import solve_incremental
@@ -38,7 +38,7 @@ class Broken(Model):
         return np.full((len(s), 1), np.nan), lambda: tuple(np.zeros(shape) for shape in shapes)
 
 
-def _broken(k: int, time: float) -> VectorizedFactor:
+def _broken(k: int, time: float) -> BoundModel:
     return Broken(np.array([time])).on([state(k)], PARAMETER)
 
 

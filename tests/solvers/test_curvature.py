@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.settings import Sensors
-from alidade.pipelines.solvers import curvature, weak_directions
+from alidade.pipelines.solvers import weak_directions
 from alidade.pipelines.solvers.batch import solve, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.posterior import Reported
@@ -63,29 +63,6 @@ def test_joint_errors_fit_at_rest_and_when_motion_begins() -> None:
     found = [followed(*recording(seed, 10.0, 21.0, Sensors()), moments) for seed in range(4)]
     sums = np.sum([each.nees for each in found], axis=0)
     assert (sums < chi2.ppf(0.999, 4 * found[0].numbers)).all(), sums / 4.0
-
-
-def test_the_ways_that_bend_are_found_and_balanced() -> None:
-    """Two of five, or the one that bends most where none does by much."""
-    generator = np.random.default_rng(0)
-    true = np.linalg.qr(generator.standard_normal((5, 2)))[0].T
-    along = curvature._bending(np.array([np.outer(np.eye(5)[0], way) for way in true]), np.full(5, 0.01))
-    np.testing.assert_allclose(along.T @ along, true.T @ true, atol=1e-12)
-    draws = along @ curvature._balanced(along, np.eye(5), generator)
-    np.testing.assert_allclose(draws @ draws.T / draws.shape[1], np.eye(2), atol=1e-12)
-    slight = curvature._bending(1e-4 * generator.standard_normal((3, 5, 5)), np.ones(5))
-    np.testing.assert_allclose(slight @ slight.T, np.eye(1), atol=1e-12)
-
-
-def test_draws_do_not_depend_on_how_directions_are_told() -> None:
-    """Else sigmas would be what rounding makes of them, and others on another machine."""
-    generator = np.random.default_rng(0)
-    along = np.linalg.qr(generator.standard_normal((5, 2)))[0].T
-    axes = np.linalg.qr(generator.standard_normal((5, 5)))[0]
-    mixed = np.linalg.qr(generator.standard_normal((2, 2)))[0]
-    draws = curvature._balanced(along, np.eye(5), np.random.default_rng(1))
-    told = curvature._balanced(mixed @ along @ axes.T, axes, np.random.default_rng(1))
-    np.testing.assert_allclose(told, axes @ draws, atol=1e-12)
 
 
 def test_other_draws_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

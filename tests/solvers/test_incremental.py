@@ -16,16 +16,14 @@ from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.simulation import los_config, simulate_los
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.batch import minimum, solve_batch
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import (
     DEFAULT_WINDOW,
     IncrementalConfig,
     IncrementalSolver,
     solve_incremental,
 )
-from alidade.pipelines.solvers.noise_levels import weigh
-from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.batch import IDEAL
 from benchmarks.young import CASES, LOS, beginning, drawn_los, followed, made, nees, report, run
 
@@ -153,9 +151,8 @@ def test_a_valley_that_bends_between_bias_and_mount_is_followed_to_its_end() -> 
     """At rest a gimbal's bias is known by its mount alone: from the mount of the motion to come to that of the rest."""
     settings, _ = CASES["los"]["rest"](27)
     problem, _ = made("los", settings, 27)
-    whole = Assembly.of(step for step in problem.steps(CHUNK) if step.time <= 47.0)
-    factors, shared = weigh(whole.factors, problem.noises), whole.shared(problem)
-    found = optimize(factors, whole.initial, shared, problem.loss, most=20, held=problem.assumed)
+    compiled = Compiled.of(problem, steps=[step for step in problem.steps(1) if step.time <= 47.0])
+    found = minimum(compiled, problem.noises)
     assert found.converged, found.message
 
 
@@ -250,9 +247,9 @@ def test_a_number_without_prior_keeps_its_posterior() -> None:
     free = np.array([q.prior_sigma is None for q in problem.quantities])
     assert free.any()
     posterior = following._posterior()
-    values, covariance = posterior.at_prior(np.eye(len(posterior.mean)))
+    values, covariance = posterior.at_prior(np.eye(len(posterior.covariance)))
     some = np.array([bool(q.prior_sigma) for q in problem.quantities])
-    own = np.diag(posterior.covariance)[np.isin(posterior.free, np.flatnonzero(free))]
+    own = np.diag(posterior.covariance)[np.isin(posterior.reported.free, np.flatnonzero(free))]
     scale = np.array([q.prior_scale for q in problem.quantities])[free]
     np.testing.assert_allclose(np.diag(covariance)[free], own * scale**2)
     np.testing.assert_allclose(values[some], [q.prior_mean for q in problem.quantities if q.prior_sigma], atol=1e-12)

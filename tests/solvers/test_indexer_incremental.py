@@ -15,7 +15,7 @@ from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.indexer.graph import problem
 from alidade.pipelines.methods.indexer.recording import read_indexer
 from alidade.pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch

@@ -35,7 +35,7 @@ def test_step_covariance_and_minimum_are_those_of_gtsams_linearisation(name: str
 
     graph, error = gtsam.GaussianFactorGraph(), 0.0
     for f in factors:
-        native = f.factor if f.vectorized is None else f.vectorized.under(None).factor
+        native = f.factor if f.bound is None else f.bound.under(None).factor
         graph.add(native.linearize(initial))
         error += 2.0 * native.error(initial)
     others = sorted(set(layout.key.tolist()) - set(reported))

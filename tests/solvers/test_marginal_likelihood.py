@@ -1,4 +1,4 @@
-"""Noise levels of the largest marginal likelihood: gradient, widening, innovations, steps that levels would hide."""
+"""Noise levels of the largest marginal likelihood: gradient, widening, innovations."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 
 from alidade.factors import so3
 from alidade.pipelines import methods
@@ -95,30 +94,3 @@ def test_few_rows_of_clean_noise_are_widened() -> None:
     wide, out = widened(linear, levels, {})
     assert np.mean(np.concatenate(list(wide.values())) > 1.0) < 0.01
     assert not np.concatenate(list(out.values())).any()
-
-
-def test_a_slip_is_found_that_levels_would_hide() -> None:
-    """2 deg at 30 %: without the step the gyro's noise rises, and the recording would be calibrated."""
-    data, _ = simulate_head(SCENARIO, 2)
-    wxyz, late = data.vision_wxyz.copy(), data.vision_t > 9.0
-    wxyz[late] = so3.multiply(wxyz[late], so3.exp(np.deg2rad([2.0, 0.0, 0.0])))
-    slipped, right = solve_batch(made(replace(data, vision_wxyz=wxyz))), solve_batch(made(data))
-    assert slipped.step is not None
-    assert right.step is not None
-    assert abs(slipped.step.time_s - 9.0) < 0.5
-    size, sigma = slipped.step.steps["helmet_mount_x"]
-    assert abs(size - np.deg2rad(2.0)) < 4.0 * sigma
-    assert slipped.step.fall > 100.0
-    assert right.step.fall < 30.0
-
-
-def test_step_that_fits_best_in_an_outage_is_one_at_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """50 pictures, none for 3 s in the middle: no candidate time is without a measurement near it."""
-    data, _ = simulate_head(SCENARIO, 2)
-    kept = np.flatnonzero((data.vision_t < 9.0) | (data.vision_t > 12.0))[::11]
-    cov = None if data.vision_cov is None else data.vision_cov[kept]
-    sparse = replace(data, vision_t=data.vision_t[kept], vision_wxyz=data.vision_wxyz[kept], vision_cov=cov)
-    monkeypatch.setattr(LinearChain, "step_scores", lambda _, __, times, ___: -np.abs(times - 11.2))
-    step = solve_batch(made(sparse)).step
-    assert step is not None
-    assert np.abs(sparse.vision_t - step.time_s).min() < 1e-9

@@ -76,7 +76,7 @@ def dense(name: str) -> Dense:
     at = layout.to_gtsam(values)
     graph = gtsam.GaussianFactorGraph()
     for f in factors:
-        graph.add((f.factor if f.vectorized is None else f.vectorized.under(None).factor).linearize(at))
+        graph.add((f.factor if f.bound is None else f.bound.under(None).factor).linearize(at))
     dims, end, columns = at.dims(), 0, {}
     for key in at.keys():
         columns[key] = slice(end, end + dims[key])
@@ -131,7 +131,7 @@ def test_degrees_of_freedom_are_rows_less_leverages(name: str) -> None:
         if f.family not in NOT_MEASURED:
             h = ((A @ covariance) * A).sum(axis=1)
             value, dof = families.get(f.family, [0.0, 0.0])
-            v = f.vectorized
+            v = f.bound
             count = len(A) if v is None else v.model.rows * len(v.model.time)  # of which a compressed factor has fewer
             families[f.family] = [value + float(b @ b), dof + count - h.sum()]
     system = case.linearization.at(case.values)[0]
@@ -216,9 +216,9 @@ def test_most_influential_measurements_are_in_balance_with_all_others() -> None:
     moves = [
         float(gain @ A[m * i : m * i + m].T @ b[m * i : m * i + m]) / sigmas["delta_px"]
         for f, A, b in zip(case.factors, case.rows, case.rights, strict=True)
-        if f.vectorized is not None and f.family != "prior"
-        for m in [f.vectorized.model.rows]
-        for i in range(len(f.vectorized.model.time))
+        if f.bound is not None and f.family != "prior"
+        for m in [f.bound.model.rows]
+        for i in range(len(f.bound.model.time))
     ]
     expected = sorted(moves, key=abs, reverse=True)[:20]
     np.testing.assert_allclose([pull.sigmas for pull in first], expected, rtol=1e-4)

@@ -16,19 +16,15 @@ from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Parame
 from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers import levenberg
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.batch import minimum, solve_batch
+from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.gauss_newton import minimize
 from alidade.pipelines.solvers.incremental import solve_incremental
-from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information, reported_covariance
-from alidade.pipelines.solvers.system import System
-from alidade.pipelines.solvers.weighing import optimize
+from alidade.pipelines.solvers.posterior import Reported
 from alidade.pipelines.solvers.window import Keyframes
 from tests.support import chain
 from tests.support.chain import INTERVAL, PARAMETER, PRIOR, Walk
 from tests.support.judged import judge
-from tests.support.short_problems import los_problem
 
 # Slopes of a gyro's bias, rad/s/K.
 WARMING = (1.5e-4, -2e-4, 2.5e-4)
@@ -200,27 +196,15 @@ def test_fixed_quantities_cost_the_others_no_digits() -> None:
     quantities = [Quantity(f"q{i}", "", 0.0 if i == 2 else 1.0, 1.0, 0.1) for i in range(4)]
     values = gtsam.Values()
     values.insert(0, np.zeros(4))
-    covariance = reported_covariance([Parameter(0, tuple(quantities))], A.T @ A, values, [0])
+    problem = Problem("", (Parameter(0, tuple(quantities)),), lambda _: iter(()))
+    reported = Reported.at(problem, values, [0], [np.eye(4)])
+    root = np.asarray(np.linalg.qr(np.column_stack([A, np.zeros(len(A))]), mode="r"), dtype=float)
+    covariance = reported.covariance(reported.root(root).covariance())
     free = [0, 1, 3]
     expected = np.linalg.inv(A[:, free].T @ A[:, free])
     np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-6)
     assert not covariance[2].any()
     assert not covariance[:, 2].any()
-
-
-def test_the_states_alone_go_to_the_floor() -> None:
-    """Shared variables stay where they are, and a step from there on has only to do with these."""
-    problem = los_problem()
-    whole = Assembly.of(problem.steps(CHUNK))
-    system = System.of(whole.factors, whole.shared(problem), None)
-    values, falls = whole.initial, []
-    for _ in range(3):
-        move = system.linearized(values).states_alone()
-        assert all(not move.at(key).any() for key in system.shared)
-        before, values = system.error(values), values.retract(move)
-        falls.append(before - system.error(values))
-    assert falls[0] > 0.1 * system.error(values)
-    assert abs(falls[2]) < 1e-3
 
 
 @pytest.mark.parametrize("pictures_hz", [5.0, 10.0])
@@ -248,49 +232,14 @@ def test_where_measurements_do_not_fit_steps_get_the_right_length(pictures_hz: f
     assert found.cost - least < 0.02**2 * found.cost / measured
 
 
-def test_a_step_goes_without_the_excess() -> None:
-    """It is that of the normal equations with mixed second derivatives, less what these have too much."""
-    problem = los_problem()
-    whole = Assembly.of(problem.steps(CHUNK))
-    system = System.of(whole.factors, whole.shared(problem), None)
-    values = minimize(system, whole.initial, 1.0).values
-    linear = system.linearized(values, mixed=True)
-    assert linear.excess is not None
-    (((key, number), excess),) = linear.excess.items()
-    assert excess[0] == pytest.approx(2 * 300, rel=0.2)
-    H, g = linear.graph.hessian(system.ordering)
-    keys = [system.ordering.at(i) for i in range(system.ordering.size())]
-    sizes = [values.dims()[k] for k in keys]
-    row, scale = sum(sizes[: keys.index(key)]) + number, np.sqrt(np.diag(H))
-
-    def solved(too_much: float) -> Array:
-        scaled = H / np.outer(scale, scale)
-        scaled[row, row] -= too_much / scale[row] ** 2
-        return np.asarray(np.linalg.solve(scaled, g.ravel() / scale) / scale)
-
-    for on_floor, too_much in ((False, excess[0]), (True, excess.sum())):
-        delta, foreseen = linear.step(on_floor)
-        expected = solved(too_much)
-        np.testing.assert_allclose(delta.vector(keys), expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
-        assert foreseen == pytest.approx(0.5 * g.ravel() @ expected, rel=1e-6)
-        # Else the roll would move less.
-        assert abs(expected[row]) > 1.02 * abs(solved(0.0)[row])
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_roll_that_pictures_do_not_tell_does_not_swing(seed: int) -> None:
-    """Ten minutes of los with all assumptions: fewer steps than by Gauss-Newton, and the answer as good."""
+def test_a_roll_that_pictures_do_not_determine_does_not_swing(seed: int) -> None:
+    """Ten minutes of los with all nuisance parameters: few iterations, and no more to be gained."""
     scenario = LosScenario(duration_s=600.0, gyro_rate_hz=200.0, image_rate_hz=50.0)
     problem = los.problem(simulate_los(scenario, seed)[0], load_config(los_config(scenario).encode()))
-    whole = Assembly.of(problem.steps(CHUNK))
-    shared = whole.shared(problem)
-    found = optimize(whole.factors, whole.initial, shared, problem.loss)
-    # Three and five; without mixed second derivatives six and eight.
-    assert found.iterations < 6
-    system = found.system.without_rejected(found.values)
-    last = minimize(system, found.values, 1e-12)
-    linear = system.linearized(last.values)
-    sigmas = np.sqrt(np.diag(np.linalg.inv(joint_information(linear.graph, system.ordering, shared))))
-    off = last.values.localCoordinates(found.values)
-    assert np.abs(np.concatenate([off.at(key) for key in shared]) / sigmas).max() < 0.01
+    compiled = Compiled.of(problem)
+    found = minimum(compiled, problem.noises)
+    assert found.iterations < 16
+    last = levenberg.minimize(found.engine, found.values, levenberg.LevenbergConfig(cost_tolerance=1e-9))
+    assert found.cost - last.cost < 0.01**2

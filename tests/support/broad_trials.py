@@ -10,7 +10,7 @@ import numpy as np
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.methods.head.recording import HeadData, read_head
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 
 RATE_HZ = 2000.0 / 7.0
 BIAS = np.array([1e-3, -2e-3, 3e-3])

@@ -14,8 +14,8 @@ from mcap.writer import CompressionType, Writer
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_records import HEAD, MAGIC
-from alidade.pipelines.recording.reading import Recording, open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import Recording, open_recording
 
 T0 = 1_700_000_000_123_456_789
 CONFIG = b"method: head\n"
@@ -148,6 +148,8 @@ def check_sound(path: Path, whole: Whole) -> str:
         assert len(set(rows.tolist())) == len(rows)
         lost += len(t_ns) - len(left_t)
     assert recording.notes or not lost
-    if recording.losses and not any(loss.kind in ("cut", "summary", "definition") for loss in recording.losses):
-        assert sum(recording.missing.values()) == lost
+    if recording.container.losses and not any(
+        loss.kind in ("cut", "summary", "definition") for loss in recording.container.losses
+    ):
+        assert sum(recording.container.missing.values()) == lost
     return "part" if lost else "whole"

@@ -8,11 +8,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from alidade.factors.vectorized import VectorizedFactor
+from alidade.factors.bridge import BoundModel
 from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Step
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-from alidade.pipelines.solvers.marginals import joint_covariance, reported
-from alidade.pipelines.solvers.weighing import optimize
+from alidade.pipelines.solvers.batch import minimum
+from alidade.pipelines.solvers.engines import ALL, Compiled
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
+from alidade.pipelines.solvers.posterior import Reported
 
 # Indices of one recording's variables stay below this.
 _APART = 10_000_000
@@ -24,7 +25,7 @@ def one_graph(problems: Sequence[Problem], shared: Collection[str]) -> Problem:
     Parameters of the second recording are called `name@1`.
     """
     same = {p.key for p in problems[0].parameters if all(q.name in shared for q in p.quantities)}
-    wholes = [Assembly.of(problem.steps(CHUNK)) for problem in problems]
+    wholes = [_whole(problem) for problem in problems]
 
     def steps(_: int) -> Iterator[Step]:
         step = Step(time=1.0)
@@ -46,6 +47,16 @@ def one_graph(problems: Sequence[Problem], shared: Collection[str]) -> Problem:
     return replace(problems[0], parameters=tuple(kept.values()), steps=steps, attitudes=None, noises=noises, finer=None)
 
 
+def _whole(problem: Problem) -> Step:
+    """All steps as one."""
+    whole = Step(time=0.0)
+    for step in problem.steps(ALL):
+        whole.factors.extend(step.factors)
+        whole.initial.insert(step.initial)
+        whole.current_keys.update(step.current_keys)
+    return whole
+
+
 def _key(key: int, same: Collection[int], i: int) -> int:
     return key if key in same else key + i * _APART
 
@@ -58,12 +69,12 @@ def _renamed(parameter: Parameter, same: Collection[int], i: int) -> Parameter:
 
 
 def _moved(factor: Factor, same: Collection[int], i: int) -> Factor:
-    own = factor.vectorized
+    own = factor.bound
     if own is None:
         moves = [_key(k, same, i) for k in factor.factor.keys()]
         return Factor(factor.family, factor.factor.rekey(moves))
     tied = [_key(c, same, i) if isinstance(c, int) else [_key(k, same, i) for k in c] for c in own.columns]
-    moved = VectorizedFactor(own.model, tied, own.loss, own.compress, weights=own.weights)
+    moved = BoundModel(own.model, tied, own.loss, weights=own.weights)
     of = Factor.process_of if factor.measurement is None else Factor.of
     return of(factor.family, moved, factor.beside)
 
@@ -77,13 +88,10 @@ def _copy(values: gtsam.Values, key: int, to: int, out: gtsam.Values) -> None:
 
 def solved(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     """Values and sigmas by name of the problem's solution, steps made until nothing is left of them."""
-    whole = Assembly.of(problem.steps(CHUNK))
-    shared = whole.shared(problem)
-    solution = optimize(whole.factors, whole.initial, shared, problem.loss, held=problem.assumed)
-    values, system = solution.values, solution.system
-    for _ in range(4):
-        values = values.retract(system.linearize(values).optimize(system.ordering, gtsam.EliminateQR))
-    covariance = joint_covariance(problem, system.linearized(values), whole.current_keys)
-    names = [q.name for q in problem.quantities]
-    numbers, sigmas = reported(problem, values, whole.current_keys).tolist(), np.sqrt(np.diag(covariance)).tolist()
-    return dict(zip(names, numbers, strict=True)), dict(zip(names, sigmas, strict=True))
+    compiled = Compiled.of(problem)
+    found = minimum(compiled, problem.noises)
+    found = minimize(found.engine, found.values, LevenbergConfig(cost_tolerance=1e-14))
+    reported = Reported.of(problem, compiled.layout, found.values, compiled.current_keys)
+    covariance = reported.covariance(reported.root(found.factorization.root).covariance())
+    numbers, sigmas = reported.numbers.tolist(), np.sqrt(np.diag(covariance)).tolist()
+    return dict(zip(reported.names, numbers, strict=True)), dict(zip(reported.names, sigmas, strict=True))

@@ -10,7 +10,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 T0 = 1_700_000_000_000_000_000

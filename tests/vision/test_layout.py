@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
-from alidade.pipelines.config import recorded_config
+from alidade.pipelines.config import configured
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.layout import cube_layout
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.layout import Layout, Shots, estimate_layout
 from alidade.pipelines.vision.layout.additional import nothing, with_intrinsics
-from alidade.pipelines.vision.layout.bundle import moved
-from alidade.pipelines.vision.layout.normal import shared_rows
+from alidade.pipelines.vision.layout.bundle import moved, shared_rows
 from alidade.pipelines.vision.layout.placing import mirrored
 from alidade.pipelines.vision.layout.sights import Bundle, Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, estimate_pose
@@ -418,8 +417,8 @@ def apart(a: Layout, b: Layout) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_real_cube_of_18_tags(shared_data) -> None:  # type: ignore[no-untyped-def]
-    recording = open_recording(shared_data / "tagslam_cube18" / "cam1.mcap")
-    config = recorded_config(recording, shared_data / "tagslam_cube18" / "ids.yaml")
+    whole = open_recording(shared_data / "tagslam_cube18" / "cam1.mcap")
+    recording, config = configured(whole, shared_data / "tagslam_cube18" / "ids.yaml")
     layout = cube_layout([(recording, config)])
     assert len(layout.body.ids) == 18
     assert not layout.unplaced

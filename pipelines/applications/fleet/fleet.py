@@ -33,7 +33,7 @@ from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.container import sha256_of, sha256_together
+from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.reports.known import load_known
 
 if TYPE_CHECKING:
@@ -290,4 +290,4 @@ def _placed(name: str, result: RecordingResult, named: Mapping[str, str]) -> Uni
 
 def _sha256(path: Path) -> str:
     """Of a file, or of all that is in a folder."""
-    return sha256_together(map(sha256_of, sorted(path.iterdir()))) if path.is_dir() else sha256_of(path)
+    return combined_sha256(map(file_sha256, sorted(path.iterdir()))) if path.is_dir() else file_sha256(path)

@@ -28,8 +28,8 @@ from alidade.pipelines.applications.follow.protocol import (
 from alidade.pipelines.applications.follow.sources import Stream
 from alidade.pipelines.applications.follow.spool import Spool
 from alidade.pipelines.errors import printable
-from alidade.pipelines.recording.channel_format import ChannelFormat
 from alidade.pipelines.recording.container import Channel, Schema
+from alidade.pipelines.recording.decoding import MessageFormat
 from alidade.pipelines.recording.messages import SENSORS
 
 # Encoding of messages -> that of their schema, where a bridge does not say it.
@@ -112,6 +112,8 @@ class Bridge(Stream):
             if isinstance(data, bytes):
                 self._take(data, wanted, record)
                 continue
+            for number in self._unadvertised(data):
+                wanted.pop(number, None)
             new = {number: one for number, one in self._advertised(data) if number not in wanted}
             if new and len(wanted) + len(new) <= MAX_CHANNELS:
                 wanted |= new
@@ -130,6 +132,15 @@ class Bridge(Stream):
             record.add(wanted[subscription], log_ns, data[MESSAGE_HEAD.size :])
         except RefusedError as error:
             self._refuse(str(error))
+
+    def _unadvertised(self, text: str) -> list[int]:
+        """Channels that the bridge has withdrawn: their subscriptions end, and their ids may be used again."""
+        try:
+            content = read_message(text)
+            ids = content.get("channelIds") if content.get("op") == "unadvertise" else []
+            return [read_id(number) for number in ids] if isinstance(ids, list) else []
+        except RefusedError:
+            return []  # counted by `_advertised`, which reads every text
 
     def _advertised(self, text: str) -> list[tuple[int, dict[str, str]]]:
         """The channels that a bridge tells of in a message and that are of use, with its numbers."""
@@ -220,5 +231,5 @@ def _is_of_use(channel: dict[str, str]) -> bool:
         schema = Schema(1, channel["schemaName"], channel["schemaEncoding"], _schema(channel))
     except (binascii.Error, ValueError) as error:
         raise RefusedError("a schema that is no base64") from error
-    form = ChannelFormat(Channel(1, channel["topic"], channel["encoding"], 1), schema)
+    form = MessageFormat(Channel(1, channel["topic"], channel["encoding"], 1), schema)
     return form.is_readable and form.type in SENSORS

@@ -20,15 +20,15 @@ import numpy as np
 
 from alidade.pipelines.applications.follow.guidance import View, Watch, view_of
 from alidade.pipelines.applications.follow.sources import Source
-from alidade.pipelines.applications.session import Session
+from alidade.pipelines.applications.session import Recorded, Session
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.camera_clock import Clock
 from alidade.pipelines.estimation.problem import Problem, Step
-from alidade.pipelines.recording.container import sha256_of
-from alidade.pipelines.recording.growing import Growing
-from alidade.pipelines.recording.opening import identity
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.container import file_sha256
+from alidade.pipelines.recording.growing import GrowingFiles
+from alidade.pipelines.recording.opening import file_identity
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
@@ -106,7 +106,7 @@ class Follower:
         self._shown = 0.0
         self._waiting = ""
         self._checklist: dict[str, ChecklistItem] = {}
-        self._growing = Growing()
+        self._growing = GrowingFiles()
         self._session: Session | None = None  # as last read whole
         self._delay_ns, self._attachments = 0, 0
         self._guessed = 0.0  # from a recording of so many s
@@ -151,6 +151,8 @@ class Follower:
         started = time.thread_time()
         try:
             problem, steps = self._end_alone() or self._whole()
+        except NotARecordingError:
+            raise
         except (InputError, OSError) as error:  # files may be gone, or too many open, for a while
             self._wait(str(error))
             return time.thread_time() - started
@@ -178,12 +180,12 @@ class Follower:
 
     def _whole(self) -> tuple[Problem, Iterator[Step]]:
         """The graph of all there is, and its steps that were not taken yet."""
-        recording = Recording(self._growing.look(self.source.parts, None))
+        recording = Recording(self._growing.refresh(self.source.parts, None))
         session = self._read(recording)
         problem = self._guessed_before(session) or _that_grows(session.problem(), session)
         steps = self._new_steps(session, problem)
         self._session, self._checklist = session, {}
-        self._delay_ns, self._attachments = recording.delay_ns, len(self._growing.attachments)
+        self._delay_ns, self._attachments = _min_delay_ns(session), len(self._growing.attachments)
         self._collect(session)
         return problem, steps
 
@@ -206,22 +208,20 @@ class Follower:
             return None
         for margin in _MARGINS:
             since = self._epoch_ns + self._delay_ns + round((run.marginal.time - margin) * 1e9)
-            recording = Recording(self._growing.look(self.source.parts, since), self._epoch_ns)
+            recording = Recording(self._growing.refresh(self.source.parts, since), self._epoch_ns)
             if len(self._growing.attachments) != self._attachments:
                 return None
             late = session.again(recording)
             problem = run.problem.onward(late.data, run.marginal.time)
             if problem is not None and problem.steps_after is not None:
-                self._delay_ns = recording.delay_ns
+                self._delay_ns = _min_delay_ns(late)
                 self._collect(late)
                 run.update_problem(problem)
                 return problem, problem.steps_after(run.time)
         return None
 
     def _wait(self, reason: str) -> None:
-        """The recording cannot be read yet, or holds too little; raises InputError when it never will."""
-        if "not an MCAP file" in reason:
-            raise InputError(reason)
+        """Say once why the recording cannot be read yet."""
         reason = reason.removeprefix(f"{self.source.path}: ")
         if reason != self._waiting:
             self._waiting = reason
@@ -299,11 +299,11 @@ class Follower:
     def _identify(self, session: Session) -> dict[str, str]:
         """What a checkpoint belongs to, in words."""
         return {
-            "recording": f"one that starts at {session.origin.epoch_ns} ns ({identity(self.source.parts[0])})",
+            "recording": f"one that starts at {session.origin.epoch_ns} ns ({file_identity(self.source.parts[0])})",
             "method": session.method.name,
             "config": session.config.model_dump_json(exclude_defaults=True),
             "window": str(self.settings.window),
-            "prior": "none" if self.settings.prior is None else sha256_of(self.settings.prior),
+            "prior": "none" if self.settings.prior is None else file_sha256(self.settings.prior),
             "version": f"alidade {metadata.version('alidade')} with gtsam {metadata.version('gtsam')}",
         }
 
@@ -346,6 +346,12 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
     for step in steps:
         yield step
         return
+
+
+def _min_delay_ns(session: Session) -> int:
+    """Least delay of the log times after the stamps, ns, of the topics that were read."""
+    assert isinstance(session.origin, Recorded)
+    return session.origin.recording.delay_ns
 
 
 def _is_misplaced(run: IncrementalSolver) -> bool:

@@ -66,7 +66,7 @@ class View:
     @property
     def verdicts(self) -> dict[str, Verdict]:
         """Parameter -> verdict, of those with a required accuracy; none while there is too little."""
-        return {} if self.covariance is None else verdicts(self.quantities, self.covariance)
+        return {} if self.covariance is None else verdicts(self.quantities, self.covariance, self.findings)
 
     @property
     def status(self) -> str:

@@ -15,13 +15,13 @@ from __future__ import annotations
 import asyncio
 import base64
 import ipaddress
-import json
 import math
 import secrets
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import suppress
 from importlib.resources import files
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -29,6 +29,7 @@ from urllib.parse import urlsplit
 
 from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Attempts, Gate
 from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.applications.follow.protocol import to_json
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.result import Calibration
@@ -48,8 +49,9 @@ _RETRY = 1000
 _POINTS = 60
 # Sentences kept, and for how long, s.
 _NOTES, _FRESH = 3, 30.0
-# A machine beyond every network: what would be sent there goes out by the address that others see. Nothing is sent.
-_ELSEWHERE = ("192.0.2.1", 9)
+# Machines beyond every network (RFC 5737, RFC 3849): what would be sent there goes out by the address that others see.
+# Nothing is sent.
+_ELSEWHERE = {socket.AF_INET: ("192.0.2.1", 9), socket.AF_INET6: ("2001:db8::1", 9)}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'",
@@ -86,7 +88,7 @@ class LivePage:
                 "--page needs starlette and uvicorn, which are not installed: pip install 'alidade[serve]'"
             ) from error
         self._say, self._host = say, host
-        self._socket = _listening(host, port)
+        self._socket, self._families = _listening(host, port)
         self._port = self._socket.getsockname()[1]
         self.is_open = not _is_loopback(self._socket.getsockname()[0])
         self._token, self._key = _token(), secrets.token_urlsafe(32)
@@ -123,7 +125,7 @@ class LivePage:
         """What to open in a browser."""
         host = self._host
         if self.is_open and ipaddress.ip_address(self._socket.getsockname()[0]).is_unspecified:
-            host = _outward()
+            host = _outward(self._families)
         address = f"http://{f'[{host}]' if ':' in host else host}:{self._port}/"
         return f"{address}?token={self._token}" if self.is_open else address
 
@@ -176,7 +178,7 @@ class LivePage:
         with self._lock:
             for changed in (*new, more):
                 self._state |= changed
-            self._event = (self._event[0] + 1, json.dumps(self._state, allow_nan=False))
+            self._event = (self._event[0] + 1, to_json(self._state))
 
     def _notes(self) -> list[str]:
         return [sentence for at, sentence in self._noted if time.monotonic() - at < _FRESH]
@@ -225,8 +227,8 @@ class LivePage:
         known = self._asks_for_this_machine(request) and (
             not self.is_open or _equal(request.cookies.get(self._cookie, ""), self._key)
         )
-        if known and request.client is not None:
-            self._gate.trust(tuple(request.client))
+        if known:
+            self._gate.trust(request.state.connection)
         return known
 
     def _asks_for_this_machine(self, request: Request) -> bool:
@@ -302,10 +304,13 @@ def _html() -> str:
     return files("alidade.pipelines.applications.follow").joinpath("templates/live.html").read_text(encoding="utf-8")
 
 
-def _listening(host: str, port: int) -> socket.socket:
+def _listening(host: str, port: int) -> tuple[socket.socket, Sequence[socket.AddressFamily]]:
+    """A listening socket and the address families that reach it: `::` is reached by IPv4 as well where that can be."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        return socket.create_server((host, port), family=family)
+        both = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
+        listening = socket.create_server((host, port), family=family, dualstack_ipv6=both)
+        return listening, (socket.AF_INET, socket.AF_INET6) if both else (family,)
     except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(f"--page: no server can be started at {host} port {port} ({error}); give another") from error
 
@@ -341,22 +346,22 @@ def _bounded(gate: Gate) -> type[Any]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
-            peer = self.client or ("?", id(self))
-            gate.admit(peer, peer[0], transport.abort)
-            self.loop.call_later(HANDSHAKE_TIME_S, gate.close_untrusted, peer)
+            # Ports are used again: the connection itself is its name, and each of its requests has it.
+            self.app_state = {**self.app_state, "connection": self}
+            gate.admit(self, self.client[0] if self.client else "?", transport.abort)
+            self.loop.call_later(HANDSHAKE_TIME_S, gate.close_untrusted, self)
 
         def connection_lost(self, exc: Exception | None) -> None:
-            gate.release(self.client or ("?", id(self)))
+            gate.release(self)
             super().connection_lost(exc)
 
     return BoundedProtocol
 
 
-def _outward() -> str:
-    """The address of this machine that others on its network see; its name where there is no network."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(_ELSEWHERE)
-        except OSError:
-            return socket.gethostname()
-        return str(probe.getsockname()[0])
+def _outward(families: Sequence[socket.AddressFamily]) -> str:
+    """Address of this machine that others on its network reach by one of the families; its name without a network."""
+    for family in families:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe, suppress(OSError):
+            probe.connect(_ELSEWHERE[family])
+            return str(probe.getsockname()[0])
+    return socket.gethostname()

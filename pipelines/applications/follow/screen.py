@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from types import TracebackType
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -13,10 +14,13 @@ from rich.table import Table
 from rich.text import Text
 
 from alidade.pipelines.applications.follow.guidance import View
-from alidade.pipelines.applications.follow.qr import qr
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.reports.terminal import COLOURS
 
+# Readers want four light modules around the code; the encoder leaves two.
+_QUIET = 2
+# Two modules above each other are one character, by whether the upper and the lower one are dark.
+_HALVES = {(False, False): " ", (True, False): "▀", (False, True): "▄", (True, True): "█"}
 # A line at most this often where there is no terminal, s.
 _LINE = 5.0
 
@@ -99,3 +103,16 @@ def _collected(view: View) -> Table:
     for c in view.checklist:
         table.add_row(c.what, c.have, c.wanted or "[green]enough[/]")
     return table
+
+
+def qr(address: str) -> Text:
+    """An address as a QR code for a phone's camera, dark on light whatever the terminal's own colours are."""
+    import cv2  # takes long, and most runs show no code
+
+    dark = np.pad(cv2.QRCodeEncoder.create().encode(address) == 0, _QUIET)
+    rows = dark if len(dark) % 2 == 0 else np.vstack([dark, np.zeros_like(dark[:1])])
+    lines = [
+        "".join(_HALVES[bool(a), bool(b)] for a, b in zip(upper, lower, strict=True))
+        for upper, lower in zip(rows[::2], rows[1::2], strict=True)
+    ]
+    return Text("\n".join(lines), style="black on white", no_wrap=True)

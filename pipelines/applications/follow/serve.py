@@ -25,6 +25,7 @@ from alidade.pipelines.applications.follow.protocol import (
     RefusedError,
     read_id,
     read_message,
+    to_json,
     websockets,
 )
 from alidade.pipelines.errors import InputError
@@ -150,23 +151,23 @@ class LiveServer:
         number = self._advertise(topic, schema, metadata)
         with self._changed:
             before = self._last[number].number if number in self._last else 0
-            self._last[number] = _Last(before + 1, at, json.dumps(message).encode())
+            self._last[number] = _Last(before + 1, at, to_json(message).encode())
             self._changed.notify_all()
 
     # -- one client: this thread listens, another one sends
 
     def _bounded(self, connected: socket.socket, address: tuple[Any, ...]) -> None:
         """A connection, as long as there is room for it."""
-        self._gate.admit(address, str(address[0]), lambda: _hang_up(connected))
+        self._gate.admit(connected, str(address[0]), lambda: _hang_up(connected))
         try:
             self._handle(connected, address)
         finally:
-            self._gate.release(address)
+            self._gate.release(connected)
 
     def _client(self, connection: Any) -> None:
         from websockets.exceptions import ConnectionClosed as Closed
 
-        self._gate.trust(connection.remote_address)
+        self._gate.trust(connection.socket)
         client = _Client()
         sender = threading.Thread(target=self._send, args=(connection, client), daemon=True)
         sender.start()

@@ -5,6 +5,7 @@ Streams are written down as they come, so that all sources look alike: files tha
 
 from __future__ import annotations
 
+import re
 import sys
 import tempfile
 import threading
@@ -22,7 +23,7 @@ from alidade.pipelines.recording.opening import Where, is_closed, parts_in
 
 _PIECE = 1 << 16
 # Names of the files in which a stream is written down.
-_PART = "live_{}.mcap"
+_PART = re.compile(r"live_(\d+)\.mcap")
 
 
 class Source(AbstractContextManager["Source"]):
@@ -92,8 +93,8 @@ class Stream(Source):
                 f"{folder or 'TMPDIR'}: {name} cannot be written down there ({error.strerror}); give another --record"
             ) from error
         super().__init__(folder, name)
-        before = len(list(folder.glob(_PART.format("*"))))
-        self._file = folder / _PART.format(f"{before:04d}")
+        numbers = (int(found[1]) for file in folder.iterdir() if (found := _PART.fullmatch(file.name)))
+        self._file = folder / f"live_{max(numbers, default=-1) + 1:04d}.mcap"
         self._over = threading.Event()
 
     @property

@@ -22,7 +22,7 @@ RETRY_PERIOD_S = 0.5
 
 
 class Spool:
-    """Bytes appended to a file, which is made when the first are written.
+    """Bytes appended to a file, which is made when the first are written and may not be there before.
 
     Args:
         path: of the file.
@@ -80,7 +80,7 @@ class Spool:
 
     def _append(self) -> None:
         if self._file is None:
-            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
         at, left = self._end, memoryview(bytes(self._waiting))
         while left:
             written = os.pwrite(self._file, left, at)

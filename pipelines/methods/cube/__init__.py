@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods.cube.scenario import CubeScenario
     from alidade.pipelines.methods.cube.topics import CubeConfig
     from alidade.pipelines.methods.formula import Formula
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration
@@ -47,7 +47,6 @@ class Cube(Method):
         r"reference_heading": "Heading error of the reference.",
         r"reference_tilt_([en])": "Tilt error of the reference about {0}.",
         r"tag_(\d+)_([xyz])": "Tag {0} rotation about {1}, correction of the config.",
-        r"accel_square_([123])": "Accelerometer quadratic nonlinearity, {0}.",
         r"accel_cube_([123])": "Accelerometer cubic nonlinearity, {0}.",
         r"camera_focal": "Relative correction of the focal length.",
         r"camera_centre_([xy])": "Correction of the image centre along {0}.",

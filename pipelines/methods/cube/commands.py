@@ -29,11 +29,11 @@ def cube_layout(
     From pictures of all sides; ids and sizes come from the config.
     """
     from alidade.pipelines import progress
-    from alidade.pipelines.config import recorded_config
+    from alidade.pipelines.config import configured
     from alidade.pipelines.methods.cube.layout import cube_layout as estimate
     from alidade.pipelines.methods.cube.layout import layout_yaml
     from alidade.pipelines.methods.cube.layout_page import layout_json, layout_report
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.whole import write_file
@@ -42,8 +42,7 @@ def cube_layout(
     if page == out:
         raise InputError(f"{out}: --out names the config, and its page takes the name with .html; call it .yaml")
     with progress.shown(quiet), progress.doing("finding where the tags are"):
-        recordings = [open_recording(session) for session in sessions]
-        layout = estimate([(each, recorded_config(each, config)) for each in recordings], refine_camera)
+        layout = estimate([configured(open_recording(session), config) for session in sessions], refine_camera)
     write_file(out, layout_yaml(layout))
     report = layout_report(layout, [session.name for session in sessions])
     write_file(page, render_html(report))

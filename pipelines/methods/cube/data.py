@@ -15,7 +15,7 @@ from alidade.pipelines.methods.cube.topics import CubeConfig, RawConversion, fie
 from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.methods.place import field_at
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config
 from alidade.pipelines.vision.camera import Camera
 

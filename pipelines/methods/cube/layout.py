@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import StringIO
 from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.cube.sightings import read_camera
 from alidade.pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import IMAGE
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
@@ -91,21 +91,14 @@ def _detections(recording: Recording, config: Config) -> list[tuple[int, Detecti
 
 def layout_yaml(layout: Layout) -> str:
     """The layout as a config with `cube.tags`, to be given to `calibrate --config`; sigmas stand in comments."""
-    from ruamel.yaml import YAML
-
     body = layout.body
     tags = {
         int(i): {"size": float(size), "rotation": bRt.tolist(), "position": position.tolist()}
         for i, size, bRt, position in zip(body.ids, body.size, body.bRt, body.position, strict=True)
     }
-    text = StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
     cube: dict[str, object] = {"tag_family": body.family, "tags": tags, "covariance": _covariance(layout)}
     if layout.with_camera is not None:
         cube["camera"] = _camera(layout.cameras[0])
-    yaml.width = _WIDE
-    yaml.dump({"cube": cube}, text)
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
     lines = [
         f"# From {layout.frames} pictures; corners good to {layout.rms_px:.3f} px RMS, tags flat and square to "
@@ -117,7 +110,7 @@ def layout_yaml(layout: Layout) -> str:
         for i, s in zip(body.ids[1:], sigmas, strict=True)
     ]
     lines += [f"# tag {i} could not be placed: {why}" for i, why in layout.unplaced.items()]
-    return "\n".join([*lines, text.getvalue()])
+    return "\n".join([*lines, dump_yaml({"cube": cube}, _WIDE)])
 
 
 def _covariance(layout: Layout) -> dict[str, object]:

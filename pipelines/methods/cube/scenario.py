@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.cube.faces import FACES, Resting
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.temperature import Warming
@@ -139,8 +139,6 @@ class CubeScenario(_Part):
 
 def cube_config(scenario: CubeScenario, images: bool = False) -> str:
     """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors."""
-    from ruamel.yaml import YAML
-
     # Simulated sensors repeat as well as white noise lets them.
     repeats = {f"{name}_repeatability": 0.0 for name in ("gyro", "turn", "accel", "mag")}
     noise = {**scenario.noise.model_dump(), **repeats}
@@ -159,8 +157,4 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
             for i, (wxyz, normal) in FACES.items()
         }
         config["cube"] = {"tag_family": "36h11", "tags": tags, "camera_rotation": list(FORWARD)}
-    text = StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.dump(config, text)
-    return text.getvalue()
+    return dump_yaml(config)

@@ -12,10 +12,10 @@ from alidade.pipelines.methods.cube.data import Array, CubeData, Sightings
 from alidade.pipelines.methods.cube.static_intervals import static_intervals
 from alidade.pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig, RefinedCamera
 from alidade.pipelines.recording.checks import clean, count
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import IMAGE, wanted
 from alidade.pipelines.settings import Config
-from alidade.pipelines.vision.recorded import camera_of
+from alidade.pipelines.vision.camera import camera_of
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.camera import Camera

@@ -13,8 +13,8 @@ from alidade.pipelines.methods.cube.data import Array, CubeData, Sightings
 from alidade.pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG
-from alidade.pipelines.recording.writing import attached, write_session
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.camera import Camera

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods.head.recording import HeadData
     from alidade.pipelines.methods.head.simulation import HeadScenario
     from alidade.pipelines.methods.head.topics import HeadConfig
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config

@@ -102,7 +102,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         keyframes=Keyframes(model.clock, _NEAR),
         layout=LAYOUT,
         marginal_likelihood=True,
-        may_step=model.parameters.helmet.key,
+        may_step=(model.parameters.helmet.key,),
         finer=partial(_finer, config, data, model),
     )
 
@@ -165,7 +165,7 @@ def _prepare(
     `noises` are those in force; None: as stated. `clock` tells when pictures were taken. Those of a recording that
     grows count as taken at their stamps.
     """
-    begun = float(data.vision_t[0])
+    begun = float(data.vision_t[0]) if before is None else before.clock.begun
     taken = data.vision_t + (Clock(begun) if clock is None else clock).late(data.vision_t - begun)
     inside = _inside(data, taken)
     stamps, taken, measured = data.vision_t[inside], taken[inside], data.vision_wxyz[inside]

@@ -64,7 +64,6 @@ HYPOTHESES = FaultModel(
         "truth_t": ("truth_wxyz",),
     },
     signs={"head_gyro": ("helmet gyro", AXES), "platform_gyro": ("platform gyro", AXES)},
-    offset=True,
     faults=(
         DataFault(
             "the attitudes of vision are inverted: they map the camera's frame to the markers', not back", _inverted

@@ -16,21 +16,15 @@ from alidade.pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import (
     check_overlap,
-    clean,
-    count,
     nanoseconds,
-    tracked,
-    unit_quaternions,
 )
-from alidade.pipelines.recording.gyro import read_gyro, read_imu
-from alidade.pipelines.recording.placeholders import believed
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.mcap_writer import attached, write_session
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
-from alidade.pipelines.recording.writing import attached, write_session
 from alidade.pipelines.settings import Config
-from alidade.pipelines.vision.recorded import camera_of
+from alidade.pipelines.vision.camera import camera_of
 
 Array = NDArray[np.float64]
 
@@ -77,38 +71,38 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     Raises InputError when a topic is missing or unusable, see alidade.pipelines.recording.checks, and when the topics
     have no time in common.
     """
-    dropped: dict[str, int] = {}
-    epoch = recording.epoch_ns
-    recording.read_together(dict.fromkeys(map(config.topic, _NUMBERS), ()))
+    reader = StreamReader(recording, dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic(HEAD_IMU)
-    head_t, head_gyro, density, head_force = read_imu(recording, name, epoch, dropped)
-    spans = {name: head_t}
+    head = reader.gyro(name)
+    head_force, density = reader.force(name, head), reader.density(name, "gyro", head)
+    spans = {name: head.t}
 
-    platform_t = platform_gyro = platform_density = None
+    platform = platform_density = None
     name = config.topic(PLATFORM_IMU)
     # One that is there and empty is no platform at rest.
     if name in recording.topics or wanted(recording, config, PLATFORM_IMU):
-        platform_t, platform_gyro, platform_density = read_gyro(recording, name, epoch, dropped)
-        spans[name] = platform_t
+        platform = reader.gyro(name, may_be_constant=True)
+        platform_density = reader.density(name, "gyro", platform)
+        spans[name] = platform.t
 
     name = config.topic(VISION_ATTITUDE)
     vision_cov: Array | None
     if wanted(recording, config, VISION_ATTITUDE) or not wanted(recording, config, IMAGE):
-        vision_t, vision_wxyz, vision_cov = _vision(recording, name, epoch, dropped)
+        vision_t, vision_wxyz, vision_cov = _vision(reader, name)
     else:
         name = config.topic(IMAGE)
-        vision_t, vision_wxyz, vision_cov = _from_pictures(recording, config, epoch, dropped)
+        vision_t, vision_wxyz, vision_cov = _from_pictures(reader, config)
     check_overlap({**spans, name: vision_t})
 
     truth_t = truth_wxyz = None
     if wanted(recording, config, TRUTH_ATTITUDE):
-        truth_t, truth_wxyz, _ = _vision(recording, config.topic(TRUTH_ATTITUDE), epoch, dropped)
+        truth_t, truth_wxyz, _ = _vision(reader, config.topic(TRUTH_ATTITUDE))
     return HeadData(
-        epoch,
-        head_t,
-        head_gyro,
-        platform_t,
-        platform_gyro,
+        reader.epoch_ns,
+        head.t,
+        head.series.gyro,
+        platform and platform.t,
+        platform and platform.series.gyro,
         vision_t,
         vision_wxyz,
         vision_cov,
@@ -117,9 +111,9 @@ def read_head(recording: Recording, config: Config) -> HeadData:
         density,
         platform_density,
         head_force,
-        dropped,
+        reader.dropped,
         recording.stamp_sigma_s,
-        temperature.read(recording, config, (parameters.TEMPERATURE,), head_t, dropped),
+        temperature.read(reader, config, (parameters.TEMPERATURE,), head.t),
     )
 
 
@@ -136,17 +130,13 @@ def write_head(
     back if the first sample is the one at t = 0.
     """
 
-    def imu(t: Array, gyro: Array, density: float | None, force: Array | None = None) -> series.ImuSeries:
-        variance = 0.0 if density is None else density**2 / np.median(np.diff(t))
-        t_ns = nanoseconds(t, data.epoch_ns)
-        accel = np.zeros(3) if force is None else force
-        return series.ImuSeries(t_ns, gyro, accel, gyro_cov=variance * np.eye(3), frame_id="imu")
-
+    epoch = data.epoch_ns
     topics: dict[str, series.Topic] = {
-        HEAD_IMU.name: imu(data.head_t, data.head_gyro, data.gyro_density, data.head_force),
+        HEAD_IMU.name: imu_series(epoch, data.head_t, data.head_gyro, data.head_force, data.gyro_density),
     }
     if data.platform_t is not None and data.platform_gyro is not None:
-        topics[PLATFORM_IMU.name] = imu(data.platform_t, data.platform_gyro, data.platform_gyro_density)
+        density = data.platform_gyro_density
+        topics[PLATFORM_IMU.name] = imu_series(epoch, data.platform_t, data.platform_gyro, density=density)
     if pictures is None:
         cov = np.zeros((len(data.vision_t), 6, 6))
         if data.vision_cov is not None:
@@ -162,9 +152,7 @@ def write_head(
     write_session(path, topics, attached(truth, config_yaml))
 
 
-def _from_pictures(
-    recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
-) -> tuple[Array, Array, Array]:
+def _from_pictures(reader: StreamReader, config: Config) -> tuple[Array, Array, Array]:
     """Attitudes of the helmet's tag board, seen in the pictures."""
     from alidade.pipelines.vision.board import board_attitudes
     from alidade.pipelines.vision.pose import TagBody
@@ -175,29 +163,21 @@ def _from_pictures(
         raise InputError(
             f"topic {topic}: the pictures need the tags on the helmet: give them in the config as head.board"
         )
-    camera = camera_of(recording, config)
+    camera = camera_of(reader.recording, config)
     board = TagBody.from_board(on_helmet)
-    seen = board_attitudes(recording.images(topic), camera, board, config.noise.corner_px)
+    seen = board_attitudes(reader.recording.images(topic), camera, board, config.noise.corner_px)
     for reason, number in seen.dropped.items():
-        count(dropped, f"{topic}: {reason}", number)
-    t, keep = clean(topic, seen.t_ns, epoch_ns, seen.cRh, dropped)
+        reader.count(topic, reason, number)
+    t, keep = reader.clean(topic, seen.t_ns, seen.cRh)
     return t, seen.cRh[keep], seen.covariance[keep]
 
 
-def _vision(
-    recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]
-) -> tuple[Array, Array, Array | None]:
-    poses = recording.poses(topic)
-    count(dropped, f"{topic}: stamped by log time (kept)", poses.stamped_by_log)
-    given = tracked(topic, poses.wxyz, dropped)
-    t, keep = clean(topic, poses.t_ns, epoch_ns, given, dropped)
-    wxyz = unit_quaternions(topic, t, given[keep])
-    cov = poses.cov[keep][:, _ROTATION, _ROTATION]
-    cov = believed(topic, "attitude", cov, _LEAST_VARIANCE, dropped)
+def _vision(reader: StreamReader, topic: str) -> tuple[Array, Array, Array | None]:
+    t, wxyz, cov = reader.attitude(topic, _LEAST_VARIANCE)
     known = np.abs(cov).max(axis=(1, 2)) > 0.0
     if not known.any():
         return t, wxyz, None
-    count(dropped, f"{topic}: no covariance, unlike the others", int(np.count_nonzero(~known)))
+    reader.count(topic, "no covariance, unlike the others", int(np.count_nonzero(~known)))
     t, wxyz, cov = t[known], wxyz[known], cov[known]
     bad = np.flatnonzero(~(np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0))
     if len(bad):

@@ -9,7 +9,6 @@ true attitude at the end of every interval, with no integration error.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from io import StringIO
 from typing import Annotated, Self
 
 import numpy as np
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.head.parameters import ASSUMPTIONS
 from alidade.pipelines.methods.head.pictures import HeadPictures, draw
 from alidade.pipelines.methods.head.recording import HeadData
@@ -157,8 +157,6 @@ def head_config(scenario: HeadScenario, images: bool = False) -> str:
 
     Attitudes from pictures bring their own covariance.
     """
-    from ruamel.yaml import YAML
-
     noise = scenario.noise.model_dump()
     if scenario.platform is None:
         del noise["platform_gyro_density"]
@@ -168,11 +166,7 @@ def head_config(scenario: HeadScenario, images: bool = False) -> str:
     if images:
         del noise["vision_attitude"]
         config["head"] = {"board": scenario.pictures.board.model_dump()}
-    text = StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = False
-    yaml.dump(config, text)
-    return text.getvalue()
+    return dump_yaml(config)
 
 
 def _platform_attitude(scenario: HeadScenario, t: Array) -> Array:

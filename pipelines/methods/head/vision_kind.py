@@ -13,7 +13,7 @@ from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
 from alidade.pipelines.methods.noise import typical
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import wanted
 from alidade.pipelines.settings import Config
 

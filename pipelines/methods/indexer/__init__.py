@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods.indexer.recording import IndexerData
     from alidade.pipelines.methods.indexer.simulation import IndexerScenario
     from alidade.pipelines.methods.indexer.topics import IndexerConfig
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config

@@ -180,8 +180,8 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
     return model, dropped
 
 
-def _steps(model: _Model, chunk: int) -> Iterator[Step]:
-    """A step for every group; in batch (chunk > 1) its factor is handed over compressed."""
+def _steps(model: _Model, _: int) -> Iterator[Step]:
+    """A step for every group, however many measurements are wanted together."""
     seen: set[tuple[str, int]] = set()
     for i, group in enumerate(model.groups):
         step = Step(
@@ -191,7 +191,7 @@ def _steps(model: _Model, chunk: int) -> Iterator[Step]:
         if i == 0:
             _begin(model, step)
         _add_bias(model, i, step)
-        _add_measurement(model, i, seen, step, compress=chunk > 1)
+        _add_measurement(model, i, seen, step)
         yield step
 
 
@@ -219,7 +219,7 @@ def _add_bias(model: _Model, i: int, step: Step) -> None:
         step.current_keys[bias.key(0)] = bias.mean_key(i)
 
 
-def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: Step, compress: bool) -> None:
+def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: Step) -> None:
     """The factor of a group, and the tilt of its position when that is new."""
     group = model.groups[i]
     options = model.options
@@ -240,7 +240,7 @@ def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: St
     average = IndexerAverageFactor.of(
         group.gyro, group.rates, model.density, encoder, options, wander, THETA_UNIT, warmth
     )
-    step.factors.append(Factor.of(group.kind, average.on(*columns, compress=compress)))
+    step.factors.append(Factor.of(group.kind, average.on(*columns)))
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:

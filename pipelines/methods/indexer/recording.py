@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +15,15 @@ from alidade.pipelines.methods.indexer import parameters
 from alidade.pipelines.methods.indexer.topics import INDEXER, JOINTS
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import (
-    LEAST_GYRO,
     check_overlap,
-    clean,
-    count,
     nanoseconds,
     unit_quaternions,
 )
-from alidade.pipelines.recording.gyro import usable
-from alidade.pipelines.recording.placeholders import density
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.mcap_writer import attached, write_session
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
 from alidade.pipelines.recording.topics import FIX, IMU, wanted
-from alidade.pipelines.recording.writing import attached, write_session
 from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
@@ -66,37 +60,32 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
     Raises InputError when a topic is missing or unusable, see alidade.pipelines.recording.checks, and when gyro and
     encoders have no time in common. A missing latitude is left to the method, which knows whether it is needed.
     """
-    dropped: dict[str, int] = {}
-    epoch = recording.epoch_ns
     imu_topic, encoder_topic = config.topic(IMU), config.topic(INDEXER)
-    recording.read_together({imu_topic: (), encoder_topic: JOINTS, config.topic(FIX): ()})
-    imu = recording.imu(imu_topic)
-    gyro_t, keep = usable(imu_topic, imu, epoch, dropped, least=3)
-    gyro = imu.gyro[keep]
-    attitude, wxyz = None, imu.wxyz[keep]
+    reader = StreamReader(recording, {imu_topic: (), encoder_topic: JOINTS, config.topic(FIX): ()})
+    imu = reader.gyro(imu_topic, least=3)
+    attitude, wxyz = None, imu.series.wxyz
     # A message that does not say it has zeros, one value, or NaN.
-    if (imu.wxyz_cov[keep, 0, 0] >= 0.0).all() and np.isfinite(wxyz).all() and np.ptp(wxyz, axis=0).any():
-        attitude = unit_quaternions(imu_topic, gyro_t, wxyz)
+    if (imu.series.wxyz_cov[:, 0, 0] >= 0.0).all() and np.isfinite(wxyz).all() and np.ptp(wxyz, axis=0).any():
+        attitude = unit_quaternions(imu_topic, imu.t, wxyz)
 
     joints = recording.joints(encoder_topic, JOINTS)
-    count(dropped, f"{encoder_topic}: stamped by log time (kept)", joints.stamped_by_log)
-    count(dropped, f"{encoder_topic}: without both joints", joints.without)
-    encoder_t, used = clean(encoder_topic, joints.t_ns, epoch, joints.position, dropped, least=3)
-    outer, inner = joints.position[used].T
-    check_overlap({imu_topic: gyro_t, encoder_topic: encoder_t})
+    reader.count(encoder_topic, "without both joints", joints.without)
+    encoders = reader.samples(encoder_topic, joints, "position", least=3)
+    outer, inner = encoders.series.position.T
+    check_overlap({imu_topic: imu.t, encoder_topic: encoders.t})
     return IndexerData(
-        epoch,
-        gyro_t,
-        gyro,
-        encoder_t,
+        reader.epoch_ns,
+        imu.t,
+        imu.series.gyro,
+        encoders.t,
         outer,
         inner,
         _latitude(recording, config),
         attitude,
-        density(imu_topic, "gyro", gyro_t, imu.gyro_cov[keep], LEAST_GYRO, dropped),
-        dropped,
+        reader.density(imu_topic, "gyro", imu),
+        reader.dropped,
         recording.stamp_sigma_s,
-        temperature.read(recording, config, (parameters.TEMPERATURE,), gyro_t, dropped),
+        temperature.read(reader, config, (parameters.TEMPERATURE,), imu.t),
     )
 
 
@@ -107,10 +96,10 @@ def write_indexer(
 
     Stamps are rounded to ns. read_indexer gives the same data back if the first sample is the one at t = 0.
     """
-    gyro_ns, encoder_ns = nanoseconds(data.gyro_t, data.epoch_ns), nanoseconds(data.encoder_t, data.epoch_ns)
-    variance = 0.0 if data.gyro_density is None else data.gyro_density**2 / np.median(np.diff(data.gyro_t))
-    orientation: dict[str, Any] = {} if data.attitude is None else {"wxyz": data.attitude, "wxyz_cov": np.zeros((3, 3))}
-    imu = series.ImuSeries(gyro_ns, data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu", **orientation)
+    encoder_ns = nanoseconds(data.encoder_t, data.epoch_ns)
+    imu = imu_series(data.epoch_ns, data.gyro_t, data.gyro, density=data.gyro_density)
+    if data.attitude is not None:
+        imu = replace(imu, wxyz=data.attitude, wxyz_cov=np.zeros((3, 3)))
     angles = np.column_stack([data.outer, data.inner])
     topics: dict[str, series.Topic] = {
         IMU.name: imu,

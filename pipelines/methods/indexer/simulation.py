@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import StringIO
 from typing import Annotated, Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.indexer.parameters import ASSUMPTIONS
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.topics import JOINTS
@@ -182,8 +182,6 @@ def indexer_config(scenario: IndexerScenario) -> str:
 
     The encoder's noise takes in all errors of the angles, RMS: white noise, harmonics, the axes' wobble, quantisation.
     """
-    from ruamel.yaml import YAML
-
     periodic = [*scenario.encoder_harmonics_arcsec, scenario.wobble_arcsec]
     variance = scenario.noise.encoder**2 + (2.0 * np.pi / 2**scenario.encoder_bits) ** 2 / 12.0
     variance += 0.5 * float(np.sum(np.square(periodic))) * ARCSEC**2
@@ -198,11 +196,7 @@ def indexer_config(scenario: IndexerScenario) -> str:
     }
     if scenario.sensors is not None:
         config["sensors"] = scenario.model_dump()["sensors"]
-    text = StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = False
-    yaml.dump(config, text)
-    return text.getvalue()
+    return dump_yaml(config)
 
 
 def _program(scenario: IndexerScenario) -> tuple[list[_Drive], float]:

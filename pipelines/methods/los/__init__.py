@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.methods.los.recording import LosData
     from alidade.pipelines.methods.los.simulation import LosScenario
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config

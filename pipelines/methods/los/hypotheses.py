@@ -7,6 +7,4 @@ from alidade.pipelines.diagnostics.fault_models import AXES, FaultModel
 HYPOTHESES = FaultModel(
     streams={"gyro_t": ("gyro", "force"), "gimbal_t": ("gimbal",), "image_t": ("error", "error_cov")},
     signs={"gyro": ("gyro", AXES), "gimbal": ("gimbal", ("azimuth", "elevation"))},
-    offset=True,
-    delays={"encoder_delay": "the encoders were read {encoder_delay} later than they are stamped"},
 )

@@ -16,16 +16,15 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.los import parameters
 from alidade.pipelines.methods.los.topics import GIMBAL, JOINTS, LOS_ERROR
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.checks import check_overlap, clean, count, nanoseconds
+from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.faults import drop_frozen
-from alidade.pipelines.recording.gyro import read_imu
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.mcap_writer import attached, write_session
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted
-from alidade.pipelines.recording.writing import attached, write_session
 from alidade.pipelines.settings import Config
-from alidade.pipelines.vision.recorded import camera_of
+from alidade.pipelines.vision.camera import camera_of
 
 Array = NDArray[np.float64]
 
@@ -79,23 +78,33 @@ def read_los(recording: Recording, config: Config) -> LosData:
     no time in common, when the target was never found, and when sizes say that an encoder is in degrees, an encoder
     stands still, a gyro axis has the opposite sign, the elevation is beyond 80 deg, or the LOS error is not in radians.
     """
-    dropped: dict[str, int] = {}
-    epoch = recording.epoch_ns
     gyro_name, gimbal_name, error_name = map(config.topic, (IMU, GIMBAL, LOS_ERROR))
-    recording.read_together({gyro_name: (), gimbal_name: JOINTS, error_name: ()})
-    gyro_t, gyro, density, force = read_imu(recording, gyro_name, epoch, dropped)
-    gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
+    reader = StreamReader(recording, {gyro_name: (), gimbal_name: JOINTS, error_name: ()})
+    imu = reader.gyro(gyro_name)
+    force, density = reader.force(gyro_name, imu), reader.density(gyro_name, "gyro", imu)
+    gimbal_t, gimbal = _gimbal(reader, gimbal_name)
     covariance = None
     if wanted(recording, config, LOS_ERROR) or not wanted(recording, config, IMAGE):
-        image_t, error = _error(recording, error_name, epoch, dropped)
+        image_t, error = _error(reader, error_name)
     else:
         error_name = config.topic(IMAGE)
-        image_t, error, covariance = _from_pictures(recording, config, epoch, dropped)
-    check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
+        image_t, error, covariance = _from_pictures(reader, config)
+    check_overlap({gyro_name: imu.t, gimbal_name: gimbal_t, error_name: image_t})
     stamp_sigma = recording.stamp_sigma_s
-    warmth = temperature.read(recording, config, (parameters.TEMPERATURE,), gyro_t, dropped)
     data = LosData(
-        epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, force, dropped, stamp_sigma, warmth
+        reader.epoch_ns,
+        imu.t,
+        imu.series.gyro,
+        gimbal_t,
+        gimbal,
+        image_t,
+        error,
+        covariance,
+        density,
+        force,
+        reader.dropped,
+        stamp_sigma,
+        temperature.read(reader, config, (parameters.TEMPERATURE,), imu.t),
     )
     check_gimbal(gimbal_name, data)
     check_signs(gyro_name, data)
@@ -118,10 +127,8 @@ def write_los(
     def ns(t: Array) -> NDArray[np.int64]:
         return nanoseconds(t, data.epoch_ns)
 
-    variance = 0.0 if data.gyro_density is None else data.gyro_density**2 / np.median(np.diff(data.gyro_t))
-    accel = np.zeros(3) if data.force is None else data.force
     topics: dict[str, series.Topic] = {
-        IMU.name: series.ImuSeries(ns(data.gyro_t), data.gyro, accel, gyro_cov=variance * np.eye(3), frame_id="imu"),
+        IMU.name: imu_series(data.epoch_ns, data.gyro_t, data.gyro, data.force, data.gyro_density),
         GIMBAL.name: series.JointSeries(ns(data.gimbal_t), data.gimbal, JOINTS, frame_id="gimbal"),
     }
     if pictures is None:
@@ -216,11 +223,10 @@ def _span(values: Array) -> Array:
     return np.asarray(np.ptp(values, axis=0)) if len(values) > 1 else np.full(values.shape[1], np.nan)
 
 
-def _gimbal(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]) -> tuple[Array, Array]:
-    joints = recording.joints(topic, JOINTS)
-    count(dropped, f"{topic}: stamped by log time (kept)", joints.stamped_by_log)
-    t, keep = clean(topic, joints.t_ns, epoch_ns, joints.position, dropped, least=4)
-    gimbal = np.stack([np.unwrap(joints.position[keep, 0]), joints.position[keep, 1]], axis=1)
+def _gimbal(reader: StreamReader, topic: str) -> tuple[Array, Array]:
+    joints = reader.samples(topic, reader.recording.joints(topic, JOINTS), "position", least=4)
+    t, position = joints.t, joints.series.position
+    gimbal = np.stack([np.unwrap(position[:, 0]), position[:, 1]], axis=1)
     worst = int(np.argmax(np.abs(gimbal[:, 1])))
     steepest = float(np.abs(gimbal[worst, 1]))
     if steepest > 0.5 * np.pi:
@@ -237,22 +243,22 @@ def _gimbal(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, 
     return t, gimbal
 
 
-def _error(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]) -> tuple[Array, Array]:
+def _error(reader: StreamReader, topic: str) -> tuple[Array, Array]:
     """Times and phx, phz, roll; messages without phx or phz (target lost), or with a frozen one, are dropped."""
-    errors = recording.vector(topic)
-    count(dropped, f"{topic}: stamped by log time (kept)", errors.stamped_by_log)
+    errors = reader.recording.vector(topic)
+    reader.count(topic, "stamped by log time (kept)", errors.stamped_by_log)
     offset = errors.vector[:, [0, 2]]
     if not np.isfinite(offset).all(axis=1).any():
         raise InputError(
             f"topic {topic}: the target was never found, none of the {len(errors)} messages has an LOS error; "
             "check what the tracker is locked on"
         )
-    t, keep = clean(topic, errors.t_ns, epoch_ns, offset, dropped)
+    t, keep = reader.clean(topic, errors.t_ns, offset)
     error = errors.vector[keep][:, [0, 2, 1]]
     if len(error) >= _FEWEST and np.isfinite(error[:, 2]).all() and np.ptp(error[:, 2]) == 0.0:
         # What never changes was not measured: a driver that measures two angles leaves the third as it is.
         error[:, 2] = np.nan
-        recording.remark(f"topic {topic}: y, the roll, reads one value in all messages: it was not measured")
+        reader.recording.remark(f"topic {topic}: y, the roll, reads one value in all messages: it was not measured")
     size = np.abs(error[:, :2]).max(axis=1)
     if np.median(size) > _WIDEST_ERROR:
         raise InputError(
@@ -260,7 +266,7 @@ def _error(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, i
             f"{_WIDEST_ERROR:g} rad; are they in pixels? divide by the focal length: x and z have to be in rad"
         )
     _check_tracked(topic, error[:, :2])
-    sound = drop_frozen(topic, t, error[:, :2], dropped, "rad", "xz")
+    sound = drop_frozen(topic, t, error[:, :2], reader.dropped, "rad", "xz")
     return t[sound], error[sound]
 
 
@@ -278,18 +284,16 @@ def _check_tracked(topic: str, offset: Array) -> None:
         )
 
 
-def _from_pictures(
-    recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
-) -> tuple[Array, Array, Array]:
+def _from_pictures(reader: StreamReader, config: Config) -> tuple[Array, Array, Array]:
     """LOS errors of the target that the first picture shows, with the tracker's covariance."""
     from alidade.pipelines.vision.target import los_errors
 
     topic = config.topic(IMAGE)
-    camera = camera_of(recording, config)
-    found = los_errors(recording.images(topic), camera)
+    camera = camera_of(reader.recording, config)
+    found = los_errors(reader.recording.images(topic), camera)
     for reason, number in found.dropped.items():
-        count(dropped, f"{topic}: {reason}", number)
-    t, keep = clean(topic, found.t_ns, epoch_ns, found.error, dropped)
+        reader.count(topic, reason, number)
+    t, keep = reader.clean(topic, found.t_ns, found.error)
     covariance = found.covariance[keep]
     # The first picture agrees with itself without error, yet where it puts the target is as uncertain as elsewhere.
     covariance[0] = np.median(covariance, axis=0)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from io import StringIO
 from math import cos, sin
 from typing import Annotated, Literal, Self
 
@@ -24,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.los.parameters import ASSUMPTIONS
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.topics import JOINTS
@@ -363,19 +363,13 @@ def los_config(scenario: LosScenario, images: bool = False) -> str:
 
     LOS errors from pictures bring their own covariance.
     """
-    from ruamel.yaml import YAML
-
     noise = {name: value for name, value in scenario.noise.model_dump().items() if value > 0.0}
     if images:
         noise = {name: value for name, value in noise.items() if name not in ("los_error", "los_roll")}
     config: dict[str, object] = {"method": "los", "noise": noise, "priors": scenario.priors}
     if scenario.sensors is not None:
         config["sensors"] = scenario.model_dump()["sensors"]
-    text = StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = False
-    yaml.dump(config, text)
-    return text.getvalue()
+    return dump_yaml(config)
 
 
 def _slew(scenario: LosScenario, t: Array) -> Array:

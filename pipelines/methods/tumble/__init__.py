@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.methods.tumble.recording import TumbleData
     from alidade.pipelines.methods.tumble.scenario import TumbleScenario
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration
@@ -33,7 +33,7 @@ class Tumble(Method):
     title = "Tumbled magnetometer and accelerometer"
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
-        "accel": ("temperature",),
+        "accel": ("square", "temperature"),
         "mag": ("delay",),
         "field": ("model_error",),
     }

@@ -139,11 +139,11 @@ def _up(graph: _Graph, keyframes: range) -> list[Factor]:
         return []
     sensor = graph.sensors["accel"]
     measured = _measured(turned, sensor, seen)
-    warmth = None if sensor.warmth is None else sensor.warmth[seen.row]
+    drivers = None if sensor.drivers is None else sensor.drivers[seen.row]
     unit = None if turned.arm is None else sensor.strength
-    factor = UpFactor(*measured, chain.gyro, turned.errors, turned.earth, unit, warmth)
+    factor = UpFactor(*measured, chain.gyro, turned.errors, turned.earth, unit, drivers)
     arm = [] if turned.arm is None else [turned.arm.key]
-    slope = [] if warmth is None else [SLOPE_KEY]
+    slope = [] if drivers is None else [SLOPE_KEY]
     keys = TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope, *_earth_key(turned)
     states = [chain.state(int(k)) for k in seen.keyframe]
     return [Factor.of(FAMILIES["accel"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]

@@ -8,9 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from alidade.pipelines.methods.formula import Formula, gyro_rate, over_temperature, temperature_text
+from alidade.pipelines.methods.formula import (
+    Formula,
+    gyro_rate,
+    numbers_of,
+    over_temperature,
+    temperature_text,
+    vector_text,
+)
 from alidade.pipelines.methods.triads import triad_formula
-from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, GYRO_SLOPE
+from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, GYRO_SLOPE
 from alidade.pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
 
 
@@ -19,6 +26,9 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     found = []
     if "accel_k11" in parameters:
         formula = triad_formula("accel", parameters, "accel", ("accel",), lambda v: v.accel, "body's")
+        if any(name in parameters for name in ACCEL_SQUARE.names):
+            found.append(replace(formula, meaning=f"{formula.meaning}, its square term in it", name="f_read"))
+            formula = _less_square(formula, parameters)
         found.append(_less_drift(formula, parameters))
     if "mag_k11" in parameters:
         unit = "the unit of field_strength"
@@ -33,6 +43,17 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
             )
         )
     return found
+
+
+def _less_square(formula: Formula, parameters: Collection[str]) -> Formula:
+    """The accelerometer's from what it reads, the square term taken off."""
+    square = vector_text(ACCEL_SQUARE.names, parameters)
+    return replace(
+        formula,
+        expression=f"f_read - {square} * f_read**2",
+        measured=("accel",),
+        compute=lambda v: np.asarray(v.f_read - numbers_of(v, ACCEL_SQUARE.names) * v.f_read**2),
+    )
 
 
 def _less_drift(formula: Formula, parameters: Collection[str]) -> Formula:

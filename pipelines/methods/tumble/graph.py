@@ -116,8 +116,8 @@ def _mirrored(model: Model, values: gtsam.Values) -> Iterator[gtsam.Values]:
             K, b = (rows @ Q.T)[:3].T, (rows @ Q.T)[3]
             of = entries(sensor.symmetric)
             other.update(TRIAD_KEYS[sensor.name], of.T @ np.append(K, b) / of.sum(axis=0))
-            if sensor.warmth is not None:
-                other.update(SLOPE_KEY, Q @ values.atVector(SLOPE_KEY))
+            if sensor.drivers is not None:
+                other.update(SLOPE_KEY, (values.atVector(SLOPE_KEY).reshape(-1, 3) @ Q.T).ravel())
         yield other
 
 
@@ -129,11 +129,11 @@ def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]
     """What a sensor says in a stretch of time."""
     if rows.start == rows.stop:
         return []
-    warmth = None if sensor.warmth is None else sensor.warmth[rows]
+    drivers = None if sensor.drivers is None else sensor.drivers[rows]
     factor = StrengthFactor(
-        sensor.time[rows], sensor.scaled[rows], sensor.sigma[rows], sensor.excess[rows], sensor.symmetric, warmth
+        sensor.time[rows], sensor.scaled[rows], sensor.sigma[rows], sensor.excess[rows], sensor.symmetric, drivers
     )
-    keys = TRIAD_KEYS[sensor.name], STRENGTH_KEYS[sensor.name], *([] if warmth is None else [SLOPE_KEY])
+    keys = TRIAD_KEYS[sensor.name], STRENGTH_KEYS[sensor.name], *([] if drivers is None else [SLOPE_KEY])
     return [Factor.of(FAMILIES[sensor.name], factor.on(*keys, loss=loss))]
 
 
@@ -141,9 +141,9 @@ def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: Tru
     """The angles between field and gravity in a stretch of time."""
     if rows.start == rows.stop:
         return []
-    warmth = None if moments.warmth is None else moments.warmth[rows]
+    drivers = None if moments.drivers is None else moments.drivers[rows]
     factor = DipFactor(
-        moments.time[rows], moments.accel[rows], moments.mag[rows], moments.sigma[rows], symmetric, warmth
+        moments.time[rows], moments.accel[rows], moments.mag[rows], moments.sigma[rows], symmetric, drivers
     )
-    keys = TRIAD_KEYS["accel"], TRIAD_KEYS["mag"], DIP_KEY, *([] if warmth is None else [SLOPE_KEY])
+    keys = TRIAD_KEYS["accel"], TRIAD_KEYS["mag"], DIP_KEY, *([] if drivers is None else [SLOPE_KEY])
     return [Factor.of("dip", factor.on(*keys, loss=loss))]

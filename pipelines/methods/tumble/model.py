@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import parameter
+from alidade.pipelines.estimation.assumptions import Assumption, parameter
 from alidade.pipelines.estimation.assumptions import stated as sheet
 from alidade.pipelines.estimation.noise import ROUGHLY, Noise
 from alidade.pipelines.estimation.problem import Array
@@ -25,7 +25,7 @@ from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
 from alidade.pipelines.methods.static_intervals import quiet_intervals
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.published import FEWEST, ellipsoid
-from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, NO_RATE, TumbleData
+from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, NO_RATE, TumbleData
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
 from alidade.pipelines.settings import Config
 
@@ -79,7 +79,7 @@ class Sensor:
         turned: (3, 3) the part of that which turns: the body's axes against those of a symmetric K.
         rested: whether the readings are means over rests.
         noise: of a sample, with its family.
-        warmth: (n,) K, temperature above the recording's first; None: not known, or nothing follows it.
+        drivers: (n, m) of the offset, see factors.ellipsoid.drifted, and `driven` their assumptions; None: none.
     """
 
     name: str
@@ -98,7 +98,8 @@ class Sensor:
     turned: Array
     rested: bool
     noise: Noise
-    warmth: Array | None = None
+    drivers: Array | None = None
+    driven: tuple[Assumption, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -146,7 +147,7 @@ class Moments:
         time, accel, mag: (n,) s, (n, 3) and (n, 3), without unit.
         sigma: (n,) of the cosine between them.
         noise: of the cosine.
-        warmth: (n,) K, of the accelerometer, as of a sensor.
+        drivers: (n, m), of the accelerometer, as of a sensor.
     """
 
     time: Array
@@ -154,7 +155,7 @@ class Moments:
     mag: Array
     sigma: Array
     noise: Noise
-    warmth: Array | None = None
+    drivers: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,10 +343,14 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sen
         config,
         (strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"),
     )
-    if data.temperature is None or parameter(0, (ACCEL_SLOPE,), config) is None:
+    causes = {ACCEL_SQUARE: found.nominal(raw) ** 2}
+    if data.temperature is not None:
+        warmth = data.temperature.above(data.temperature.first, data.accel_t)
+        causes[ACCEL_SLOPE] = np.repeat(_means(data.accel_t, warmth[:, None], rests)[1], 3, axis=1)
+    driven = tuple(each for each in causes if parameter(0, (each,), config) is not None)
+    if not driven:
         return found
-    warmth = data.temperature.above(data.temperature.first, data.accel_t)
-    return replace(found, warmth=_means(data.accel_t, warmth[:, None], rests)[1][:, 0])
+    return replace(found, drivers=np.concatenate([causes[each] for each in driven], axis=1), driven=driven)
 
 
 def _magnetometer(data: TumbleData, config: Config, field: Array | None, alone: bool) -> Sensor:
@@ -498,8 +503,8 @@ def _together(
     cosine2 = max(1.0 - sine**2, 1e-2)
     sigma = np.sqrt(cosine2 * (accel.sigma[rows] ** 2 + own**2))
     noise = Noise("dip", float(np.median(sigma)), "default", 0.0 if config.noise_known == 0.0 else ROUGHLY, ("dip",))
-    warmth = None if accel.warmth is None else accel.warmth[rows]
-    moments = Moments(time, accel.scaled[rows], readings / mag.radius, sigma, noise, warmth)
+    drivers = None if accel.drivers is None else accel.drivers[rows]
+    moments = Moments(time, accel.scaled[rows], readings / mag.radius, sigma, noise, drivers)
     dip = Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model)
     return [accel, turned], dip, moments, premises
 

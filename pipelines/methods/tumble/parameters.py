@@ -16,7 +16,7 @@ from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
-from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, SLOPES
+from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
 from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, EARTH, SCALE, SENSITIVITY
 from alidade.pipelines.settings import Config, check_names
 
@@ -51,7 +51,7 @@ class Variable:
 
 
 def variables(model: Model, config: Config) -> tuple[Variable, ...]:
-    """Triads, strengths, dip and slopes over temperature, in reporting order; a gyro's are `turning.parameters`.
+    """Triads, strengths, dip and what drives an offset, in reporting order; a gyro's are `turning.parameters`.
 
     Raises InputError when the config names no such parameter.
     """
@@ -64,11 +64,11 @@ def variables(model: Model, config: Config) -> tuple[Variable, ...]:
         known = config.prior(_DIP, sigma)
         quantity = Quantity(_DIP, "rad", known, sigma or _ANY_DIP, wanted, prior_mean=mean, nuisance=True)
         found.append(_variable(DIP_KEY, (quantity,), np.ones(1), np.array([model.dip.start])))
-    slopes = (sensor for sensor in model.sensors if sensor.warmth is not None)
-    found += [
-        _variable(SLOPE_KEY, quantities(ACCEL_SLOPE, config), np.full(3, sensor.strength), np.zeros(3))
-        for sensor in slopes
-    ]
+    for sensor in model.sensors:
+        if sensor.driven:
+            numbers = tuple(q for each in sensor.driven for q in quantities(each, config))
+            scales = np.full(len(numbers), sensor.strength)
+            found.append(_variable(SLOPE_KEY, numbers, scales, np.zeros(len(numbers))))
     return tuple(found)
 
 
@@ -136,7 +136,7 @@ def _check_names(config: Config) -> None:
         *BIAS,
         *ARM,
         *EARTH,
-        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, *SLOPES)),
+        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, ACCEL_SQUARE, *SLOPES)),
     ]
     check_names(config.priors, known, "priors")
     check_names(config.require, known, "require")

@@ -9,28 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import temperature_assumption
+from alidade.pipelines.estimation.assumptions import Assumption, temperature_assumption
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import read_place
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import (
-    LEAST_ACCEL,
-    LEAST_GYRO,
-    LEAST_MAG,
     check_overlap,
     clean,
-    count,
     nanoseconds,
     too_fast,
 )
-from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.placeholders import density, is_there, measured_once
-from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.mcap_writer import attached, write_session
+from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, is_there, lacks_gravity
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import Samples, StreamReader, Temperature
 from alidade.pipelines.recording.topics import FIX, IMU, MAG, wanted
-from alidade.pipelines.recording.writing import attached, write_session
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.simulated import Simulated
 
@@ -44,6 +38,8 @@ SLOPES = GYRO_SLOPE, ACCEL_SLOPE = (
     temperature_assumption("gyro", "rad/s", 1e-4),
     temperature_assumption("accel", "m/s^2", 1e-2),
 )
+# Three of 1e-4 of what is felt at 1 g: what consumer accelerometers read beside it, along each axis.
+ACCEL_SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel", "square", 3e-5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,41 +75,24 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
 
     Raises InputError when both are, when a topic is unusable, and when they have no time in common.
     """
-    dropped: dict[str, int] = {}
-    epoch = recording.epoch_ns
-    recording.read_together(dict.fromkeys(map(config.topic, (MAG, IMU, FIX)), ()))
+    reader = StreamReader(recording, dict.fromkeys(map(config.topic, (MAG, IMU, FIX)), ()))
     spans = {}
-    mag_t = mag = mag_density = accel_t = accel = accel_density = None
-    gyro_t = gyro = gyro_density = None
+    mag = accel = gyro = mag_density = accel_density = gyro_density = None
     name = config.topic(MAG)
     if wanted(recording, config, MAG):
-        measured = recording.magnetic(name)
-        count(dropped, f"{name}: stamped by log time (kept)", measured.stamped_by_log)
-        mag_t, keep = clean(name, measured.t_ns, epoch, measured.field, dropped)
-        sound = drop_faults(name, mag_t, measured.field[keep], dropped, "T")
-        sound = sound[measured_once(name, measured.field[keep[sound]], dropped)]
-        mag_t, keep = mag_t[sound], keep[sound]
-        mag, mag_density = (
-            measured.field[keep],
-            density(name, "mag", mag_t, measured.field_cov[keep], LEAST_MAG, dropped),
-        )
-        spans[name] = mag_t
+        mag = reader.magnetic_field(name)
+        mag_density = reader.density(name, "mag", mag)
+        spans[name] = mag.t
     name = config.topic(IMU)
     if wanted(recording, config, IMU):
         imu = recording.imu(name)
         if is_there("accel", imu.accel, imu.accel_cov):
-            count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
-            accel_t, keep = clean(name, imu.t_ns, epoch, imu.accel, dropped)
-            sound = drop_faults(name, accel_t, imu.accel[keep], dropped, "m/s^2")
-            accel_t, keep = accel_t[sound], keep[sound]
-            _check_gravity(name, imu.accel[keep])
-            accel, accel_density = (
-                imu.accel[keep],
-                density(name, "accel", accel_t, imu.accel_cov[keep], LEAST_ACCEL, dropped),
-            )
-            spans[name] = accel_t
-        if mag is not None:
-            gyro_t, gyro, gyro_density = _gyro(name, imu, epoch, dropped)
+            accel = reader.samples(name, imu, "accel")
+            _check_gravity(name, accel.series.accel)
+            accel_density = reader.density(name, "accel", accel)
+            spans[name] = accel.t
+        if mag is not None and (gyro := _gyro(reader, name, imu)) is not None:
+            gyro_density = reader.density(name, "gyro", gyro)
     if not spans:
         raise InputError(
             f"neither {config.topic(MAG)} (MagneticField) nor an accelerometer in {config.topic(IMU)} (Imu); "
@@ -121,22 +100,22 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         )
     check_overlap(spans)
     latitude, longitude, height = read_place(recording, config, FIX)
-    imu_t = gyro_t if accel_t is None else accel_t
-    warming = None if imu_t is None else temperature.read(recording, config, SLOPES, imu_t, dropped)
+    warmed = accel or gyro
+    warming = None if warmed is None else temperature.read(reader, config, SLOPES, warmed.t)
     return TumbleData(
-        epoch_ns=epoch,
-        mag_t=mag_t,
-        mag=mag,
-        accel_t=accel_t,
-        accel=accel,
+        epoch_ns=reader.epoch_ns,
+        mag_t=mag and mag.t,
+        mag=mag and mag.series.field,
+        accel_t=accel and accel.t,
+        accel=accel and accel.series.accel,
         mag_density=mag_density,
         accel_density=accel_density,
         latitude=latitude,
         longitude=longitude,
         height=height,
-        dropped=dropped,
-        gyro_t=gyro_t,
-        gyro=gyro,
+        dropped=reader.dropped,
+        gyro_t=gyro and gyro.t,
+        gyro=gyro and gyro.series.gyro,
         gyro_density=gyro_density,
         temperature=warming,
     )
@@ -148,22 +127,18 @@ def _check_gravity(topic: str, accel: Array) -> None:
         raise InputError(f"topic {topic}: {GRAVITY_REMOVED}")
 
 
-def _gyro(
-    topic: str, imu: series.ImuSeries, epoch: int, dropped: dict[str, int]
-) -> tuple[Array | None, Array | None, float | None]:
-    """Times, rates and density; None where there is none, or one that is not in rad/s.
+def _gyro(reader: StreamReader, topic: str, imu: series.ImuSeries) -> Samples[series.ImuSeries] | None:
+    """The gyro beside a magnetometer; None where there is none, or one that is not in rad/s.
 
     Raises InputError where an axis is dead beside others, or a fifth of the samples is lost.
     """
     if not is_there("gyro", imu.gyro, imu.gyro_cov):
-        return None, None, None
-    t, keep = clean(topic, imu.t_ns, epoch, imu.gyro, {})
+        return None
+    t, keep = clean(topic, imu.t_ns, reader.epoch_ns, imu.gyro, {})
     if too_fast(topic, t, imu.gyro[keep]):
-        count(dropped, f"{topic}: {NO_RATE}", len(t))
-        return None, None, None
-    sound = drop_faults(topic, t, imu.gyro[keep], dropped, "rad/s", may_stand=True)
-    t, keep = t[sound], keep[sound]
-    return t, imu.gyro[keep], density(topic, "gyro", t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
+        reader.count(topic, NO_RATE, len(t))
+        return None
+    return reader.samples(topic, imu, "gyro", may_be_constant=True)
 
 
 def write_tumble(path: Path, simulated: Simulated) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.simulation.temperature import Warming
 
 # 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
@@ -38,6 +38,7 @@ class TumbledAccelerometer(_Part):
     bias: NotNegative = 0.3  # m/s^2
     mounting_deg: NotNegative = 3.0  # sigma of the magnetometer's rotation against it, each component
     temperature: NotNegative = 1e-2  # m/s^2/K, sigma of each slope of b, where there is a temperature
+    square: NotNegative = 3e-5  # s^2/m, sigma of what is felt squared that each axis reads beside it
     arm: NotNegative = 0.1  # m, from the centre that the device is turned about
 
 
@@ -73,8 +74,6 @@ class TumbleScenario(_Part):
 
 def tumble_config(scenario: TumbleScenario) -> str:
     """The recording's config, YAML: the noise simulated, the scenario's priors."""
-    from ruamel.yaml import YAML
-
     noise = {}
     if scenario.magnetometer is not None:
         noise["mag_density"] = scenario.magnetometer.density
@@ -83,6 +82,4 @@ def tumble_config(scenario: TumbleScenario) -> str:
     if scenario.gyro is not None:
         noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
     config: dict[str, Any] = {"method": "tumble", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
-    text = StringIO()
-    YAML(typ="safe", pure=True).dump(config, text)
-    return text.getvalue()
+    return dump_yaml(config)

@@ -70,7 +70,10 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
         K, b = _drawn(rng, accel.gain, accel.bias)
         K, b = so3.matrix(mounting) @ K, so3.rotate(mounting, b)
         t, raw = _accelerometer(motion, accel, g, K, b, rng)
-        raw = raw + drift(scenario.temperature, "accel", slopes, t) @ np.linalg.inv(K).T
+        square = accel.square * np.random.default_rng([seed, 2]).standard_normal(3)
+        truth |= {f"accel_square_{i + 1}": float(each) for i, each in enumerate(square)}
+        beside = square * (raw @ K.T + b) ** 2 + drift(scenario.temperature, "accel", slopes, t)
+        raw = raw + beside @ np.linalg.inv(K).T
         found |= {"accel_t": t, "accel": raw, "accel_density": accel.density}
         truth |= _truth("accel", K, b, symmetric=gyro is None) | {"gravity": g}
         truth |= {"accel_arm_x": accel.arm, "accel_arm_y": 0.0, "accel_arm_z": 0.0}

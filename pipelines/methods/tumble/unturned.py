@@ -54,7 +54,7 @@ def unturned(sensor: Sensor) -> Sensor:
         raw=sensor.radius * means,
         sigma=sensor.sigma[first] / np.sqrt(number),
         excess=excess(means, believed / np.sqrt(number), numbers) - sagitta(means, scatter, numbers),
-        warmth=None if sensor.warmth is None else mean(sensor.warmth),
+        drivers=None if sensor.drivers is None else mean(sensor.drivers),
     )
 
 

@@ -31,9 +31,13 @@ def validate(data: TumbleData, config: Config, values: Mapping[str, float]) -> l
         strength = values.get(STRENGTHS[sensor.name], sensor.strength)
         raw = np.linalg.norm(sensor.raw, axis=1)
         drift = np.zeros((1, 3))
-        if sensor.warmth is not None and data.temperature is not None and FIRST in values:
-            warmth = sensor.warmth + (data.temperature.first - values[FIRST])
-            drift = np.outer(warmth, [values.get(name, 0.0) for name in ACCEL_SLOPE.names])
+        for i, cause in enumerate(sensor.driven):
+            driver = sensor.drivers[:, 3 * i : 3 * i + 3] if sensor.drivers is not None else drift
+            if cause is ACCEL_SLOPE:
+                if data.temperature is None or FIRST not in values:
+                    continue
+                driver = driver + (data.temperature.first - values[FIRST])
+            drift = drift + driver * [values.get(name, 0.0) for name in cause.names]
         after = np.linalg.norm(sensor.raw @ K.T + b - drift, axis=1) - strength
         before = raw * strength / np.mean(raw) - strength
         found.append(Validation(_WHAT[sensor.name], sensor.unit, sensor.time, before[:, None], after[:, None]))

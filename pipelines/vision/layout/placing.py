@@ -1,24 +1,27 @@
 """A start for bundle adjustment: tags placed one by one by a vote of all pictures that show them with placed ones.
 
-No single picture has to tell a tag's pose from its planar flip. Each proposes what it may be, both flips of the tag
-on both poses that the placed tags leave open; a wrong flip differs from picture to picture, so that the pose most
-pictures can explain is the right one. What remains is that all may be inside out: seen from afar, a body and its
-mirror image have the same pictures. That is told at the end, by adjusting both.
+No single picture has to determine a tag's pose against its planar flip. Each proposes what it may be, both flips of the
+tag on both poses that the placed tags leave open; a wrong flip differs from picture to picture, so that the pose most
+pictures can explain is the right one. What remains is that all may be inside out: seen from afar, a body and its mirror
+image have the same pictures. That is decided at the end, by adjusting both; pictures that do not decide between their
+two poses are left out.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.layout.additional import nothing
-from alidade.pipelines.vision.layout.bundle import adjusted, loss
-from alidade.pipelines.vision.layout.flips import Flips, Sides, pairs, sides
+from alidade.pipelines.vision.layout.bundle import adjusted, loss, refined_pictures
+from alidade.pipelines.vision.layout.pictures import Gathered
+from alidade.pipelines.vision.layout.robust import Fit, fitted
 from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
-from alidade.pipelines.vision.pose import TagBody, part
+from alidade.pipelines.vision.pose import TagBody, part, planar_solutions
 
 # Sum of squares of a tag in a picture, eight numbers in sigmas, beyond which it counts less and less.
 FAR = 8.0 * 4.0**2
@@ -30,6 +33,133 @@ _STAYS = 0.01
 _LEAST_DAMPING = 1e-9
 # Adjustments on the way.
 _ON_THE_WAY = 4
+# Poses closer than this, rad, are one.
+_ONE_POSE = 1e-3
+# Twice the logarithm of the odds, a thousand to one, from which a flip is told.
+_TOLD = 2.0 * float(np.log(1e3))
+# Poses closer than this, rad, are one, or on the way to it.
+_SAME = 0.05
+# Tags are placed from at most so many views, and those that show a pair of tags seen in no more than so many.
+_MOST, _RARE = 250, 10
+# Views that are asked whether a tag's flip is told.
+_HEARD = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Flips:
+    """Both poses of each tag in each picture: cRt (m, 2, 4), place in c (m, 2, 3) m."""
+
+    cRt: Array
+    place: Array
+
+    def __getitem__(self, keep: Index) -> Flips:
+        return Flips(self.cRt[keep], self.place[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """The two poses that each picture may have, the better first.
+
+    Attributes:
+        cRb, position: (f, 2, 4), (f, 2, 3).
+        cost: (f, 2); infinite where there is none.
+        information: (f, 2, 6, 6).
+    """
+
+    cRb: Array
+    position: Array
+    cost: Array
+    information: Array
+
+
+def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
+    """The most likely bundle of all tags; `body` is where they are, None if that is not known yet.
+
+    Raises:
+        InputError: the pictures do not tell the layout from its mirror image.
+    """
+    sights = views.sights
+    found = flips(views.start, sights)
+    sights = replace(sights, sigma=sights.sigma * lone_scale(views.start, sights, found))
+    if body is None:
+        few = _telling(sights, views.view)
+        body = _in_frame(grown(views.start, sights[few], found[few]), views.start.body)
+    body = _right_side_out(replace(views.start, body=body), sights, found)
+    start = replace(views.start, body=body)
+    told = sides(start, sights, found, FAR)
+    decided = told.cost[:, 1] - told.cost[:, 0] > _TOLD
+    whole = np.flatnonzero(together(sights) & decided[sights.picture])
+    if not len(whole):
+        raise InputError(
+            "no picture tells the poses of the tags in it from their planar flips; take pictures from nearer, or that "
+            "show more tags on different faces"
+        )
+    return replace(fitted(with_pictures(start, told), sights[whole], 0, nothing(start)), whole=whole)
+
+
+def _telling(sights: Sights, view: Index) -> Index:
+    """Sights of the pictures from which tags are placed: one of each view, and not too many."""
+    first = np.unique(view, return_index=True)[1]
+    if len(first) > _MOST:
+        # Of the ways in which tags are tied together, the rare ones stay.
+        ties = joint(sights, int(sights.tag.max()) + 1)
+        a, b = pairs(sights.picture)
+        rare = np.unique(sights.picture[a[ties[sights.tag[a], sights.tag[b]] <= _RARE]])
+        even = first[np.linspace(0, len(first) - 1, _MOST).round().astype(np.intp)]
+        first = np.union1d(even, np.intersect1d(rare, first))
+    return np.flatnonzero(np.isin(sights.picture, first))
+
+
+def _in_frame(body: TagBody, given: TagBody) -> TagBody:
+    """The body turned and moved so that its first tag is where it is given."""
+    turn = so3.multiply(given.bRt[0], so3.inverse(body.bRt[0]))
+    position = given.position[0] + so3.rotate(turn, body.position - body.position[0])
+    return replace(body, bRt=so3.multiply(turn, body.bRt), position=position)
+
+
+def _right_side_out(start: Bundle, sights: Sights, found: Flips) -> TagBody:
+    """The body or its mirror image, whichever the pictures fit.
+
+    Raises:
+        InputError: both fit.
+    """
+    bodies, costs = [], []
+    seen = sights[together(sights)]
+    for body in (start.body, mirrored(start.body, 0)):
+        there = replace(start, body=body)
+        there = with_pictures(there, sides(there, sights, found, FAR))
+        after, rows = adjusted(there, seen, 0, nothing(start), FAR)
+        bodies.append(after.body)
+        costs.append(float(loss(rows.squares, FAR).sum()))
+    best = int(np.argmin(costs))
+    apart = _angles(bodies[0].bRt, bodies[1].bRt).max()
+    if apart > _SAME and abs(costs[1] - costs[0]) < _TOLD:
+        raise InputError(
+            "the pictures fit the tags and their mirror image alike, an edge seen from outside and one seen from "
+            "inside; take pictures from nearer, where perspective shows"
+        )
+    return bodies[best]
+
+
+def flip_told(fit: Fit, view: Index, tag: int) -> bool:
+    """Whether the pictures tell the pose of a tag, by its index, from every other that they may fit; see `vote`.
+
+    Pictures in which nothing moved count once.
+    """
+    mine = np.flatnonzero(fit.sights.tag == tag)
+    mine = mine[np.unique(view[fit.sights.picture[mine]], return_index=True)[1]]
+    mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _HEARD)).round().astype(np.intp)]
+    pictures = fit.sights.picture[mine]
+    others = fit.sights[np.isin(fit.sights.picture, pictures) & (fit.sights.tag != tag)]
+    told = sides(fit.bundle, others, flips(fit.bundle, others), FAR)
+    seen = fit.sights[mine]
+    bRt, _, cost = vote(fit.bundle, seen, flips(fit.bundle, seen), told)
+    now = _angles(bRt, fit.bundle.body.bRt[tag]) < _SAME
+    return bool(now.any() and (now.all() or cost[~now].min() - cost[now].min() > _TOLD))
+
+
+def _angles(p: Array, q: Array) -> Array:
+    return np.asarray(np.linalg.norm(so3.log(so3.multiply(so3.inverse(p), q)), axis=-1))
 
 
 def grown(bundle: Bundle, sights: Sights, found: Flips) -> TagBody:
@@ -193,3 +323,110 @@ def _against(
     taken = np.swapaxes(crossing, 1, 2) @ moved
     gradient = (Bt @ miss - taken[..., :1])[..., 0]
     return squares.reshape(shape), gradient.reshape(*shape, 6), (Bt @ B - taken[..., 1:]).reshape(*shape, 6, 6)
+
+
+def flips(bundle: Bundle, sights: Sights) -> Flips:
+    """Both poses of each tag by itself, as they minimise its reprojection error."""
+    m = len(sights)
+    cRt, place = np.zeros((m, 2, 4)), np.zeros((m, 2, 3))
+    size = bundle.body.size[sights.tag]
+    for k, camera in enumerate(bundle.cameras):
+        mine = np.flatnonzero(bundle.camera[sights.picture] == k)
+        cRt[mine], place[mine] = planar_solutions(camera, size[mine], sights.corners[mine])
+    return Flips(cRt, place)
+
+
+def lone_scale(bundle: Bundle, sights: Sights, found: Flips) -> float:
+    """By how much corners are worse than stated: from each tag by itself, eight numbers for the six of its pose."""
+    m = len(sights)
+    body = replace(bundle.body, bRt=so3.identity(len(bundle.body.ids)), position=np.zeros((len(bundle.body.ids), 3)))
+    alone = Sights(np.arange(m), sights.tag, sights.corners, sights.sigma)
+    costs = []
+    for k in range(2):
+        start = Bundle.of(bundle.cameras, bundle.camera[sights.picture], body, found.cRt[:, k], found.place[:, k])
+        costs.append(refined_pictures(start, alone)[1])
+    # The median of a chi-square of two degrees of freedom is 2 ln 2.
+    return float(np.sqrt(np.median(np.minimum(*costs)) / (2.0 * np.log(2.0))))
+
+
+def sides(bundle: Bundle, sights: Sights, found: Flips, far: float) -> Sides:
+    """The two poses of each picture with the tags where the bundle's body has them.
+
+    Every pose of every tag in a picture is a start; the best is refined, and the best of those on the other side of
+    the flip.
+
+    Args:
+        bundle: cameras and body; its pictures' poses are not looked at.
+        sights: of the tags that are placed.
+        found: of the same sights.
+        far: see `adjusted`.
+    """
+    f = len(bundle.cRb)
+    bRt, place = bundle.body.bRt[sights.tag][:, None], bundle.body.position[sights.tag][:, None]
+    cRb = so3.multiply(found.cRt, so3.inverse(bRt))
+    position = found.place - so3.rotate(cRb, place)
+    costs = _start_costs(bundle, sights, cRb, position, far)
+    picture = np.repeat(sights.picture, 2)
+    cRb, position = cRb.reshape(-1, 4), position.reshape(-1, 3)
+    first = _refined(bundle, sights, _best(picture, costs.ravel(), f), cRb, position, far)
+    away = np.linalg.norm(so3.log(so3.multiply(so3.inverse(first[0].cRb[picture]), cRb)), axis=1).reshape(-1, 2)
+    other = np.where(away < away[:, ::-1], np.inf, costs)
+    second = _refined(bundle, sights, _best(picture, other.ravel(), f), cRb, position, far)
+    turn = np.linalg.norm(so3.log(so3.multiply(so3.inverse(first[0].cRb), second[0].cRb)), axis=1)
+    second[1][turn < _ONE_POSE] = np.inf
+    order = np.argsort(np.stack([first[1], second[1]], axis=1), axis=1)
+    rows = np.arange(f)[:, None]
+
+    def sorted_(a: Array, b: Array) -> Array:
+        return np.asarray(np.stack([a, b], axis=1)[rows, order])
+
+    return Sides(
+        sorted_(first[0].cRb, second[0].cRb),
+        sorted_(first[0].position, second[0].position),
+        sorted_(first[1], second[1]),
+        sorted_(first[2], second[2]),
+    )
+
+
+def _start_costs(bundle: Bundle, sights: Sights, cRb: Array, position: Array, far: float) -> Array:
+    """(m, 2) cost of all sights in a picture, were the picture's pose that of each start."""
+    a, b = pairs(sights.picture)
+    costs = []
+    for k in range(2):
+        start = Bundle.of(bundle.cameras, bundle.camera[sights.picture], bundle.body, cRb[:, k], position[:, k])
+        # Each start is a picture of its own, which sees what the picture sees.
+        seen = Sights(a, sights.tag[b], sights.corners[b], sights.sigma[b])
+        costs.append(np.bincount(a, loss(linearized(start, seen).squares, 100.0 * far), len(sights)))
+    return np.stack(costs, axis=1)
+
+
+def pairs(picture: Index) -> tuple[Index, Index]:
+    """All ordered pairs of sights in one picture, each with itself too; pictures ascend."""
+    counts = np.bincount(picture)[picture]
+    first = np.searchsorted(picture, picture)
+    a = np.repeat(np.arange(len(picture)), counts)
+    within = np.arange(len(a)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return a, np.repeat(first, counts) + within
+
+
+def _best(picture: Index, costs: Array, f: int) -> Index:
+    """(f,) the start of least cost in each picture, -1 where there is none."""
+    order = np.lexsort((costs, picture))
+    order = order[np.isfinite(costs[order])]
+    out = np.full(f, -1)
+    which, first = np.unique(picture[order], return_index=True)
+    out[which] = order[first]
+    return out
+
+
+def _refined(
+    bundle: Bundle, sights: Sights, start: Index, cRb: Array, position: Array, far: float
+) -> tuple[Bundle, Array, Array]:
+    got = start >= 0
+    there = replace(
+        bundle,
+        cRb=np.where(got[:, None], cRb[start], so3.identity()),
+        position=np.where(got[:, None], position[start], [0.0, 0.0, 1.0]),
+    )
+    there, cost, information = refined_pictures(there, sights[got[sights.picture]], far)
+    return there, np.where(got, cost, np.inf), information

@@ -2,7 +2,8 @@
 
 A hand-held body is sharp in some pictures and blurred in others. Each picture has a variance of its own, distributed
 about a common one, which makes the errors of a picture one draw of a multivariate t distribution (K. Lange, R. Little,
-J. Taylor, "Robust statistical modeling using the t distribution", JASA 1989); its weights are found by iteration.
+J. Taylor, "Robust statistical modeling using the t distribution", JASA 1989); its weights are found by iteration. How
+the body moves in each picture, for shutters that roll, follows from its poses in the pictures before and after.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors import so3
 from alidade.pipelines.vision.layout.additional import Additional
 from alidade.pipelines.vision.layout.bundle import adjusted
-from alidade.pipelines.vision.layout.motion import with_motion
 from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Rows, Sights, linearized
 
 # Degrees of freedom of the t distribution.
@@ -23,6 +24,11 @@ _ROUNDS, _SETTLED = 12, 1e-3
 # A tag in a picture whose corners miss by this many times the picture's sigma is a false detection.
 _FAR = 4.0
 _MEDIAN_OF_SEVEN = 6.35
+# Pictures farther apart than this, s, tell nothing of the motion in each other.
+_APART = 0.25
+# A polynomial is laid through so many pictures before and after, and through all within this time, s.
+_BESIDE, _NEAR = 2, 0.12
+_DEGREE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,3 +157,34 @@ def _scale(squares: Array, freedom: Array) -> tuple[float, Array]:
         if abs(variance / before - 1.0) < 1e-6:
             break
     return float(np.sqrt(variance)), np.asarray((_NU + freedom) / (_NU + squares / variance))
+
+
+def with_motion(bundle: Bundle, pictures: Index) -> Bundle:
+    """The bundle with the motion that some of its pictures, by ascending time, show; in others nothing moves."""
+    motion = np.zeros_like(bundle.motion)
+    for run in _runs(bundle, pictures):
+        time = bundle.time[run]
+        place = np.arange(len(run))
+        first = np.minimum(place - _BESIDE, np.searchsorted(time, time - _NEAR)).clip(0)
+        last = np.maximum(place + _BESIDE, np.searchsorted(time, time + _NEAR) - 1).clip(max=len(run) - 1)
+        for k, a, b in zip(place, first, last, strict=True):
+            about = run[a : b + 1]
+            turned = so3.log(so3.multiply(so3.inverse(bundle.cRb[run[k]]), bundle.cRb[about]))
+            away = np.concatenate([turned, bundle.position[about]], axis=1)
+            motion[run[k]] = _slope(time[a : b + 1] - time[k], away)
+    return replace(bundle, motion=motion)
+
+
+def _runs(bundle: Bundle, pictures: Index) -> list[Index]:
+    """Pictures of one camera that follow each other closely."""
+    gap, camera = np.diff(bundle.time[pictures]), bundle.camera[pictures]
+    # Where a time is unknown, NaN, no comparison holds.
+    close = (gap > 0.0) & (gap < _APART) & (camera[1:] == camera[:-1])
+    return [run for run in np.split(pictures, np.flatnonzero(~close) + 1) if len(run) > 1]
+
+
+def _slope(t: Array, values: Array) -> Array:
+    """(6,) at t = 0 of polynomials of degree four, or as many as there are values (n, 6) for."""
+    scale = np.abs(t).max()
+    powers = (t / scale)[:, None] ** np.arange(min(_DEGREE + 1, len(t)))
+    return np.asarray(np.linalg.lstsq(powers, values)[0][1] / scale)

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE
 from alidade.pipelines.applications.follow.serve import MAX_SUBSCRIPTIONS, LiveServer
 from alidade.pipelines.applications.follow.spool import Spool
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 
 connect: Any = websockets().sync.client.connect
 serve: Any = websockets().sync.server.serve
@@ -200,6 +201,44 @@ def test_letters_beyond_ascii_are_refused_as_any_other() -> None:
         assert _get(port, "/events", Cookie=f"alidade-{port}=é")[0] == 403
 
 
+def test_connections_that_use_a_port_again_are_told_apart() -> None:
+    with LivePage(lambda _: None, "127.0.0.1", 0) as page:
+        page._gate.admit(old := object(), "127.0.0.1", lambda: None)
+        with socket.create_connection(("127.0.0.1", _port(page))) as client:
+            client.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert b"200 OK" in client.recv(4096)
+            (served,) = set(page._gate._admitted) - {old}
+            assert page._gate._admitted[served].trusted
+            assert not page._gate._admitted[old].trusted
+
+
+def test_every_address_of_both_families_is_one_that_answers() -> None:
+    if not socket.has_dualstack_ipv6():
+        pytest.skip("this machine has no IPv6")
+    with LivePage(lambda _: None, "::", 0) as page:
+        host, port = str(urlsplit(page.url).hostname), _port(page)
+        assert page.is_open
+        for address in ("127.0.0.1", "::1", host):
+            with socket.create_connection((address, port), timeout=3.0) as client:
+                client.sendall(f"GET /?token={_token(page)} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+                assert client.recv(4096).startswith(b"HTTP/1.1 403"), address
+
+
+def test_numbers_that_are_none_are_null_in_what_is_sent() -> None:
+    """JSON knows neither NaN nor Infinity: a browser refuses the whole message."""
+    view = replace(_view(), values=np.array([np.nan]), covariance=np.array([[np.inf]]))
+
+    def refuse(name: str) -> None:
+        pytest.fail(f"{name} is sent")
+
+    with LiveServer(0) as server, LivePage(lambda _: None, "127.0.0.1", 0) as page:
+        server.show(view)
+        page.show(view)
+        sent = [last.data.decode() for last in server._last.values()]
+        for text in (*sent, page._event[1]):
+            json.loads(text, parse_constant=refuse)
+
+
 # -- the server
 
 
@@ -361,6 +400,28 @@ def test_a_bridge_that_says_anything_costs_no_message_of_its_sensors(tmp_path: P
     assert list(recording.topics) == ["/gyro"]
     assert bridge.refused >= 2 * len(HOSTILE_MESSAGES)
     assert f"{url}: {bridge.refused} messages refused" in said
+
+
+def test_a_channel_that_is_advertised_again_after_it_was_withdrawn_is_subscribed_again(tmp_path: Path) -> None:
+    """As when a node behind the bridge is restarted: the bridge gives its channel the same id."""
+    came = threading.Event()
+    asked = list[Any]()
+
+    def say(connection: Any) -> None:
+        for start in (0, 10):
+            connection.send(json.dumps({"op": "advertise", "channels": [GOOD]}))
+            asked.append(json.loads(connection.recv(5.0)))
+            connection.send(_message(start))
+            connection.send(json.dumps({"op": "unadvertise", "channelIds": [GOOD["id"]]}))
+        time.sleep(0.3)
+        came.set()
+        time.sleep(1.0)
+
+    said: list[str] = []
+    with _bridge(say) as url, Bridge(url, tmp_path, said.append):
+        assert came.wait(10.0), said
+    assert [message["op"] for message in asked] == ["subscribe", "subscribe"]
+    assert open_recording(next(tmp_path.glob("*.mcap"))).topics["/gyro"].count >= 2
 
 
 # -- a disk without room

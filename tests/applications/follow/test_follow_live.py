@@ -20,7 +20,7 @@ from alidade.pipelines.applications.follow.sources import Source, StandardInput,
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods.los.recording import write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.recording.growing import Growing
+from alidade.pipelines.recording.growing import GrowingFiles
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
@@ -215,14 +215,14 @@ def follow_grown(path: Path, seconds: float, piece_s: float) -> np.ndarray:
 
 def test_a_look_reads_the_end_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[tuple[int, int]] = []
-    look = Growing.look
+    look = GrowingFiles.refresh
 
-    def noted(self: Growing, where: list[Path], since_ns: int | None) -> object:
+    def noted(self: GrowingFiles, where: list[Path], since_ns: int | None) -> object:
         found = look(self, where, since_ns)
         read.append((0 if since_ns is None else since_ns, sum(found.counts.values())))
         return found
 
-    monkeypatch.setattr(Growing, "look", noted)
+    monkeypatch.setattr(GrowingFiles, "refresh", noted)
     spent = follow_grown(tmp_path, 80.0, 6.0)
     assert spent[-1, 0] > 79.0
     late = np.array(read[-2:])

@@ -23,7 +23,7 @@ from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websock
 from alidade.pipelines.applications.follow.serve import LiveServer
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from tests.support.live import Bridge, messages
 
 connect: Any = websockets().sync.client.connect

@@ -129,6 +129,15 @@ def test_standard_input(whole: Path, batch: Calibration, tmp_path: Path) -> None
     assert not source.path.exists()
 
 
+def test_a_stream_never_overwrites_an_earlier_one(tmp_path: Path) -> None:
+    """Its file has the number after the largest, not that of how many there are."""
+    (tmp_path / "live_0001.mcap").write_bytes(b"an earlier recording")
+    with StandardInput(tmp_path, io.BytesIO(b"what comes"), lambda _: None) as source:
+        assert source._ended.wait(5.0)
+    assert (tmp_path / "live_0001.mcap").read_bytes() == b"an earlier recording"
+    assert (tmp_path / "live_0002.mcap").read_bytes() == b"what comes"
+
+
 def test_a_pipe_that_ends_early_gives_what_came(whole: Path) -> None:
     write(messages(whole), pipe := io.BytesIO(), 4096)
     half = io.BytesIO(pipe.getvalue()[: len(pipe.getvalue()) // 2])

@@ -17,7 +17,7 @@ from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Er
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.topics import CubeConfig
 from alidade.pipelines.methods.cube.writing import write_cube
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.layout import Layout
 from tests.support.browser import fits
 from tests.support.command import Command

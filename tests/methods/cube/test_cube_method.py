@@ -8,13 +8,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import gtsam
 import numpy as np
 import pytest
 
 from alidade.factors import so3
 from alidade.factors.turns import GyroRotationFactor
-from alidade.factors.vectorized import Ensemble
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import rms
 from alidade.pipelines.errors import InputError
@@ -40,11 +38,11 @@ from alidade.pipelines.methods.cube.static_intervals import static_intervals
 from alidade.pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
 from alidade.pipelines.methods.cube.validation import validate
 from alidade.pipelines.methods.static_intervals import find_static_intervals
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.temperature import Warming
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
 from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import solve_incremental
 from datasets import imu_tk_xsens
 from tests.support.judged import Judged, judge
@@ -426,28 +424,21 @@ def test_from_pictures_as_good_as_from_perfect_corners(tmp_path: Path) -> None:
     _assert_as_good_from_pictures(tmp_path, scenario, 1e-3)
 
 
-def test_poses_and_turns_are_evaluated_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One call for all turns, however many samples each has; all factors answer as they do alone."""
+def test_turns_are_evaluated_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One call for all turns, however many samples each has; rows are those of each turn alone."""
     data, _, config = _simulated(1, temperature=Warming())
-    whole = Assembly.of(problem(data, config).steps(CHUNK))
-    factors = [factor.vectorized for factor in whole.factors if factor.vectorized is not None]
-    # Off the first guess, where residuals of priors are rounding.
-    generator, off = np.random.default_rng(0), gtsam.VectorValues()
-    for key, size in whole.initial.dims().items():
-        off.insert(key, 1e-3 * generator.standard_normal(size))
-    values = whole.initial.retract(off)
-    alone = [factor.rows(values) for factor in factors]
-    calls = []
-    evaluated = GyroRotationFactor.__call__
+    compiled = Compiled.of(problem(data, config))
+    calls, evaluated = [], GyroRotationFactor.__call__
 
     def counted(self: GyroRotationFactor, *blocks: Any) -> Any:
         calls.append(len(self.time))
         return evaluated(self, *blocks)
 
     monkeypatch.setattr(GyroRotationFactor, "__call__", counted)
-    with Ensemble(factors).at(values):
-        together = [factor.rows(values) for factor in factors]
+    (group,) = (group for group in compiled.engine.groups if isinstance(group.model, GyroRotationFactor))
+    together, _ = group.evaluate(compiled.initial)
     assert calls == [SHORT["poses"] - 1]
-    for own, shared in zip(alone, together, strict=True):
-        for a, b in zip(own, shared, strict=True):
-            np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * np.abs(a).max())
+    values = compiled.layout.to_gtsam(compiled.initial)
+    factors = [f.bound for step in problem(data, config).steps(1) for f in step.factors]
+    alone = [f.residuals(values) for f in factors if f is not None and isinstance(f.model, GyroRotationFactor)]
+    np.testing.assert_allclose(together, np.concatenate(alone), rtol=1e-9)

@@ -21,7 +21,7 @@ from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.static_intervals import static_intervals
 from alidade.pipelines.methods.cube.topics import CubeConfig
 from alidade.pipelines.methods.cube.writing import write_cube
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.vision.camera import Camera
 

@@ -13,7 +13,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head, simulate_pictures
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 
 

@@ -24,8 +24,8 @@ from alidade.pipelines.methods.indexer.simulation import (
 from alidade.pipelines.methods.indexer.topics import INDEXER, JOINTS
 from alidade.pipelines.methods.indexer.validation import validate
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 

@@ -21,7 +21,7 @@ from alidade.pipelines.methods.indexer.published import published_estimate, thin
 from alidade.pipelines.methods.indexer.recording import read_indexer
 from alidade.pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.indexer.validation import validate
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.estimation.problem import Estimate, Problem
     from alidade.pipelines.methods.formula import Formula
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config

@@ -7,5 +7,4 @@ from alidade.pipelines.diagnostics.fault_models import AXES, FaultModel
 HYPOTHESES = FaultModel(
     streams={"a_t": ("a_gyro",), "b_t": ("b_gyro",)},
     signs={"a_gyro": ("gyro a", AXES), "b_gyro": ("gyro b", AXES)},
-    offset=True,
 )

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
-from alidade.pipelines.recording.gyro import read_gyro
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.mcap_writer import attached, write_session
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
-from alidade.pipelines.recording.writing import attached, write_session
+from alidade.pipelines.recording.streams import StreamReader
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 from alidade.pipelines.simulation.simulated import Simulated
 from gyro_pair.topics import GYRO_A, GYRO_B, GyroPairConfig
@@ -53,13 +53,12 @@ def read_gyro_pair(recording: Recording, config: Config) -> GyroPairData:
 
     Raises InputError when a topic is missing or unusable, and when the two have no time in common.
     """
-    dropped: dict[str, int] = {}
     a, b = config.topic(GYRO_A), config.topic(GYRO_B)
-    recording.read_together({a: (), b: ()})
-    a_t, a_gyro, a_density = read_gyro(recording, a, recording.epoch_ns, dropped)
-    b_t, b_gyro, b_density = read_gyro(recording, b, recording.epoch_ns, dropped)
-    check_overlap({a: a_t, b: b_t})
-    return GyroPairData(recording.epoch_ns, a_t, a_gyro, b_t, b_gyro, a_density, b_density, dropped)
+    reader = StreamReader(recording, {a: (), b: ()})
+    of_a, of_b = (reader.gyro(name, may_be_constant=True) for name in (a, b))
+    check_overlap({a: of_a.t, b: of_b.t})
+    densities = reader.density(a, "gyro", of_a), reader.density(b, "gyro", of_b)
+    return GyroPairData(reader.epoch_ns, of_a.t, of_a.series.gyro, of_b.t, of_b.series.gyro, *densities, reader.dropped)
 
 
 def write_gyro_pair(path: Path, simulated: Simulated) -> None:

@@ -6,7 +6,6 @@ Log of the exact rotation over its interval, centred on the moment it was taken,
 
 from __future__ import annotations
 
-from io import StringIO
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from alidade.pipelines.simulation.simulated import Simulated
 from gyro_pair.recording import GyroPairData
@@ -96,8 +96,4 @@ def _gyro(
 
 def _config(scenario: GyroPairScenario) -> str:
     """The recording's config, YAML; the noise is told by the messages."""
-    from ruamel.yaml import YAML
-
-    text = StringIO()
-    YAML(typ="safe", pure=True).dump({"method": "gyro_pair", "priors": scenario.priors}, text)
-    return text.getvalue()
+    return dump_yaml({"method": "gyro_pair", "priors": scenario.priors})

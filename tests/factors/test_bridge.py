@@ -1,4 +1,4 @@
-"""The bridge to gtsam: layout, robust loss, compression."""
+"""The bridge to gtsam: layout, robust loss."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ import pytest
 
 from alidade import factors
 from alidade.factors import so3
-from alidade.factors.answers import square_root
+from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import POSE3, Array, Keys, Model, Residuals
 from alidade.factors.testing import assert_jacobians
-from alidade.factors.vectorized import Ensemble, VectorizedFactor
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ def _values(*vectors: Array) -> gtsam.Values:
     return values
 
 
-def _normal_equations(factor: VectorizedFactor, values: gtsam.Values) -> tuple[Array, Array]:
+def _normal_equations(factor: BoundModel, values: gtsam.Values) -> tuple[Array, Array]:
     graph = gtsam.NonlinearFactorGraph()
     graph.add(factor.factor)
     return graph.linearize(values).hessian()
@@ -78,41 +77,13 @@ def test_own_and_shared_variables_are_laid_out_row_by_row() -> None:
     np.testing.assert_allclose(H, full.T @ full, rtol=1e-12, atol=1e-12)
 
 
-def test_compressed_factor_is_the_same_factor() -> None:
-    model = _line(1000)
-    plain, small = (model.on(0, 1, compress=c) for c in (False, True))
-    assert small.factor.dim() == 6
-    for values in (_values(np.zeros(3), np.zeros(2)), _values(np.array([1.0, -2, 0.5]), np.array([0.1, 0.2]))):
-        assert small.factor.error(values) == pytest.approx(plain.factor.error(values), rel=1e-12)
-        (Ha, ga), (Hb, gb) = (_normal_equations(f, values) for f in (plain, small))
-        np.testing.assert_allclose(Hb, Ha, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(gb, ga, rtol=1e-9, atol=1e-9)
-
-
-def test_compression_of_singular_systems_keeps_the_null_space() -> None:
-    J = np.random.default_rng(2).normal(size=(30, 4))
-    J[:, 3] = J[:, 0] * 1e3 - J[:, 1]
-    e = np.random.default_rng(3).normal(size=30)
-    R, d, rest = square_root(J.T @ J, J.T @ e, float(e @ e))
-    x = np.array([0.3, -0.2, 1.0, 2.0])
-    exact = float(((J @ x + e) ** 2).sum())
-    assert float(((R @ x + d) ** 2).sum()) + rest**2 == pytest.approx(exact, rel=1e-9)
-    assert np.linalg.norm(R @ np.array([1e3, -1.0, 0.0, -1.0])) < 1e-4 * np.linalg.norm(R)
-
-
-@pytest.mark.parametrize("compress", [False, True])
-def test_rows_are_the_plain_linearisation(compress: bool) -> None:
+def test_rows_are_the_plain_linearisation() -> None:
     model = _line(6)
     values = _values(np.array([0.2, 0.1, -0.3]), np.ones(2))
     loss = TruncatedLoss(gate=0.1)
-    error, A = model.on(0, 1, loss=loss, compress=compress).rows(values)
+    error, A = model.on(0, 1, loss=loss).rows(values)
     np.testing.assert_allclose(A, np.concatenate([model.A.reshape(-1, 3), np.tile(np.eye(2), (6, 1))], axis=1))
     np.testing.assert_allclose(error, A @ np.array([0.2, 0.1, -0.3, 1, 1]) - model.y.ravel())
-
-
-def test_compressed_factors_need_shared_columns() -> None:
-    with pytest.raises(ValueError, match="shared by all"):
-        _line(2).on([0, 1], 2, compress=True)
 
 
 def test_outliers_lose_their_pull_and_no_more() -> None:
@@ -141,87 +112,30 @@ def test_loss_weight_is_the_slope_of_its_cost(mu: float) -> None:
     assert (np.diff(loss.cost(square)) >= -1e-12).all()
 
 
-def test_an_ensemble_evaluates_what_its_factors_would() -> None:
-    columns: list[tuple[list[int | list[int]], int]] = [([[0, 1], 5], 2), ([[1, 2, 1], 5], 3), ([3, 5], 4), ([3, 6], 4)]
-    factors = [_line(n, seed).on(*c) for seed, (c, n) in enumerate(columns)]
-    rng = np.random.default_rng(1)
-    graph, values, others = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Values()
-    for factor in factors:
-        graph.add(factor.factor)
-    for key in graph.keyVector():
-        values.insert(key, rng.normal(size=3 if key < 5 else 2))
-        others.insert(key, rng.normal(size=3 if key < 5 else 2))
-    error, jacobian = graph.error(values), graph.linearize(values).augmentedJacobian()
-    ensemble = Ensemble(factors)
-    for _ in range(2):
-        with ensemble.at(others):
-            assert graph.error(others) != pytest.approx(error)
-        with ensemble.at(values):
-            assert graph.error(values) == pytest.approx(error, rel=1e-14)
-            assert ensemble.error == pytest.approx(error, rel=1e-14)
-            np.testing.assert_allclose(graph.linearize(values).augmentedJacobian(), jacobian, rtol=1e-14)
-    assert graph.error(others) != pytest.approx(error)
-
-
-@pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("loss", [None, TruncatedLoss(2.0), TruncatedLoss(2.0, mu=0.1)])
-def test_a_system_made_in_one_piece_is_what_gtsam_asks_for_key_by_key(
-    loss: TruncatedLoss | None, compress: bool
-) -> None:
-    tied: tuple[Keys, Keys] = (0, 1) if compress else ([0, 1, 0, 2, 1, 0], 5)
-    factor = _line(6).on(*tied, loss=loss, compress=compress)
+def test_a_system_made_in_one_piece_is_what_gtsam_asks_for_key_by_key(loss: TruncatedLoss | None) -> None:
+    factor = _line(6).on([0, 1, 0, 2, 1, 0], 5, loss=loss)
     factor = factor.weighed(np.random.default_rng(2).uniform(0.5, 2.0, (6, 2)))
     values, rng = gtsam.Values(), np.random.default_rng(3)
     for key in factor.keys:
         values.insert(key, rng.normal(size=2 if key == factor.keys[-1] else 3))
-
-    def assert_same() -> None:
-        whole, asked = factor.linearized(values), factor.factor.linearize(values)
-        assert type(whole) is gtsam.JacobianFactor
-        assert list(whole.keys()) == list(asked.keys())
-        np.testing.assert_array_equal(whole.augmentedJacobian(), asked.augmentedJacobian())
-
-    assert_same()
-    ensemble = Ensemble([factor])
-    for within in (None, TruncatedLoss(1.0)):
-        with ensemble.at(values, within):
-            assert_same()
-            assert ensemble.error == pytest.approx(factor.factor.error(values), rel=1e-14)
+    whole, asked = factor.linearized(values), factor.factor.linearize(values)
+    assert type(whole) is gtsam.JacobianFactor
+    assert list(whole.keys()) == list(asked.keys())
+    np.testing.assert_array_equal(whole.augmentedJacobian(), asked.augmentedJacobian())
 
 
-def test_the_loss_in_force_is_that_of_the_evaluation() -> None:
-    """A factor's own elsewhere; a factor without one never gets one."""
+def test_a_loss_can_be_replaced_where_there_is_one() -> None:
     line = _line(8)
     spoilt = _Line(line.time, line.A, line.y + 5.0)
     weighed, plain = spoilt.on(0, 1, loss=TruncatedLoss(1.0)), spoilt.on(0, 1)
     values = _values(np.array([1.0, -2.0, 0.5]), np.zeros(2))
-    ensemble = Ensemble([weighed, plain])
     full = plain.factor.error(values)
     for loss, error in ((None, full), (TruncatedLoss(1.0), 8 * 0.5), (TruncatedLoss(1.0, mu=0.0), full)):
-        with ensemble.at(values, loss):
-            assert weighed.factor.error(values) == pytest.approx(error)
-            assert plain.factor.error(values) == pytest.approx(full)
-    assert weighed.factor.error(values) == pytest.approx(8 * 0.5)
-    assert weighed.under(None).factor.error(values) == pytest.approx(full)
+        assert weighed.under(loss).factor.error(values) == pytest.approx(error)
     assert plain.under(TruncatedLoss(1.0)) is plain
     with pytest.raises(FrozenInstanceError):
         weighed.loss.mu = 0.0  # type: ignore[misc, union-attr]
-
-
-def test_models_that_differ_in_more_than_measurements_are_evaluated_apart() -> None:
-    @dataclass(frozen=True)
-    class Offset(_Line):
-        offset: float = 0.0
-
-        def __call__(self, x: Array, b: Array) -> Residuals:
-            residual, jacobians = super().__call__(x, b)
-            return residual + self.offset, jacobians
-
-    line = _line(2)
-    factors = [Offset(line.time, line.A, line.y, offset=o).on(0, 1) for o in (0.0, 1.0)]
-    values = _values(np.zeros(3), np.zeros(2))
-    with Ensemble(factors).at(values):
-        np.testing.assert_allclose(factors[1].residuals(values), factors[0].residuals(values) + 1.0)
 
 
 @dataclass(frozen=True)

@@ -35,13 +35,17 @@ from numpy.typing import NDArray
 
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.mcap_records import MAGIC, MESSAGE_HEAD, windows
-from alidade.pipelines.recording.message_source import Source, message_source
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.array_container import SeriesEncoder, encode_series
+from alidade.pipelines.recording.container import byte_windows
+from alidade.pipelines.recording.mcap_records import AFTER_LENGTH, MAGIC, MESSAGE_HEAD
+from alidade.pipelines.recording.messages import definition_text
 from alidade.pipelines.settings import ATTACHMENT, TRUTH
 
-_CHUNK = 1 << 20
-_LEVEL = 1  # noise does not compress better at higher ones
+# Bytes of a chunk before compression.
+CHUNK_BYTES = 1 << 20
+# Of zstd: noise does not compress better at higher ones.
+_LEVEL = 1
 _MEDIA = {".yaml": "application/yaml", ".json": "application/json"}
 
 
@@ -85,27 +89,28 @@ class _File:
         self._stream = stream
         self._chunks: list[ChunkIndex] = []
         self._attachments: list[AttachmentIndex] = []
+        self._encoders: list[SeriesEncoder] = []
 
     def write(self, topics: Mapping[str, series.Topic], attachments: Mapping[str, bytes]) -> None:
-        sources = [message_source(i, topic) for i, topic in enumerate(topics.values(), start=1)]
-        texts = {source.definition.name: messages.definition_text(source.definition.name) for source in sources}
+        self._encoders = encoders = [encode_series(topic) for topic in topics.values()]
+        texts = {encoder.definition.name: definition_text(encoder.definition.name) for encoder in encoders}
         schemas = [Schema(i, text.encode(), "ros2msg", name) for i, (name, text) in enumerate(texts.items(), start=1)]
         ids = {schema.name: schema.id for schema in schemas}
         channels = [
-            Channel(source.channel, name, "cdr", {}, ids[source.definition.name])
-            for name, source in zip(topics, sources, strict=True)
+            Channel(i, name, "cdr", {}, ids[encoder.definition.name])
+            for i, (name, encoder) in enumerate(zip(topics, encoders, strict=True), start=1)
         ]
-        start = min((int(source.log_ns[0]) for source in sources if len(source.log_ns)), default=0)
-        end = max((int(source.log_ns[-1]) for source in sources if len(source.log_ns)), default=0)
+        start = min((int(encoder.log_ns[0]) for encoder in encoders if len(encoder.log_ns)), default=0)
+        end = max((int(encoder.log_ns[-1]) for encoder in encoders if len(encoder.log_ns)), default=0)
 
         self._stream.write(MAGIC)
         self._put(Header("ros2", "alidade"))
         for name, data in attachments.items():
             self._attach(name, data, start)
         self._put(*schemas, *channels)
-        self._write_chunks(sources)
+        self._write_chunks()
         self._put(DataEnd(0))
-        counts = {source.channel: len(source.log_ns) for source in sources}
+        counts = {i: len(encoder.log_ns) for i, encoder in enumerate(encoders, start=1)}
         statistics = Statistics(
             attachment_count=len(attachments),
             channel_count=len(channels),
@@ -129,39 +134,46 @@ class _File:
         length = self._put(Attachment(time_ns, time_ns, name, media, data))
         self._attachments.append(AttachmentIndex(offset, length, time_ns, time_ns, len(data), name, media))
 
-    def _write_chunks(self, sources: list[Source]) -> None:
+    def _write_chunks(self) -> None:
         """Cut the messages of all topics, in time order, into chunks of about the same size."""
-        log_ns = np.concatenate([np.empty(0, np.int64), *(source.log_ns for source in sources)])
-        owner = np.repeat(np.arange(len(sources)), [len(source.log_ns) for source in sources])
+        log_ns = np.concatenate([np.empty(0, np.int64), *(encoder.log_ns for encoder in self._encoders)])
+        owner = np.repeat(np.arange(len(self._encoders)), [len(encoder.log_ns) for encoder in self._encoders])
         order = np.argsort(log_ns, kind="stable")
         log_ns, owner = log_ns[order], owner[order]
-        widths = np.array([MESSAGE_HEAD.itemsize + source.size for source in sources], dtype=np.int64)
+        widths = np.array([MESSAGE_HEAD.itemsize + encoder.size for encoder in self._encoders], dtype=np.int64)
         filled = np.cumsum(widths[owner])
-        cuts = np.flatnonzero(np.diff(filled // _CHUNK)) + 1
+        cuts = np.flatnonzero(np.diff(filled // CHUNK_BYTES)) + 1
         pieces = list(zip([0, *cuts], [*cuts, len(order)], strict=True))
         # Pictures are drawn as they are written.
         for start, end in progress.track(pieces, "writing", len(pieces)):
             if end > start:
-                self._write_chunk(sources, owner[start:end], log_ns[start:end])
+                self._write_chunk(owner[start:end], log_ns[start:end])
 
-    def _write_chunk(self, sources: list[Source], owner: NDArray[np.int64], log_ns: NDArray[np.int64]) -> None:
-        counts = np.bincount(owner, minlength=len(sources))
+    def _write_chunk(self, owner: NDArray[np.int64], log_ns: NDArray[np.int64]) -> None:
+        """Write the next messages: their topics' numbers and log times, (n,) each."""
+        heads = np.zeros(len(owner), MESSAGE_HEAD)
         size = np.empty(len(owner), dtype=np.int64)
-        parts = {}
-        for i in np.flatnonzero(counts):
-            mine = np.flatnonzero(owner == i)
-            parts[i] = mine, sources[i].take(int(counts[i]))
-            size[mine] = [len(message) for message in parts[i][1]] if sources[i].varies else parts[i][1].shape[1]
-        end = np.cumsum(size)
-        offset = end - size
+        found = {}
+        for i in np.unique(owner).tolist():
+            encoder, rows = self._encoders[i], np.flatnonzero(owner == i)
+            heads["sequence"][rows] = encoder.taken + np.arange(len(rows))
+            messages = encoder.take(len(rows))
+            size[rows] = [len(message) for message in messages] if encoder.varies else encoder.size
+            found[i] = rows, messages
+        heads["opcode"], heads["channel"], heads["length"] = Opcode.MESSAGE, owner + 1, AFTER_LENGTH + size
+        heads["log_ns"] = heads["publish_ns"] = log_ns
+        end = np.cumsum(size + heads.itemsize)
+        at = end - size
         records = np.empty(end[-1], np.uint8)
-        for mine, rows in parts.values():
-            if isinstance(rows, list):
-                for at, message in zip(offset[mine], rows, strict=True):
-                    records[at : at + len(message)] = np.frombuffer(message, np.uint8)
+        byte_windows(records, heads.itemsize)[at - heads.itemsize] = heads.view(f"V{heads.itemsize}")
+        for rows, messages in found.values():
+            if isinstance(messages, list):
+                for start, message in zip(at[rows], messages, strict=True):
+                    records[start : start + len(message)] = np.frombuffer(message, np.uint8)
             else:
-                windows(records, rows.shape[1])[offset[mine]] = rows.view(f"V{rows.shape[1]}")[:, 0]
-        index = {sources[i].channel: np.stack([log_ns[mine], offset[mine]], axis=1) for i, (mine, _) in parts.items()}
+                byte_windows(records, messages.shape[1])[at[rows]] = messages.view(f"V{messages.shape[1]}")[:, 0]
+        start = at - heads.itemsize
+        index = {i + 1: np.stack([log_ns[rows], start[rows]], axis=1) for i, (rows, _) in found.items()}
         self._put_chunk(records.tobytes(), int(log_ns[0]), int(log_ns[-1]), index)
 
     def _put_chunk(self, records: bytes, start_ns: int, end_ns: int, index: dict[int, NDArray[np.int64]]) -> None:

@@ -1,0 +1,106 @@
+"""Numbers that the config fixes, against what the recording says of them: a score test of each.
+
+With H, g the information of a graph in which they are free, linear about the solution with them fixed, A the numbers
+that are free there and j a fixed one, the estimate of j alone freed is
+
+    x_j = (g_j - H_jA H_AA^-1 g_A) / I_j,    I_j = H_jj - H_jA H_AA^-1 H_Aj,    sigma^2 = 1 / I_j
+
+(Rao's score test: x_j^2 I_j is chi-square of one degree of freedom). The worst one is freed, and the others are tested
+again, so that what explains a misfit is named once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.diagnostics.diagnose import DEFAULT, Thresholds
+from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.problem import Array, Quantity, Told
+from alidade.pipelines.settings import Config
+
+
+def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | None:
+    """The config with everything free that it fixes, and parameters that it states tightly; None: it fixes nothing.
+
+    Args:
+        config: in force.
+        quantities: of its graph; what is not among them is fixed.
+    """
+    known = {q.name: q for q in quantities}
+    tight = [name for name in config.priors if name in known and known[name].tight]
+    fixed = [name for name in config.priors if config.prior(name, None) == 0.0]
+    sheets = {}
+    for name in config.sensors.model_fields_set:
+        sheet = getattr(config.sensors, name)
+        exact = [figure for figure in sheet.model_fields_set if getattr(sheet, figure) == 0.0]
+        if exact:
+            sheets[name] = sheet.model_copy(update=dict.fromkeys(exact))
+    if not fixed and not sheets:
+        return None
+    priors = {**config.priors, **dict.fromkeys(fixed + tight)}
+    return config.model_copy(update={"priors": priors, "sensors": config.sensors.model_copy(update=sheets)})
+
+
+def contradictions(
+    told: Told,
+    freed: Sequence[Quantity],
+    quantities: Sequence[Quantity],
+    ratio: float = 1.0,
+    limits: Thresholds = DEFAULT,
+) -> tuple[Finding, ...]:
+    """Findings of kind `contradiction`, the worst first: fixed numbers that the recording contradicts.
+
+    INCONSISTENT where freeing it shifts a required parameter by half of what is required, else a NOTE.
+
+    Args:
+        told: information of the graph in which they are free, about the solution with them fixed.
+        freed: quantities of that graph.
+        quantities: as they were solved for; what is not among them is fixed.
+        ratio: of sigmas to those for white noise of the model.
+        limits: thresholds.
+    """
+    known = {q.name: q for q in freed}
+    free = {q.name for q in quantities if q.prior_sigma != 0.0}
+    inside = np.array([name in free for name in told.names])
+    found: list[Finding] = []
+    while not inside.all():
+        gain, x, information, correlation = _each_freed(told, inside)
+        z = x * np.sqrt(information) / ratio
+        worst = int(np.argmax(np.abs(z)))
+        if abs(z[worst]) < limits.prior_z:
+            break
+        fixed = np.flatnonzero(~inside)
+        j, shifts = fixed[worst], np.zeros(len(inside))
+        shifts[inside], shifts[j] = -gain[:, worst] * x[worst], x[worst]
+        shifts *= told.scales
+        effect = {name: float(shifts[i]) for i, name in enumerate(told.names) if known[name].judged and shifts[i]}
+        material = any(abs(shift) >= limits.material * known[name].require for name, shift in effect.items())
+        alike = fixed[np.abs(correlation[worst]) > limits.inseparable]
+        evidence = {
+            "parameter": told.names[j],
+            "unit": known[told.names[j]].unit,
+            "stated": float(told.at[j]),
+            "value": float(told.at[j] + shifts[j]),
+            "sigma": float(ratio * told.scales[j] / np.sqrt(information[worst])),
+            "z": float(z[worst]),
+            "inseparable": tuple(sorted(told.names[k] for k in alike if k != j)),
+            "effect": effect,
+        }
+        found.append(Finding("contradiction", Severity.INCONSISTENT if material else Severity.NOTE, evidence))
+        inside[j] = True
+    return tuple(found)
+
+
+def _each_freed(told: Told, inside: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+    """Of f fixed numbers, in units of their scales: H_AA^-1 H_AF (a, f), x (f,), I (f,), correlations (f, f)."""
+    R, a = told.R * told.scales, int(inside.sum())
+    rows = np.column_stack([R[:, inside], R[:, ~inside], told.d])
+    T = np.asarray(np.linalg.qr(rows, mode="r"), dtype=float)
+    gain: Array = np.linalg.lstsq(T[:a, :a], T[:a, a:-1], rcond=None)[0]
+    own, right = T[a:, a:-1], T[a:, -1]
+    H: Array = own.T @ own
+    information: Array = np.maximum(np.diag(H), np.finfo(float).tiny)
+    return gain, own.T @ right / information, information, H / np.sqrt(np.outer(information, information))

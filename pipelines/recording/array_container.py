@@ -1,0 +1,213 @@
+"""Series as CDR messages: for the writer, and as a container for what logs, tables and data sets hold.
+
+All messages of a topic that differ in numbers alone are encoded at once: rosbags encodes one, whose layout the arrays
+are written into. What is read from a log or a table thus passes the same decoder and checks as a recording's messages.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema
+from alidade.pipelines.recording.messages import Array, Definition, definition_text, known
+
+# Messages of a block; those of varying size may be pictures.
+_UNIFORM_BLOCK, _VARYING_BLOCK = 1 << 14, 4
+# Expected size of a message of varying size, bytes; only chunk sizes depend on it.
+_PICTURE_BYTES, _DETECTIONS_BYTES = 1 << 16, 1 << 10
+_SEC_NS = 1_000_000_000
+
+
+class SeriesEncoder(ABC):
+    """A series as CDR messages, taken in order.
+
+    Attributes:
+        definition: message type.
+        log_ns: log times (N,), Unix ns: the stamps; a message stamped before its predecessor is logged with it.
+        size: bytes of a message, expected ones where they vary.
+        taken: number of messages taken.
+    """
+
+    varies: bool
+
+    def __init__(self, definition: Definition, t_ns: NDArray[np.int64], size: int) -> None:
+        self.definition, self.t_ns, self.size = definition, t_ns, size
+        self.log_ns = np.maximum.accumulate(t_ns)
+        self.taken = 0
+
+    def take(self, count: int) -> Any:
+        """The next messages: rows of bytes (count, size), or a list of bytes if their sizes vary."""
+        which = slice(self.taken, self.taken + count)
+        self.taken = which.stop
+        return self._encode(which)
+
+    @abstractmethod
+    def _encode(self, which: slice) -> Any: ...
+
+
+class _UniformEncoder(SeriesEncoder):
+    """Messages that differ in nothing but numbers."""
+
+    varies = False
+
+    def __init__(
+        self, definition: Definition, t_ns: NDArray[np.int64], first: object, columns: Mapping[str, Array]
+    ) -> None:
+        data = definition.encode(first)
+        layout = definition.layout(data)
+        assert layout is not None
+        super().__init__(definition, t_ns, len(data))
+        self._first = np.frombuffer(data, np.uint8)
+        self._columns = [(layout.run(path), values) for path, values in columns.items()]
+        self._sec, self._nanosec = layout.run("header.stamp.sec"), layout.run("header.stamp.nanosec")
+
+    def _encode(self, which: slice) -> NDArray[np.uint8]:
+        rows = np.empty((which.stop - which.start, self.size), np.uint8)
+        rows[:] = self._first
+        self._sec.of(rows)[:, 0], self._nanosec.of(rows)[:, 0] = np.divmod(self.t_ns[which], _SEC_NS)
+        for run, values in self._columns:
+            run.of(rows)[:] = values[which]
+        return rows
+
+
+class _VaryingEncoder(SeriesEncoder):
+    """Messages of any size, encoded one by one by rosbags."""
+
+    varies = True
+
+    def __init__(self, definition: Definition, t_ns: NDArray[np.int64], encoded: Iterator[bytes], size: int) -> None:
+        super().__init__(definition, t_ns, size)
+        self._encoded = encoded
+
+    def _encode(self, which: slice) -> list[bytes]:
+        return [next(self._encoded) for _ in range(which.start, which.stop)]
+
+
+def encode_series(topic: series.Topic) -> SeriesEncoder:
+    """The messages of a topic."""
+    if isinstance(topic, series.Series):
+        definition = known(topic.TYPE)
+        columns = {}
+        for name, column in topic.COLUMNS.items():
+            values = getattr(topic, name).reshape(len(topic), math.prod(column.shape))
+            recorded_order = np.argsort(column.order) if column.order else slice(None)
+            columns[column.path] = values[:, recorded_order]
+        first = definition.new(topic.TYPE, header=_header(definition, 0, topic.frame_id))
+        return _UniformEncoder(definition, topic.t_ns, first, columns)
+    if isinstance(topic, series.JointSeries):
+        definition = known(messages.JOINT_STATE)
+        header = _header(definition, 0, topic.frame_id)
+        zeros = np.zeros(len(topic.names))
+        first = definition.new(messages.JOINT_STATE, header=header, name=list(topic.names), position=zeros)
+        return _UniformEncoder(definition, topic.t_ns, first, {"position": topic.position})
+    if isinstance(topic, series.CameraInfo):
+        definition = known(messages.CAMERA_INFO)
+        t_ns = np.array([topic.t_ns], dtype=np.int64)
+        return _VaryingEncoder(definition, t_ns, iter([_camera_info(definition, topic)]), _PICTURE_BYTES)
+    if isinstance(topic, series.ImageSeries):
+        definition = known(messages.COMPRESSED_IMAGE)
+        return _VaryingEncoder(definition, topic.t_ns, _images(definition, topic), _PICTURE_BYTES)
+    definition = known(messages.TAG_DETECTIONS)
+    return _VaryingEncoder(definition, topic.t_ns, _detections(definition, topic), _DETECTIONS_BYTES)
+
+
+class ArrayContainer(Container):
+    """Topics, name -> series, as messages.
+
+    Args:
+        path: of the file or folder they were read from, as the user named it.
+        topics: pictures are read from their iterable anew each time.
+        assumptions: sentences about what was assumed.
+        data: file they were read from; None: `path`.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        topics: Mapping[str, series.Topic],
+        assumptions: Sequence[str] = (),
+        data: Path | None = None,
+    ) -> None:
+        super().__init__(path)
+        self.data, self.assumptions = data or path, tuple(assumptions)
+        self.losses: list[DataLoss] = []
+        self.channels, self.schemas, self.counts = {}, {}, {}
+        self._topics = dict(enumerate(topics.values(), start=1))
+        for number, (name, topic) in enumerate(topics.items(), start=1):
+            kind = encode_series(topic).definition.name
+            self.schemas[number] = Schema(number, kind, "ros2msg", definition_text(kind).encode())
+            self.channels[number] = Channel(number, name, "cdr", number)
+            self.counts[number] = 1 if isinstance(topic, series.CameraInfo) else len(topic)
+
+    def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
+        """Messages of these channels, one channel after the other."""
+        for number in sorted(channels):
+            encoder = encode_series(self._topics[number])
+            step = _VARYING_BLOCK if encoder.varies else _UNIFORM_BLOCK
+            for start in range(0, self.counts[number], step):
+                log_ns = encoder.log_ns[start : start + step]
+                rows = encoder.take(len(log_ns))
+                if encoder.varies:
+                    yield MessageBlock.pack(number, rows, log_ns)
+                else:
+                    at = encoder.size * np.arange(len(log_ns))
+                    yield MessageBlock(number, rows.ravel(), at, np.full(len(log_ns), encoder.size), log_ns)
+
+
+def _header(definition: Definition, t_ns: int, frame_id: str) -> Any:
+    sec, nanosec = divmod(int(t_ns), _SEC_NS)
+    stamp = definition.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return definition.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def _camera_info(definition: Definition, info: series.CameraInfo) -> bytes:
+    return definition.encode(
+        definition.new(
+            messages.CAMERA_INFO,
+            header=_header(definition, info.t_ns, info.frame_id),
+            width=info.width,
+            height=info.height,
+            distortion_model=info.distortion_model,
+            d=info.d,
+            k=info.k.ravel(),
+            r=info.r.ravel(),
+            p=info.p.ravel(),
+        )
+    )
+
+
+def _images(definition: Definition, images: series.ImageSeries) -> Iterator[bytes]:
+    for t_ns, data in zip(images.t_ns, images.data, strict=True):
+        header = _header(definition, t_ns, images.frame_id)
+        picture = np.frombuffer(data, np.uint8)
+        yield definition.encode(
+            definition.new(messages.COMPRESSED_IMAGE, header=header, format=images.format, data=picture)
+        )
+
+
+def _detections(definition: Definition, found: series.DetectionSeries) -> Iterator[bytes]:
+    point = "apriltag_msgs/msg/Point"
+    for i, t_ns in enumerate(found.t_ns):
+        tags = []
+        for k in np.flatnonzero(found.frame == i):
+            corners = [definition.new(point, x=x, y=y) for x, y in found.corners[k].tolist()]
+            tags.append(
+                definition.new(
+                    "apriltag_msgs/msg/AprilTagDetection",
+                    family=str(found.family[k]),
+                    id=int(found.tag_id[k]),
+                    hamming=int(found.hamming[k]),
+                    decision_margin=float(found.decision_margin[k]),
+                    corners=corners,
+                )
+            )
+        header = _header(definition, t_ns, found.frame_id)
+        yield definition.encode(definition.new(messages.TAG_DETECTIONS, header=header, detections=tags))

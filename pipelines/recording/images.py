@@ -1,0 +1,188 @@
+"""Pictures as files in the Netpbm form, which any decoder of pictures reads: a line of text and the pixels.
+
+Raw pictures of any encoding become such files, and so do those of videos: H.264, a message a picture, and MP4 and AVI
+files. OpenCV's FFmpeg decodes them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.errors import InputError
+
+Pixels = NDArray[Any]
+
+# Channels, and the order of those that are red, green, blue.
+_COLOURS = {
+    "rgb8": (3, [0, 1, 2]),
+    "bgr8": (3, [2, 1, 0]),
+    "rgba8": (4, [0, 1, 2]),
+    "bgra8": (4, [2, 1, 0]),
+    "8UC3": (3, [2, 1, 0]),
+}
+_GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+# Two pixels in four bytes; which of them are brightness.
+_YUV = {"yuv422": 1, "uyvy": 1, "UYVY": 1, "yuv422_yuy2": 0, "yuyv": 0, "YUYV": 0}
+# Where red is in a square of four pixels, row and column.
+_RED = {"rggb": (0, 0), "bggr": (1, 1), "gbrg": (1, 0), "grbg": (0, 1)}
+_BAYER = re.compile("bayer_(?P<pattern>rggb|bggr|gbrg|grbg)(?P<bits>8|16)")
+MAX_PICTURE_BYTES = 1 << 28
+# How the formats of messages are called; what is read, and what else a video may be.
+H264 = ("h264", "avc", "x264", "libx264")
+OTHERS = ("h265", "hevc", "vp8", "vp9", "av1")
+MAX_PICTURE_PIXELS = 1 << 26
+# What a message of H.264 begins with (Annex B of ITU-T H.264).
+_STARTS = (b"\0\0\1", b"\0\0\0\1")
+
+
+def netpbm(image: Any) -> bytes:
+    """A sensor_msgs/msg/Image as a file: grey, or in colour, with 8 bits.
+
+    Of pictures with 16 bits the upper ones that are used are kept, 8 of them. Raises ValueError where the encoding is
+    another, or the size does not agree with the data.
+    """
+    encoding, data = str(image.encoding), np.asarray(image.data, np.uint8)
+    height, width, step = int(image.height), int(image.width), int(image.step)
+    if encoding in _GREY:
+        pixels = _used_bytes(data, height, width * np.dtype(_GREY[encoding]).itemsize, step)
+        if _GREY[encoding] == "u2":
+            return _file(_eight_bits(pixels.view(">u2" if image.is_bigendian else "<u2")))
+        return _file(pixels)
+    if encoding in _COLOURS:
+        channels, order = _COLOURS[encoding]
+        pixels = _used_bytes(data, height, width * channels, step).reshape(height, width, channels)
+        return _file(pixels[:, :, order])
+    if encoding in _YUV:
+        return _file(_used_bytes(data, height, 2 * width, step)[:, _YUV[encoding] :: 2])
+    bayer = _BAYER.fullmatch(encoding)
+    if bayer is None:
+        raise ValueError(f"the encoding {encoding!r} is not one of mono, rgb, bgr, rgba, bgra, bayer, yuv422")
+    is_wide = bayer["bits"] == "16"
+    pixels = _used_bytes(data, height, width * (2 if is_wide else 1), step)
+    if is_wide:
+        pixels = _eight_bits(pixels.view(">u2" if image.is_bigendian else "<u2"))
+    return _file(_colours(pixels, _RED[bayer["pattern"]]))
+
+
+def colour_file(rgb: Pixels) -> bytes:
+    """A picture (height, width, 3) of 8 bits as a file."""
+    return _file(np.ascontiguousarray(rgb))
+
+
+def _used_bytes(data: NDArray[np.uint8], height: int, used: int, step: int) -> NDArray[np.uint8]:
+    """The bytes that are used of each row."""
+    if not 0 < used <= step or height <= 0 or height * step != len(data) or len(data) > MAX_PICTURE_BYTES:
+        raise ValueError(f"{height} rows of {step} bytes with {used} used, in {len(data)} bytes of data")
+    return np.ascontiguousarray(data.reshape(height, step)[:, :used])
+
+
+def _eight_bits(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """The upper 8 bits of those that the picture uses: cameras with 10 or 12 bits leave the highest ones zero."""
+    shift = max(0, int(pixels.max()).bit_length() - 8)
+    return (pixels >> shift).astype(np.uint8)
+
+
+def _colours(pixels: NDArray[np.uint8], red: tuple[int, int]) -> Pixels:
+    """Red, green and blue of a Bayer picture, with red at (row, column) of each square of four."""
+    import cv2
+
+    # OpenCV names a pattern by the square that begins at the second row and column.
+    codes = {
+        (0, 0): cv2.COLOR_BayerBG2RGB,
+        (1, 1): cv2.COLOR_BayerRG2RGB,
+        (1, 0): cv2.COLOR_BayerGR2RGB,
+        (0, 1): cv2.COLOR_BayerGB2RGB,
+    }
+    return np.asarray(cv2.cvtColor(pixels, codes[red]))
+
+
+def _file(pixels: Pixels) -> bytes:
+    kind = "P5" if pixels.ndim == 2 else "P6"
+    return f"{kind} {pixels.shape[1]} {pixels.shape[0]} 255\n".encode() + pixels.tobytes()
+
+
+def decode_video(packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
+    """(stamp, file in the Netpbm form) of each (stamp, message): one picture a message, none out of order.
+
+    Raises ValueError where that is not what the messages are, or nothing of them can be decoded.
+    """
+    stamps = []
+    with tempfile.NamedTemporaryFile(prefix="alidade-", suffix=".h264") as whole:
+        for t_ns, data in packets:
+            # FFmpeg goes by what a file begins with, and other forms name files of their own to be read.
+            if not data.startswith(_STARTS):
+                raise ValueError("a message of the video is no H.264 (Annex B)")
+            whole.write(data)
+            stamps.append(t_ns)
+        whole.flush()
+        needed = "it has to begin with a key picture, and a message has to be a picture"
+        yield from zip(stamps, _decoded_pictures(whole.name, len(stamps), "messages", needed), strict=True)
+
+
+def is_video(start: bytes) -> bool:
+    """Whether a file that begins so, 12 bytes, is one of the video files that are read: MP4 or AVI."""
+    return start[4:8] == b"ftyp" or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")
+
+
+class VideoFile:
+    """The pictures of an MP4 or AVI file as files in the Netpbm form, one by one and anew each time.
+
+    Args:
+        path: of the file.
+        count: pictures there have to be.
+
+    Raises:
+        InputError: it is no such file; when iterating, it cannot be decoded or has more or fewer pictures.
+    """
+
+    def __init__(self, path: Path, count: int) -> None:
+        self.path, self._count = path, count
+        try:
+            with path.open("rb") as stream:
+                start = stream.read(12)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
+        if not is_video(start):
+            raise InputError(f"{path}: neither an MP4 nor an AVI file")
+
+    def __iter__(self) -> Iterator[bytes]:
+        try:
+            needed = "the file has to be whole, its codec one of FFmpeg's, and its table has to have a row for each"
+            yield from _decoded_pictures(str(self.path), self._count, "stamps", needed)
+        except ValueError as error:
+            raise InputError(f"{self.path}: {error}") from error
+
+
+def _decoded_pictures(name: str, count: int, of: str, needed: str) -> Iterator[bytes]:
+    """The pictures of a video, which there are `count` of. Raises ValueError otherwise, with what is needed."""
+    # Remarks on what is damaged would go to the terminal; what matters of them is the number of pictures.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    import cv2
+
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    video = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
+    cv2.utils.logging.setLogLevel(level)
+    try:
+        width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if width * height > MAX_PICTURE_PIXELS:
+            raise ValueError(f"pictures of {width} x {height}, which no camera makes")
+        for i in range(count):
+            is_there, pixels = video.read()
+            if not is_there:
+                raise ValueError(
+                    f"only {i} of {count} pictures of the video can be decoded, so that nobody knows which they are: "
+                    f"{needed}"
+                )
+            if i == count - 1 and video.grab():
+                raise ValueError(f"the video has more pictures than its {count} {of}")
+            yield colour_file(pixels[:, :, ::-1])
+    finally:
+        video.release()

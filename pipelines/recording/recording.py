@@ -1,0 +1,578 @@
+"""Recordings as arrays.
+
+    recording = open_recording(Path("session.mcap"))
+    imu = recording.imu("/imu")         # imu.t_ns, imu.gyro, ...
+
+The path of a sample, one module a step:
+
+    mcap_file.py, ros1_bag.py, ...  file         -> MessageBlock: raw messages of one channel, checksums verified
+    decoding.py                     MessageBlock -> ColumnTable: numbers of all messages of one layout at once
+    recording.py                    ColumnTable  -> Series: units, frames and covariances as the messages state them
+    streams.py                      Series       -> times in s, sorted and finite, faulty samples removed
+    the method's recording.py                    -> arrays of the method
+
+The time of a sample is its header stamp; where that is zero the log time stands in, and the series counts those.
+Messages come in the order of their log times. Every method raises InputError, naming what is there, when the topic is
+missing or empty, has another type, cannot be decoded, or its clock was set in between (stamps.py). A damaged chunk is
+left out, see `Recording.notes`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines import progress
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages, series, single_messages
+from alidade.pipelines.recording.container import Container, MessageBlock
+from alidade.pipelines.recording.decoding import (
+    ENCODING,
+    NUMERIC_TYPES,
+    READABLE,
+    ColumnTable,
+    DecodedMessage,
+    MessageFormat,
+    Times,
+    with_log_times,
+)
+from alidade.pipelines.recording.messages import MessageError
+from alidade.pipelines.recording.opening import Where, open_container
+from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
+from alidade.pipelines.recording.sources import TopicSource, along, inverted, joined
+from alidade.pipelines.recording.stamps import check_clock, jitter_ns, stamp_notes
+from alidade.pipelines.recording.table_topics import TableTopic, described
+
+# Topics whose first stamp may start a session. Positions and intrinsics may be stamped long before it.
+SENSOR_STAMPED_TYPES = {
+    *(messages.IMU, messages.MAGNETIC_FIELD, messages.JOINT_STATE, messages.VECTOR, messages.QUATERNION, messages.POSE),
+    *(messages.COMPRESSED_IMAGE, messages.IMAGE, messages.TAG_DETECTIONS),
+    *(messages.PLAIN_POSE, messages.TRANSFORM, messages.ODOMETRY, messages.TWIST, messages.ACCEL),
+}
+# Topics, and pairs of frames, that an error message names.
+MAX_NAMED = 30
+# Sigma of the delay with which messages are logged, s: assumed where log times stand in for stamps.
+UNKNOWN_LOG_DELAY_S = 0.01
+# Quantities that may be counts of a sensor.
+_COUNTED: Mapping[type, tuple[str, ...]] = {
+    series.ImuSeries: ("gyro", "accel"),
+    series.MagneticSeries: ("field",),
+    series.VectorSeries: ("vector",),
+}
+
+AnySeries = TypeVar("AnySeries", bound=series.Series)
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One topic of a recording: its ROS 2 type, number of messages, encoding, and whether that encoding is read."""
+
+    name: str
+    type: str
+    count: int
+    encoding: str
+    is_readable: bool
+
+
+@dataclass(frozen=True)
+class _StampFacts:
+    """What the stamps of a topic show: least delay of the log times, ns (None without messages), and sentences."""
+
+    delay_ns: int | None
+    notes: tuple[str, ...]
+
+
+def open_recording(where: Where, strict: bool = False) -> Recording:
+    """The recording in a file, a folder of parts, files named by a pattern or a list; see docs/reference/messages.md.
+
+    One that is still being written, or is damaged, is read as far as it is sound. Raises InputError when something is
+    missing, empty or no recording, when nothing in it can be read, and with `strict` when anything is lost: truncated,
+    damaged, without summary.
+    """
+    return Recording(open_container(where, strict))
+
+
+class Recording:
+    """The topics of a recording. Holds positions in the file and stamps, not the messages.
+
+    What reading a topic shows (notes, delays, sigma of stamps) belongs to this object: `with_config` returns another
+    one, which knows of the topics read through it alone.
+
+    Args:
+        container: where its messages are.
+        epoch_ns: start of the session, Unix ns, where the container lacks its first messages.
+
+    Attributes:
+        path: of the file or folder, as it was named.
+        container: the raw messages, and what of them is lost.
+        recorded: topics in the file, by name, sorted.
+        stamp_sigma_s: sigma of the stamps read by now, s: 0, but where log times stand in for them.
+    """
+
+    def __init__(self, container: Container, epoch_ns: int | None = None) -> None:
+        self.path = container.path
+        self.container = self._undescribed = container
+        self._given_epoch_ns = epoch_ns
+        if epoch_ns is not None:
+            self.epoch_ns = epoch_ns
+        self._formats = {
+            number: MessageFormat(channel, container.schemas.get(channel.schema_id))
+            for number, channel in container.channels.items()
+        }
+        self.recorded = self._list_topics()
+        self._sources: dict[str, TopicSource] = {}
+        self._assumptions: tuple[str, ...] = ()
+        self.stamp_sigma_s = 0.0
+        self._decoded_tables: dict[tuple[str, tuple[str, ...]], ColumnTable] = {}
+        self._transforms: dict[str, dict[tuple[str, str], series.PoseSeries]] = {}
+        self._times: dict[str, Times] = {}
+        self._unstamped: dict[str, int] = {}  # topic -> messages without a stamp that were left out
+        self._stamp_facts: dict[str, _StampFacts] = {}
+
+    def with_config(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic] | None = None) -> Recording:
+        """The recording with other derived topics and, if there are any, other described columns of its tables.
+
+        Raises InputError when a table or a column is not there, or holds no numbers.
+        """
+        container = described(self._undescribed, columns) if columns else self.container
+        known = self.__dict__.get("epoch_ns") if container is self.container else self._given_epoch_ns
+        other = Recording(container, known)
+        other._undescribed, other._assumptions = self._undescribed, self._assumptions
+        other._sources = {source.name: source for source in sources if source.is_made}
+        return other
+
+    @property
+    def topics(self) -> Mapping[str, TopicInfo]:
+        """Topics by name: the recorded ones, and the derived ones whose parts are there."""
+        derived = {name: info for name, source in self._sources.items() if (info := self._derived_info(name, source))}
+        return {**self.recorded, **derived}
+
+    def remark(self, sentence: str) -> None:
+        """Note an assumption about the recording, once."""
+        if sentence not in self._assumptions:
+            self._assumptions = (*self._assumptions, sentence)
+
+    def sha256(self) -> str:
+        """SHA-256 of the file, hexadecimal."""
+        return self.container.sha256()
+
+    def attachment(self, name: str, needed: bool = True) -> bytes | None:
+        """Content of an attachment, None if there is none; see `Container.attachment`."""
+        return self.container.attachment(name, needed)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about what is lost, what was assumed, and how stamps came about in the topics read by now."""
+        container = self.container
+        lost = container.notes(self.epoch_ns, self.duration_s) if container.losses or container.missing else ()
+        return (*container.incomplete, *container.assumptions, *self._assumptions, *self._stamp_notes, *lost)
+
+    @cached_property
+    def epoch_ns(self) -> int:
+        """Start of the session, Unix ns: the earliest first stamp of a sensor topic, else the first log time."""
+        sensors = [n for n, each in self._formats.items() if each.type in SENSOR_STAMPED_TYPES and each.is_readable]
+        first = (
+            int(with_log_times(self._formats[number].stamps(block), block.log_ns)[0][0])
+            for number, block in self.container.first_blocks(sensors).items()
+        )
+        return min(first, default=self.container.first_log_ns)
+
+    @cached_property
+    def duration_s(self) -> float:
+        """Time from the first message to the last, by their log times, s."""
+        logged = [log_ns for _, log_ns in self.times.values() if len(log_ns)]
+        first, last = min((int(t.min()) for t in logged), default=0), max((int(t.max()) for t in logged), default=0)
+        return (last - first) * 1e-9
+
+    @property
+    def delay_ns(self) -> int:
+        """Least delay of the log times after the stamps, ns, in the topics read by now."""
+        delays = [facts.delay_ns for facts in self._all_stamp_facts().values() if facts.delay_ns is not None]
+        return min(delays, default=0)
+
+    @property
+    def times(self) -> Mapping[str, Times]:
+        """Topic -> stamps (log times where there is no header to be read) and log times."""
+        found: dict[str, list[Times]] = {name: [] for name in self.recorded if name not in self._times}
+        for name, block in self._blocks(found):
+            found[name].append((self._formats[block.channel].stamps(block), block.log_ns))
+        self._times |= {name: with_log_times(*_concatenate(parts)) for name, parts in found.items()}
+        bases = {name: source.parts[0] for name, source in self._sources.items()}
+        return {**self._times, **{name: self._times[base] for name, base in bases.items() if base in self._times}}
+
+    def forget_times(self) -> None:
+        """Drop the stamps read by now, which would stay as long as the recording; `times` reads them anew."""
+        self._all_stamp_facts()
+        self._times.clear()
+
+    def there(self) -> str:
+        """A phrase that lists the recorded topics, and what is lost."""
+        named = [
+            f"{name} ({t.type.split('/')[-1]}{f', {t.encoding}' if t.encoding != ENCODING else ''})"
+            for name, t in self.recorded.items()
+        ]
+        more = f" and {len(named) - MAX_NAMED} more" if len(named) > MAX_NAMED else ""
+        ros1 = " (a ROS 1 recording)" if any(t.encoding.startswith("ros1/") for t in self.recorded.values()) else ""
+        return "; ".join(
+            [f"topics there{ros1}: {', '.join(named[:MAX_NAMED]) or 'none'}{more}", *self.container.notes(None)]
+        )
+
+    # -- topics of numbers
+
+    def read_together(self, topics: Mapping[str, Sequence[str]]) -> None:
+        """Decode topics in one pass over the file, for the methods below.
+
+        A topic that has no numbers, or cannot be read, is left to the method, which says why.
+
+        Args:
+            topics: names, each with the joints that are needed if it is a sensor_msgs/JointState.
+        """
+        wanted = dict(topics)
+        for name in wanted.keys() & self._sources.keys():
+            wanted |= dict.fromkeys(self._sources[name].parts, ())
+        tables = {}
+        for name in wanted.keys() & self.recorded.keys():
+            info = self.recorded[name]
+            if info.type in NUMERIC_TYPES and info.is_readable and info.count:
+                tables[name] = ColumnTable(info.type, info.count, wanted[name])
+        failed = self._fill(tables)
+        self._decoded_tables |= {(n, tuple(wanted[n])): table for n, table in tables.items() if n not in failed}
+
+    def imu(self, topic: str, frame: str | None = None) -> series.ImuSeries:
+        """A sensor_msgs/Imu topic, or rates alone from a Vector3Stamped or TwistStamped one: accelerations NaN."""
+        if topic in self._sources:
+            return self._derived_imu(topic, self._sources[topic])
+        if self._require(topic, *messages.RATES).type == messages.IMU:
+            return self._series(series.ImuSeries, topic, frame)
+        rate = self._series(series.VectorSeries, topic, frame)
+        return series.ImuSeries(rate.t_ns, rate.vector, np.full(3, np.nan), stamped_by_log=rate.stamped_by_log)
+
+    def magnetic(self, topic: str) -> series.MagneticSeries:
+        """A sensor_msgs/MagneticField topic."""
+        source = self._sources.get(topic)
+        if source is None:
+            return self._series(series.MagneticSeries, topic)
+        if source.topic is None:
+            raise InputError(f"{self.path}: topic {topic} is made of rates; it holds no magnetic field")
+        found = self._series(series.MagneticSeries, source.topic, source.frame)
+        return dataclasses.replace(found, field=along(source.axes, found.field))
+
+    def vector(self, topic: str) -> series.VectorSeries:
+        """A geometry_msgs/Vector3Stamped topic, a TwistStamped's rates or an AccelStamped's accelerations."""
+        return self._series(series.VectorSeries, topic)
+
+    def quaternion(self, topic: str) -> series.QuaternionSeries:
+        """A geometry_msgs/QuaternionStamped topic."""
+        return self._series(series.QuaternionSeries, topic)
+
+    def poses(self, topic: str, frame: str | None = None) -> series.PoseSeries:
+        """A topic of poses, or of attitudes alone, in any of the types of messages.ATTITUDES."""
+        if topic in self._sources:
+            return self.poses_of(self._sources[topic])
+        kind = self._require(topic, *messages.ATTITUDES).type
+        if kind == messages.IMU:
+            return self._orientations(topic, frame)
+        if kind != messages.QUATERNION:
+            return self._series(series.PoseSeries, topic, frame)
+        attitude = self._series(series.QuaternionSeries, topic, frame)
+        return series.PoseSeries(attitude.t_ns, attitude.wxyz, stamped_by_log=attitude.stamped_by_log)
+
+    def poses_of(self, source: TopicSource) -> series.PoseSeries:
+        """The poses of a source that `with_config` need not know."""
+        if source.topic is None:
+            raise InputError(f"{self.path}: topic {source.name} is made of rates; it holds no attitude")
+        frames = source.frames
+        poses = self._between(source.topic, frames) if frames else self.poses(source.topic, source.frame)
+        return inverted(poses) if source.invert else poses
+
+    def fixes(self, topic: str) -> series.FixSeries:
+        """A sensor_msgs/NavSatFix topic."""
+        return self._series(series.FixSeries, topic)
+
+    def temperature(self, topic: str) -> series.TemperatureSeries:
+        """A sensor_msgs/Temperature topic."""
+        return self._series(series.TemperatureSeries, topic)
+
+    def joints(self, topic: str, names: Sequence[str]) -> series.JointSeries:
+        """Positions of the named joints on a sensor_msgs/JointState topic, in any order of the messages."""
+        self._require(topic, messages.JOINT_STATE)
+        table = self._table(topic, tuple(names))
+        if not table.filled.any():
+            raise InputError(
+                f"{self.path}: topic {topic} has no message with positions of the joints {', '.join(names)}; "
+                f"its joints: {', '.join(table.joint_names) or 'none'}"
+            )
+        check_clock(topic, *table.times(), self.epoch_ns)
+        t_ns, from_log, numbers = table.sorted()
+        self._note_unstamped(topic, t_ns, from_log)
+        without = table.count - int(np.count_nonzero(table.filled))
+        return series.JointSeries(t_ns, numbers["position"], tuple(names), from_log, without)
+
+    # -- messages one by one
+
+    def camera_info(self, topic: str) -> series.CameraInfo:
+        """The first message of a sensor_msgs/CameraInfo topic."""
+        with self._problems(topic):
+            return single_messages.camera_info(next(self._decoded(topic, messages.CAMERA_INFO)))
+
+    def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
+        """(stamp in ns, file) of the pictures on a CompressedImage or Image topic, one by one.
+
+        Raw ones, and those of a H.264 video, are files in the Netpbm form.
+        """
+        info = self._require(topic, *messages.PICTURES)
+        found = progress.track(self._decoded(topic, *messages.PICTURES), "pictures", info.count)
+        with self._problems(topic):
+            yield from single_messages.pictures(found, info.type == messages.IMAGE)
+
+    def detections(self, topic: str) -> series.DetectionSeries:
+        """An apriltag_msgs/AprilTagDetectionArray topic."""
+        with self._problems(topic):
+            return single_messages.tag_detections(self._decoded(topic, messages.TAG_DETECTIONS))
+
+    def transforms(self, topic: str) -> Mapping[tuple[str, str], series.PoseSeries]:
+        """(Parent frame, child frame) -> the transforms between them on a tf2_msgs/TFMessage topic."""
+        if topic not in self._transforms:
+            with self._problems(topic):
+                self._transforms[topic] = single_messages.transforms(self._decoded(topic, messages.TF))
+        return self._transforms[topic]
+
+    # -- derived topics
+
+    def _derived_info(self, name: str, source: TopicSource) -> TopicInfo | None:
+        """A derived topic; None if a part is not there."""
+        parts = [self.recorded[part] for part in source.parts if part in self.recorded]
+        if len(parts) < len(source.parts):
+            return None
+        is_pose = source.topic is not None and (bool(source.frames) or source.invert)
+        kind = messages.POSE if is_pose else messages.IMU if source.topic is None else parts[0].type
+        return TopicInfo(name, kind, parts[0].count, parts[0].encoding, all(part.is_readable for part in parts))
+
+    def _derived_imu(self, name: str, source: TopicSource) -> series.ImuSeries:
+        if source.frames or source.invert:
+            raise InputError(f"{self.path}: topic {name} is made of attitudes; it holds no rates")
+        if source.topic is not None:
+            imu = self.imu(source.topic, source.frame)
+        else:
+            accel = None if source.accel is None else self._part(source.accel, "accel")
+            imu = joined(self._part(source.gyro or "", "gyro"), accel)
+        return dataclasses.replace(imu, gyro=along(source.axes, imu.gyro), accel=along(source.axes, imu.accel))
+
+    def _part(self, topic: str, which: str) -> series.VectorSeries:
+        """The rates or accelerations on a topic that holds either."""
+        info = self._require(topic, messages.IMU, messages.VECTOR, messages.TWIST, messages.ACCEL)
+        if info.type != messages.IMU:
+            return self._series(series.VectorSeries, topic)
+        imu = self._series(series.ImuSeries, topic)
+        return series.VectorSeries(imu.t_ns, getattr(imu, which), stamped_by_log=imu.stamped_by_log)
+
+    def _between(self, topic: str, frames: tuple[str, str]) -> series.PoseSeries:
+        """The transforms of a pair of frames, parent and child."""
+        pairs = self.transforms(topic)
+        found = pairs.get((frames[0].lstrip("/"), frames[1].lstrip("/")))
+        if found is None:
+            there = ", ".join(f"{parent} to {child}" for parent, child in sorted(pairs)[:MAX_NAMED])
+            raise InputError(
+                f"{self.path}: topic {topic} has no transform from {frames[0]} to {frames[1]}; there: {there or 'none'}"
+            )
+        self._note_unstamped(topic, found.t_ns, found.stamped_by_log)
+        return found
+
+    def _orientations(self, topic: str, frame: str | None) -> series.PoseSeries:
+        """The orientations of an Imu topic. Raises InputError where it has none."""
+        imu = self.imu(topic, frame)
+        if (imu.wxyz_cov[:, 0, 0] < 0.0).all():
+            raise InputError(
+                f"{self.path}: topic {topic}: orientation_covariance starts with -1, so there is no attitude in it"
+            )
+        cov = np.zeros((len(imu), 6, 6))
+        cov[:, 3:, 3:] = imu.wxyz_cov
+        return series.PoseSeries(imu.t_ns, imu.wxyz, cov=cov, stamped_by_log=imu.stamped_by_log)
+
+    # -- from messages to series
+
+    def _list_topics(self) -> dict[str, TopicInfo]:
+        topics: dict[str, TopicInfo] = {}
+        for number, channel in self.container.channels.items():
+            found = self._formats[number]
+            before = topics.get(channel.topic)
+            if before and (before.type, before.encoding) != (found.type, found.encoding):
+                raise InputError(
+                    f"{self.path}: topic {channel.topic} has messages of two types, {before.type} and {found.type}"
+                )
+            count = self.container.counts.get(number, 0) + (before.count if before else 0)
+            topics[channel.topic] = TopicInfo(channel.topic, found.type, count, found.encoding, found.is_readable)
+        return dict(sorted(topics.items()))
+
+    def _require(self, topic: str, *types: str) -> TopicInfo:
+        """The recorded topic. Raises InputError unless it has messages, of one of the types, that can be decoded."""
+        found = self.recorded.get(topic)
+        if found is None:
+            problem = f"no topic {topic} ({' or '.join(types)}); {self.there()}; `topics:` in the config can rename"
+        elif found.type not in types:
+            kind = found.type if found.encoding == ENCODING else f"{found.type} ({found.encoding})"
+            needed = f"needed is {' or '.join(types)} ({ENCODING}){self._advice(topic)}"
+            problem = f"topic {topic} holds {kind}, {needed}"
+        elif not found.is_readable:
+            problem = (
+                f"topic {topic} has the encoding {found.encoding}, needed is {ENCODING} (ROS 2, as `ros2 bag record "
+                f"-s mcap` writes it), or one of {', '.join(READABLE[1:])}{self._advice(topic)}"
+            )
+        elif not found.count:
+            problem = f"topic {topic} has no messages"
+        else:
+            return found
+        raise InputError(f"{self.path}: {problem}")
+
+    def _advice(self, topic: str) -> str:
+        channels = self.container.channels.items()
+        return next(self._formats[number].advice for number, channel in channels if channel.topic == topic)
+
+    def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, MessageBlock]]:
+        """(topic, messages) in file order."""
+        names = set(topics)
+        wanted = {n: channel.topic for n, channel in self.container.channels.items() if channel.topic in names}
+        for block in self.container.blocks(set(wanted)) if wanted else ():
+            yield wanted[block.channel], block
+
+    def _table(self, topic: str, joints: tuple[str, ...] = ()) -> ColumnTable:
+        """The decoded messages of a topic that has been required."""
+        table = self._decoded_tables.pop((topic, joints), None)
+        if table is None:
+            table = ColumnTable(self.recorded[topic].type, self.recorded[topic].count, joints)
+            for error in self._fill({topic: table}).values():
+                raise error
+        self._check_any(topic, table.count)
+        if without := table.drop_unstamped():
+            self._unstamped[topic] = without
+        return table
+
+    def _fill(self, tables: Mapping[str, ColumnTable]) -> dict[str, InputError]:
+        """Decode topics in one pass; returns those that cannot be read, with the reason."""
+        failed: dict[str, InputError] = {}
+        for topic, block in self._blocks(tables):
+            if topic not in failed:
+                try:
+                    with self._problems(topic):
+                        self._formats[block.channel].append(block, tables[topic])
+                except InputError as error:
+                    failed[topic] = error
+            if len(failed) == len(tables):
+                break
+        self._times |= {topic: table.times(filled=False) for topic, table in tables.items() if topic not in failed}
+        return failed
+
+    def _decoded(self, topic: str, *types: str) -> Iterator[DecodedMessage]:
+        """Messages one by one, in file order."""
+        info = self._require(topic, *types)
+        times = []
+        for _, block in self._blocks([topic]):
+            t_ns = []
+            with self._problems(topic):
+                for message in self._formats[block.channel].decode(block):
+                    t_ns.append(message.t_ns)
+                    yield message
+            times.append((np.array(t_ns, dtype=np.int64), block.log_ns))
+        self._times[topic] = _concatenate(times)
+        self._check_any(topic, len(self._times[topic][0]))
+        if info.type in SENSOR_STAMPED_TYPES:
+            check_clock(topic, *self._times[topic], self.epoch_ns)
+
+    def _check_any(self, topic: str, number: int) -> None:
+        """Raise InputError if no message of the topic is left."""
+        if not number:
+            lost = "; ".join(self.container.notes(None))
+            raise InputError(f"{self.path}: topic {topic}: none of its messages can be read: {lost}")
+
+    @contextmanager
+    def _problems(self, topic: str) -> Iterator[None]:
+        """Make an InputError of messages that cannot be decoded, or whose fields are missing or something else."""
+        try:
+            yield
+        except MessageError as error:
+            when = f", logged at {(error.log_ns - self.epoch_ns) * 1e-9:.3f} s" if error.log_ns is not None else ""
+            raise InputError(f"{self.path}: topic {topic}: {error}{when}") from error
+        except (KeyError, AttributeError, TypeError, ValueError) as error:
+            raise InputError(f"{self.path}: topic {topic}: the messages have no usable field ({error})") from error
+
+    def _series(self, kind: type[AnySeries], topic: str, frame: str | None = None) -> AnySeries:
+        info = self._require(topic, kind.TYPE, *kind.OTHERS)
+        table = self._table(topic)
+        self._choose_frame(topic, table, frame)
+        if info.type in SENSOR_STAMPED_TYPES:
+            check_clock(topic, *table.times(), self.epoch_ns)
+        t_ns, from_log, columns = table.sorted()
+        self._note_unstamped(topic, t_ns, from_log)
+        for name in _COUNTED.get(kind, ()):
+            if bits := wrapped_bits(columns[name]):
+                columns[name] = to_signed(columns[name], bits)
+                self.remark(
+                    f"topic {topic}: {name} jumps by {1 << bits}: counts of a signed {bits} bit sensor that were "
+                    "written as unsigned, read as signed"
+                )
+        return kind(t_ns, stamped_by_log=from_log, **columns)
+
+    def _choose_frame(self, topic: str, table: ColumnTable, frame: str | None) -> None:
+        """Keep the messages of a frame. Raises InputError where it has none, and where none is given of several.
+
+        Frames that follow one another in time are one device that was renamed.
+        """
+        frames = table.frames()
+        there = ", ".join(f"{name or 'without a name'} ({int(rows.sum())} messages)" for name, rows in frames.items())
+        if frame is not None:
+            if frame.lstrip("/") not in frames:
+                raise InputError(f"{self.path}: topic {topic} has no messages of the frame {frame}; there: {there}")
+            table.filled &= frames[frame.lstrip("/")]
+            return
+        spans = [np.flatnonzero(rows)[[0, -1]] for rows in frames.values() if rows.sum() > 1]
+        spans.sort(key=lambda span: int(span[0]))
+        if any(after[0] < before[1] for before, after in itertools.pairwise(spans)):
+            raise InputError(
+                f"{self.path}: topic {topic} has messages of several devices, by their frames: {there}; choose one: "
+                f"`{{topic: {topic}, frame: {next(iter(frames))}}}` in place of its name under `topics:`"
+            )
+
+    # -- what stamps show
+
+    @property
+    def _stamp_notes(self) -> tuple[str, ...]:
+        """Sentences about how the stamps came about in the topics read by now."""
+        facts = self._all_stamp_facts()
+        left_out = (
+            f"topic {name}: {n} messages without a stamp, among others that have one, are left out"
+            for name, n in self._unstamped.items()
+        )
+        return (*left_out, *(note for name in self.recorded if name in facts for note in facts[name].notes))
+
+    def _all_stamp_facts(self) -> Mapping[str, _StampFacts]:
+        for name in self._times.keys() - self._stamp_facts.keys():
+            t_ns, log_ns = self._times[name]
+            is_sensor = name in self.recorded and self.recorded[name].type in SENSOR_STAMPED_TYPES
+            delay = int((log_ns - t_ns).min()) if len(t_ns) else None
+            self._stamp_facts[name] = _StampFacts(delay, stamp_notes(name, t_ns, log_ns) if is_sensor else ())
+        return self._stamp_facts
+
+    def _note_unstamped(self, topic: str, t_ns: NDArray[np.int64], from_log: int) -> None:
+        """Note that log times stand in for stamps, and by how much they jitter."""
+        if not from_log:
+            return
+        jitter = jitter_ns(np.diff(t_ns))
+        self.stamp_sigma_s = max(self.stamp_sigma_s, float(np.hypot(UNKNOWN_LOG_DELAY_S, jitter * 1e-9)))
+        self.remark(
+            f"topic {topic}: {from_log} of {len(t_ns)} messages have no stamp; the log times stand in, which are "
+            f"late by a delay that nobody knows (taken for {1e3 * UNKNOWN_LOG_DELAY_S:.0f} ms, one sigma) and jitter "
+            f"by {jitter * 1e-6:.2g} ms (sigma)"
+        )
+
+
+def _concatenate(parts: Sequence[Times]) -> Times:
+    none = np.empty(0, np.int64)
+    return np.concatenate([none, *(t_ns for t_ns, _ in parts)]), np.concatenate([none, *(log for _, log in parts)])

@@ -1,0 +1,95 @@
+"""Readers of messages that come one by one: intrinsics, pictures, tag detections, transforms.
+
+A message without a field, or with a field of another kind, is an AttributeError, TypeError, KeyError or ValueError; a
+video that is not read is a MessageError.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+
+from alidade.pipelines.recording import images, series
+from alidade.pipelines.recording.decoding import DecodedMessage
+from alidade.pipelines.recording.messages import MessageError
+
+
+def camera_info(message: DecodedMessage) -> series.CameraInfo:
+    """The intrinsics in a sensor_msgs/CameraInfo."""
+    found = message.content
+    k, r, p, d = (np.array(values, dtype=float) for values in (found.k, found.r, found.p, found.d))
+    size = int(found.width), int(found.height)
+    matrices = k.reshape(3, 3), r.reshape(3, 3), p.reshape(3, 4)
+    return series.CameraInfo(message.t_ns, *size, found.distortion_model, d, *matrices, found.header.frame_id)
+
+
+def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
+    """(stamp in ns, file) of each picture: raw ones and those of a H.264 video in the Netpbm form."""
+    files = (_file(message, is_raw) for message in messages)
+    for t_ns, form, data in files:
+        if form in images.OTHERS:
+            raise MessageError(f"a video in {form}; H.264 is read, or single pictures")
+        if form in images.H264:
+            packets = itertools.chain([(t_ns, data)], ((t_ns, data) for t_ns, _, data in files))
+            try:
+                yield from images.decode_video(packets)
+            except ValueError as error:
+                raise MessageError(str(error)) from error
+            return
+        yield t_ns, data
+
+
+def _file(message: DecodedMessage, is_raw: bool) -> tuple[int, str, bytes]:
+    """Stamp, form, and file or packet of a video."""
+    found = message.content
+    if is_raw:
+        return message.t_ns, "netpbm", images.netpbm(found)
+    return message.t_ns, found.format.lower(), found.data.tobytes()
+
+
+def tag_detections(messages: Iterable[DecodedMessage]) -> series.DetectionSeries:
+    """Detections of apriltag_msgs/AprilTagDetectionArray messages, with corners as points or as plain numbers."""
+    stamps: list[tuple[int, bool]] = []
+    rows: list[tuple[int, int, Any, int, float, str]] = []
+    for i, message in enumerate(messages):
+        stamps.append((message.t_ns, message.from_log_time))
+        numbers = message.definition.numbers
+        for found in message.content.detections:
+            # (x, y) or (x, y, z) of each
+            xy = numbers(found.corners).reshape(4, -1)[:, :2]
+            quality = int(found.hamming), float(found.decision_margin), found.family
+            rows.append((i, int(numbers(found.id)[0]), xy, *quality))
+    frame, tag_id, corners, hamming, margin, family = ([row[k] for row in rows] for k in range(6))
+    return series.DetectionSeries(
+        np.array([t_ns for t_ns, _ in stamps], dtype=np.int64),
+        np.array(frame, dtype=np.int64),
+        np.array(tag_id, dtype=np.int64),
+        np.array(corners, dtype=float).reshape(-1, 4, 2),
+        np.array(hamming, dtype=np.int64),
+        np.array(margin, dtype=float),
+        np.array(family, dtype=np.str_),
+        sum(from_log for _, from_log in stamps),
+    )
+
+
+def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], series.PoseSeries]:
+    """(Parent frame, child frame) -> transforms between them, of tf2_msgs/TFMessage messages and their log times."""
+    rows: dict[tuple[str, str], list[tuple[int, bool, Any]]] = {}
+    for message in messages:
+        for one in message.content.transforms:
+            t_ns = one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec
+            row = t_ns or message.t_ns, not t_ns, message.definition.numbers(one.transform)
+            pair = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+            rows.setdefault(pair, []).append(row)
+    return {pair: _poses(found) for pair, found in rows.items()}
+
+
+def _poses(rows: list[tuple[int, bool, Any]]) -> series.PoseSeries:
+    """Poses of (stamp, whether it is a log time, translation and quaternion x, y, z, w)."""
+    numbers = np.array([row[2] for row in rows]).reshape(len(rows), 7)
+    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
+    from_log = sum(row[1] for row in rows)
+    return series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=from_log)

@@ -1,0 +1,91 @@
+"""What a graph says of numbers that were fixed when a recording was solved: nothing is solved again but the states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.estimation.problem import Estimate, Problem, Told
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.levenberg import Engine
+from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels
+from alidade.pipelines.solvers.noise_estimation import apply_levels
+from alidade.pipelines.solvers.posterior import Reported, sqrt_information
+
+# Steps to the states that are optimal for given parameters; first values are near them.
+_STEPS = 3
+
+
+def freed_information(freed: Problem, estimate: Estimate) -> Told | None:
+    """Square-root information of a graph about the solution of another one, in which some numbers were fixed.
+
+    Noise levels and rejected measurements are the solution's. Levels that a misfit has raised hide its cause: where
+    they maximise the likelihood they are found anew.
+
+    Args:
+        freed: the graph in which they are free.
+        estimate: the solution; a number that it has not is at its prior mean.
+
+    Returns:
+        None where the graph does not determine its states.
+    """
+    levels = estimate.levels
+    compiled = Compiled.of((freed.finer and freed.finer(levels)) or freed)
+    used = _used(compiled.engine.groups, estimate)
+    try:
+        engine = _without_rejected(apply_levels(compiled.engine, levels), used)
+        values = _with_optimal_states(engine, _at(compiled, estimate))
+        if freed.marginal_likelihood and isinstance(compiled.engine, Linearization):
+            out = {i: ~used[i] for i, group in enumerate(engine.groups) if group.is_measurement}
+            found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
+            engine = _without_rejected(apply_levels(compiled.engine, found.levels), used)
+        return sqrt_information(compiled.problem, engine, values, compiled.current_keys, ())
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]]:
+    """(n,) of each group which of its measurements the solution uses; all where it has others of the family."""
+    used = [np.ones(len(group.model.time), dtype=bool) for group in groups]
+    for family, known in estimate.residuals.items():
+        own = [i for i, group in enumerate(groups) if group.family == family and group.is_measurement]
+        if not own or sum(len(used[i]) for i in own) != len(known.used):
+            continue
+        order = np.argsort(np.concatenate([groups[i].factors for i in own]), kind="stable")
+        flat = np.empty(len(order), dtype=bool)
+        flat[order] = known.used
+        ends = np.cumsum([len(used[i]) for i in own])[:-1]
+        for i, each in zip(own, np.split(flat, ends), strict=True):
+            used[i] = each
+    return used
+
+
+def _without_rejected(engine: Engine, used: Sequence[NDArray[np.bool_]]) -> Engine:
+    """The engine with measurements that count in full or not at all."""
+    return engine.with_groups([group.counting(own) for group, own in zip(engine.groups, used, strict=True)])
+
+
+def _at(compiled: Compiled, estimate: Estimate) -> Values:
+    """First values with the parameters as estimated."""
+    numbers = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
+    layout, values = compiled.layout, compiled.initial
+    N, d, J, c, _ = layout.sizes
+    for _ in range(_STEPS):  # rotation vectors are not linear
+        here = Reported.of(compiled.problem, layout, values, compiled.current_keys)
+        means = [numbers.get(q.name, q.prior_mean) for q in compiled.problem.quantities]
+        move = np.linalg.pinv(here.jacobian[:, c:]) @ (np.array(means) - here.numbers)
+        values = layout.retract(values, Tangent(np.zeros((N, d)), np.zeros((J, c)), move))
+    return values
+
+
+def _with_optimal_states(engine: Engine, values: Values) -> Values:
+    """Values with the states optimal for the parameters as they are."""
+    *_, c, s = engine.layout.sizes
+    for _ in range(_STEPS):
+        states, nodes = engine.at(values)[0].eliminate().given(np.zeros((c + s, 1)))
+        values = engine.layout.retract(values, Tangent(states[..., 0], nodes[..., 0], np.zeros(s)))
+    return values

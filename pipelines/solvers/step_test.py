@@ -1,0 +1,459 @@
+"""The step of a rotation that all measurements share, at one moment of a recording: a mount that slips.
+
+Every keyframe is a candidate. At the solution the problem is linear, and all that a step at keyframe j needs follows
+from a filter that runs forward and one that runs backward, both with their derivatives by the shared parameters: with A
+what the forward one has learned of these before j, B the backward one from j on, and (y, V) the difference of their
+attitudes at j with its covariance,
+
+    A(parameters) + B(parameters, step) + |y(parameters, step)|^2 / V     the step, the chain unbroken
+    A(parameters) + B(parameters, step)                                   motion alone: the attitude is free to jump
+
+A glitch of the reference jumps and has no say in motion; a slip has both, and they agree (Fraser, Potter, IEEE TAC 1969
+for the two filters). A step passes for noise, so that levels at the solution hide it: the best candidates are solved
+again with the rotation after the step as a variable of its own, levels, widening and linearisation included.
+
+Limits: a parameter of which all measurements hold the same variable; steps of a bias that walks are not looked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.factors.model import ROT3
+from alidade.pipelines.estimation.noise import ROUGHLY, Level
+from alidade.pipelines.estimation.problem import APART, Parameter, StepEstimate
+from alidade.pipelines.solvers.chain import Array, IndeterminateStateError, Index
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.layout import Layout, Values
+from alidade.pipelines.solvers.levenberg import Solution
+from alidade.pipelines.solvers.linearization import Group, Linearization, NativeModel
+from alidade.pipelines.solvers.marginal_likelihood import (
+    LinearChain,
+    Outliers,
+    Rows,
+    estimate_levels,
+    maximise_likelihood,
+    rejected,
+    sandwich,
+    widened,
+)
+
+# rad, one sigma of a step before anything is known.
+STEP_PRIOR = 0.35
+# Share of a recording at either end in which no step is looked for.
+_MARGIN = 0.03
+# Candidates that are nearer to another one than so many keyframes are that one.
+_SAME = 2
+# Keyframes that are scanned at once.
+_BLOCK = 1000
+# Fall of chi-square below which no candidate is solved again: 20 are needed for a change in a minute.
+NOTHING = 12.0
+# Linearisations with a step.
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Tests of a step before each of J keyframes, at the levels of the solution without one.
+
+    Attributes:
+        keyframe: (J,) the first one after it.
+        time, since: (J,) s of its first measurement, and of the last one before.
+        fall: (J,) of chi-square with the step.
+        by_motion: (J,) of the step with the attitude free to jump.
+        apart: (J,) chi-square of the difference of both steps, by the covariance of that from motion alone.
+        step, information: (J, 3), (J, 3, 3) with the chain unbroken, rad.
+    """
+
+    keyframe: Index
+    time: Array
+    since: Array
+    fall: Array
+    by_motion: Array
+    apart: Array
+    step: Array
+    information: Array
+
+    def best(self) -> list[int]:
+        """The candidates, at most four: the largest of both tests, of the smaller one, and where both agree."""
+        both = np.minimum(self.fall, self.by_motion)
+        found: list[int] = []
+        for size in (self.fall, self.by_motion, both, np.where(self.apart < APART, both, -np.inf)):
+            at = int(np.argmax(size))
+            if all(abs(self.keyframe[at] - self.keyframe[i]) > _SAME for i in found):
+                found.append(at)
+        return found
+
+
+def scan(chain: LinearChain, variances: Sequence[Array], columns: Index) -> Scan | None:
+    """Tests of a step at every keyframe; None where there are too few.
+
+    Args:
+        chain: about the solution.
+        variances: (n,) of each kind of rows.
+        columns: of the parameter that may step, among the shared ones.
+    """
+    candidates, time, since = _candidates(chain)
+    if not len(candidates):
+        return None
+    parts = [_tests(*each, columns) for each in _two_sides(chain, variances, candidates)]
+    return Scan(candidates, time, since, *(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def _candidates(chain: LinearChain) -> tuple[Index, Array, Array]:
+    """Keyframes with measurements, the time of their first, and that of the last before."""
+    n, parts = chain.size[0], [r for r in chain.rows if r.is_measurement and len(r.states) == 1]
+    first, last = np.full(n, np.inf), np.full(n, -np.inf)
+    for rows in parts:
+        np.minimum.at(first, rows.states[0][0], rows.time)
+        np.maximum.at(last, rows.states[0][0], rows.time)
+    before = np.append(-np.inf, np.maximum.accumulate(last)[:-1])
+    least = max(1, int(_MARGIN * n))
+    k = np.flatnonzero(np.isfinite(first) & np.isfinite(before))
+    k = k[(k >= least) & (k < n - least)]
+    return k, first[k], before[k]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """One filter: of each keyframe the state by what comes before and with it, as (d, 1 + p) and covariances.
+
+    Attributes:
+        X, P: predicted.
+        Y, R: with the measurements there.
+        own: H, g, of the measurements there: of the state, and of that and (1, shared).
+    """
+
+    X: Array
+    P: Array
+    Y: Array
+    R: Array
+    own: tuple[Array, Array]
+
+    def learned(self, some: slice, beside: Array) -> Array:
+        """(m, 1 + p, 1 + p) information on (1, shared) from the measurements of some keyframes, the state left out."""
+        H, g = (each[some] for each in self.own)
+        X, b = self.X[some], H @ self.X[some] + g
+        crossed = np.swapaxes(X, 1, 2) @ (b + g)
+        out: Array = beside + 0.5 * (crossed + np.swapaxes(crossed, 1, 2)) - np.swapaxes(b, 1, 2) @ self.R[some] @ b
+        return out
+
+
+def _filtered(chain: LinearChain, variances: Sequence[Array]) -> _Pass:
+    """A Kalman filter over the keyframes one after the other, derivatives by the shared parameters beside the state."""
+    (n, d), q = chain.size, chain.prior.shape[1]
+    F, c, Q = chain.transitions(variances, True)
+    H, g = np.zeros((n, d, d)), np.zeros((n, d, q))
+    for rows, variance in zip(chain.rows, variances, strict=True):
+        if len(rows.states) == 1:
+            ((at, J),) = rows.states
+            weighed = np.swapaxes(J, 1, 2) / variance[:, None, None]
+            np.add.at(H, at, weighed @ J)
+            np.add.at(g, at, weighed @ np.concatenate([rows.residuals[..., None], rows.shared], axis=2))
+    X, P, Y, R = np.zeros((n, d, q)), np.zeros((n, d, d)), np.zeros((n, d, q)), np.zeros((n, d, d))
+    unit = np.eye(d)
+    for k in range(n):
+        X[k], P[k] = (F[k] @ Y[k - 1] + c[k], F[k] @ R[k - 1] @ F[k].T + Q[k]) if k else (c[k], Q[k])
+        R[k] = np.linalg.solve(unit + P[k] @ H[k], P[k])
+        Y[k] = X[k] - R[k] @ (H[k] @ X[k] + g[k])
+    return _Pass(X, P, Y, R, (H, g))
+
+
+def _beside(chain: LinearChain, variances: Sequence[Array], begin: int, end: int) -> Array:
+    """(m, 1 + p, 1 + p) squares of what measurements of some keyframes have beside the state: residual and shared."""
+    out = np.zeros((end - begin, chain.prior.shape[1], chain.prior.shape[1]))
+    for rows, variance in zip(chain.rows, variances, strict=True):
+        if len(rows.states) == 1:
+            at = rows.states[0][0]
+            some = np.flatnonzero((at >= begin) & (at < end))
+            both = np.concatenate([rows.residuals[some, :, None], rows.shared[some]], axis=2)
+            np.add.at(out, at[some] - begin, np.swapaxes(both, 1, 2) @ both / variance[some, None, None])
+    return out
+
+
+def _two_sides(
+    chain: LinearChain, variances: Sequence[Array], candidates: Index
+) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
+    """For blocks of candidates: information A, B (m, q, q) on (1, shared), states X, Y (m, d, q) at j, covariance V.
+
+    A and X are from before j, priors included, B and Y from j on; V is that of their difference.
+    """
+    n, q = chain.size[0], chain.prior.shape[1]
+    forward, backward = _filtered(chain, variances), _filtered(chain.reversed(), variances)
+
+    def learned(begin: int) -> tuple[Array, Array]:
+        end = min(begin + _BLOCK, n)
+        beside = _beside(chain, variances, begin, end)
+        back = backward.learned(slice(n - end, n - begin), beside[::-1])[::-1]
+        return forward.learned(slice(begin, end), beside), back
+
+    begins = range(0, n, _BLOCK)
+    before, after = _alone(chain, variances), sum((learned(begin)[1].sum(axis=0) for begin in begins), np.zeros((q, q)))
+    for begin in begins:
+        ahead, back = learned(begin)
+        own = candidates[(candidates >= begin) & (candidates < begin + len(ahead))]
+        A, B = before + np.cumsum(ahead, axis=0) - ahead, after - np.cumsum(back, axis=0) + back
+        before, after, late = before + ahead.sum(axis=0), after - back.sum(axis=0), n - 1 - own
+        V = forward.P[own] + backward.R[late]
+        yield A[own - begin], B[own - begin], forward.X[own], backward.Y[late], V
+
+
+def _alone(chain: LinearChain, variances: Sequence[Array]) -> Array:
+    """(q, q) information on (1, shared) of priors and of rows without a state."""
+    prior = np.roll(chain.prior, 1, axis=1)
+    out: Array = prior.T @ prior
+    for rows, variance in zip(chain.rows, variances, strict=True):
+        if not rows.states:
+            both = np.concatenate([rows.residuals[..., None], rows.shared], axis=2)
+            out += np.einsum("nmi,nmj,n->ij", both, both, 1.0 / variance)
+    return out
+
+
+def _tests(A: Array, B: Array, X: Array, Y: Array, V: Array, columns: Index) -> tuple[Array, ...]:
+    """Fall with the step, chi-square of it by motion alone, how far both are apart, the step and its information."""
+    q, d = A.shape[1], len(columns)
+    at = np.append(np.arange(q), 1 + columns)
+    alone = B[:, at[:, None], at]
+    alone[:, :q, :q] += A
+    alone[:, q:, q:] += np.eye(d) / STEP_PRIOR**2
+    link = Y[..., at]
+    link[..., :q] -= X
+    joined = alone + np.swapaxes(link, 1, 2) @ np.linalg.solve(V, link)
+    fall, step, information = _step_of(joined, q)
+    by_motion, moved, of_motion = _step_of(alone, q)
+    return fall, by_motion, _square(of_motion, moved - step), step, information
+
+
+def _step_of(N: Array, q: int) -> tuple[Array, Array, Array]:
+    """Chi-square, value and information of the last numbers in information N on (1, shared, step)."""
+    right = np.concatenate([N[:, 1:q, :1], N[:, 1:q, q:]], axis=2)
+    solved = np.linalg.solve(N[:, 1:q, 1:q], right)
+    whole = np.concatenate([N[:, q:, :1], N[:, q:, q:]], axis=2) - N[:, q:, 1:q] @ solved
+    information = whole[..., 1:]
+    step = np.asarray(-np.linalg.solve(information, whole[..., :1])[..., 0])
+    return _square(information, step), step, information
+
+
+def _square(information: Array, x: Array) -> Array:
+    """x' information x, (n,)."""
+    return np.asarray(np.einsum("ni,nij,nj->n", x, information, x))
+
+
+def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
+    """Steps of one of `Problem.may_step` that explain a recording best, the most significant first."""
+    engine = compiled.engine
+    if not isinstance(engine, Linearization) or not isinstance(solution.engine, Linearization):
+        return ()
+    parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.may_step]
+    base = _Fit.of(engine, solution.values, levels)
+    scans = [(p, found) for p in parameters if (found := base.scanned(p)) is not None]
+    steps = [_scanned(base, p, found) for p, found in scans if found.fall.max() < NOTHING]
+    scans = [(p, found) for p, found in scans if found.fall.max() >= NOTHING]
+    if scans:
+        outliers = rejected(solution.engine, solution.values)
+        without = _maximised(engine, solution.values, levels, outliers)
+        tried = [_solved_again(without, base, outliers, p, found, i) for p, found in scans for i in found.best()]
+        steps += [step for step in tried if step is not None]
+    return tuple(sorted(steps, key=lambda step: (-step.statistic, -step.fall)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A solution at the levels of the largest likelihood, all outliers widened.
+
+    Attributes:
+        engine: with the noise stated.
+        values, levels: there.
+        chain: about it.
+        variances: (n,) of each kind of rows.
+        minus_two_log_likelihood: of it.
+    """
+
+    engine: Linearization
+    values: Values
+    levels: tuple[Level, ...]
+    chain: LinearChain
+    variances: list[Array]
+    minus_two_log_likelihood: float
+
+    @classmethod
+    def of(cls, engine: Linearization, values: Values, levels: Sequence[Level]) -> _Fit:
+        chain = LinearChain.of(engine, values)
+        wide, _ = widened(chain, levels, {})
+        found = estimate_levels(chain, levels, wide, {}).levels
+        by = [wide.get(rows.group, np.ones(len(rows.time))) for rows in chain.rows]
+        variances = [v * w**2 for v, w in zip(chain.variances(found), by, strict=True)]
+        known = [(np.log(level.scale) / max(level.noise.known, ROUGHLY)) ** 2 for level in found]
+        solved = chain.solved(variances)
+        value = np.inf if solved is None else solved.value + float(sum(known))
+        return cls(engine, values, found, chain, variances, value)
+
+    def scanned(self, parameter: Parameter) -> Scan | None:
+        """Tests of steps of a parameter; None: it is none of the recording, or that is too short."""
+        layout = self.engine.layout
+        columns = np.flatnonzero(layout.root_columns(parameter.key)[:, layout.sizes[3] :].any(axis=0))
+        return scan(self.chain, self.variances, columns) if len(columns) else None
+
+
+def _maximised(engine: Linearization, values: Values, levels: Sequence[Level], outliers: Outliers) -> _Fit:
+    """From levels and values near: those of the largest likelihood."""
+    best = maximise_likelihood(engine, values, levels, outliers, _ROUNDS)
+    return _Fit.of(engine, best.values, best.levels)
+
+
+def _scanned(base: _Fit, parameter: Parameter, found: Scan) -> StepEstimate:
+    """The best candidate at the solution without a step."""
+    i = int(np.argmax(found.fall))
+    layout, covariance = base.engine.layout, np.linalg.inv(found.information[i])
+    _, J = parameter.coordinates(layout.to_gtsam(base.values, [parameter.key]), parameter.key)
+    named = _named(parameter, J @ found.step[i], J @ covariance @ J.T)
+    tests = float(found.fall[i]), float(found.by_motion[i]), float(found.apart[i])
+    when = float(found.time[i]), float(found.since[i])
+    return StepEstimate(*when, named, *_length(found.step[i], covariance), *tests, 1.0, 1.0)
+
+
+def _named(parameter: Parameter, steps: Array, covariance: Array) -> dict[str, tuple[float, float]]:
+    """Quantity -> step and its sigma."""
+    each = zip(steps.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
+    return {q.name: step for q, step in zip(parameter.quantities, each, strict=True)}
+
+
+def _length(step: Array, covariance: Array) -> tuple[float, float]:
+    """Of a vector, and its sigma along it."""
+    length = float(np.linalg.norm(step))
+    along = step / max(length, 1e-300)
+    return length, float(np.sqrt(along @ covariance @ along))
+
+
+def _solved_again(
+    without: _Fit, base: _Fit, outliers: Outliers, parameter: Parameter, found: Scan, i: int
+) -> StepEstimate | None:
+    """A candidate with levels, widening and linearisation of its own; None: it is not determined."""
+    engine, values, late = split(base.engine, base.values, parameter.key, float(found.time[i]), found.step[i])
+    try:
+        fit = _maximised(engine, values, base.levels, outliers)
+    except IndeterminateStateError:
+        return None
+    link = [_leads_to(rows, int(found.keyframe[i])) for rows in fit.chain.rows]
+    apart = [np.where(to, np.inf, v) for v, to in zip(fit.variances, link, strict=True)]
+    joined, alone = fit.chain.solved(fit.variances), fit.chain.solved(apart)
+    if joined is None or alone is None:
+        return None
+    layout, c = engine.layout, engine.layout.sizes[3]
+    first, second = (layout.root_columns(key)[:, c:] for key in (parameter.key, late))
+    turn = so3.log(so3.multiply(so3.inverse(layout.of_key(fit.values, parameter.key)), layout.of_key(fit.values, late)))
+    # Log(A^-1 B) with A Exp(a), B Exp(b).
+    D = so3.right_jacobian_inverse(turn) @ (second - so3.matrix(so3.exp(-turn)) @ first)
+    C, moved = joined.covariance(D), alone.covariance(D)
+    step, by_motion = turn + D @ joined.shared, turn + D @ alone.shared
+    ratio_moved = _ratio(fit.chain, apart, D, alone.shared)
+    ratio = max(_ratio(fit.chain, fit.variances, D, joined.shared), ratio_moved)
+    fall = without.minus_two_log_likelihood - fit.minus_two_log_likelihood
+    # Log det of the step's information is what a prior of its width would pay: no evidence for a step.
+    fall -= float(np.linalg.slogdet(C)[1])
+    at = layout.to_gtsam(fit.values, [parameter.key, late])
+    (a, by_a), (b, by_b) = (parameter.coordinates(at, key) for key in (parameter.key, late))
+    J = by_b @ second - by_a @ first
+    return StepEstimate(
+        float(found.time[i]),
+        float(found.since[i]),
+        _named(parameter, b - a + J @ joined.shared, joined.covariance(J)),
+        *_length(step, C),
+        fall,
+        float(by_motion @ np.linalg.solve(moved, by_motion)),
+        float((by_motion - step) @ np.linalg.solve(moved, by_motion - step)),
+        ratio,
+        ratio_moved,
+    )
+
+
+def _leads_to(rows: Rows, keyframe: int) -> NDArray[np.bool_]:
+    """(n,) which rows join a keyframe to the one before."""
+    if len(rows.states) != 2:
+        return np.zeros(len(rows.time), dtype=bool)
+    return np.asarray(rows.states[1][0] == keyframe)
+
+
+def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, at: Array) -> float:
+    """Largest ratio of sandwich to nominal sigma over directions of numbers that go with the shared ones by D."""
+    nominal, robust, _ = sandwich(chain, variances, at)
+    root = np.linalg.inv(np.linalg.cholesky(D @ nominal @ D.T))
+    return max(1.0, float(np.linalg.eigvalsh(root @ D @ robust @ D.T @ root.T)[-1]) ** 0.5)
+
+
+def split(
+    engine: Linearization, values: Values, key: int, time: float, step: Array
+) -> tuple[Linearization, Values, int]:
+    """The linearisation with another rotation in force from a time on, the values, and that rotation's key.
+
+    Args:
+        engine: as it is.
+        values: of it.
+        key: of the rotation.
+        time: s; measurements from it on have the new one.
+        step: (3,) first guess of Log(R^-1 R_late); R and R_late are joined by a prior of `STEP_PRIOR`.
+    """
+    layout = engine.layout
+    (at,) = layout.at([key]).tolist()
+    late, begin, columns = len(layout.key), int(layout.shared[at]), layout.sizes[4]
+    array = values.arrays[ROT3]
+    grown = replace(
+        layout,
+        key=np.append(layout.key, layout.key.max() + 1),
+        row=np.append(layout.row, len(array)),
+        shared=np.append(layout.shared, columns),
+        block=np.append(layout.block, layout.block[at]),
+        keyframe=np.append(layout.keyframe, -1),
+        offset=np.append(layout.offset, 0),
+        node=np.append(layout.node, -1),
+        part=np.append(layout.part, 0),
+        sizes=(*layout.sizes[:4], columns + 3),
+    )
+    moved = so3.multiply(array[layout.row[at]], so3.exp(step))
+    arrays = {**values.arrays, ROT3: np.vstack([array, moved])}
+    groups = [_with_late(group, at, late, len(array), columns - begin, time) for group in engine.groups]
+    prior = _prior(key, int(grown.key[late]), grown, at, late)
+    return replace(engine, layout=grown, groups=[*groups, prior]), Values(arrays), int(grown.key[late])
+
+
+def _with_late(group: Group, at: int, late: int, row: int, further: int, time: float) -> Group:
+    """A group of which late measurements have a variable so many columns further."""
+    blocks = [i for i, each in enumerate(group.at) if group.is_measurement and (each == at).all()]
+    if not blocks:
+        return group
+    (i,) = blocks
+    after = group.model.time >= time
+    positions, gather, columns = list(group.at), list(group.gather), list(group.columns)
+    positions[i] = np.where(after, late, at)
+    gather[i] = (gather[i][0], np.where(after, row, gather[i][1]))
+    columns[i] = [columns[i][0] + further * after[:, None]]
+    return replace(group, at=positions, gather=gather, columns=columns)
+
+
+def _prior(key: int, late_key: int, layout: Layout, at: int, late: int) -> Group:
+    """What is known of the step before."""
+    import gtsam
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, STEP_PRIOR)
+    factor = gtsam.BetweenFactorRot3(key, late_key, gtsam.Rot3(), noise)
+    return Group(
+        family="prior",
+        model=NativeModel(factor, np.zeros(1), 3, (ROT3, ROT3)),
+        loss=None,
+        weights=None,
+        factors=np.array([-1]),
+        is_measurement=False,
+        beside=None,
+        gather=[(ROT3, layout.row[[each]]) for each in (at, late)],
+        at=[np.array([each]) for each in (at, late)],
+        target="shared",
+        place=np.array([-1]),
+        row=np.zeros(1, dtype=np.intp),
+        columns=[[int(layout.shared[each]) + np.arange(3)[None]] for each in (at, late)],
+        deviates=[np.zeros(1, dtype=bool)] * 2,
+    )
