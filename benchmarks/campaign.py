@@ -31,7 +31,7 @@ from alidade.pipelines.applications.fleet.analysis import counting, populations
 from alidade.pipelines.applications.fleet.fleet import Outcome, Settings, calibrate_recording
 from alidade.pipelines.applications.fleet.histories import histories, packed, unpacked
 from alidade.pipelines.applications.fleet.recordings import Recording, find, local
-from alidade.pipelines.applications.fleet.store import Result, Store
+from alidade.pipelines.applications.fleet.store import RecordingResult, Store, UnitResult
 from alidade.pipelines.applications.fleet.write import write_fleet
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.recording.recording import open_recording
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("| method | MB | fetch, s | read, s | solve and judge, s | all, s | result, kB |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     with tempfile.TemporaryDirectory() as folder:
-        results: list[Result] = []
+        results: list[RecordingResult] = []
         with bucket() as address:
             for method in options.methods:
                 result, *costs = worker_costs(method, options.recordings, Path(folder), address)
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         most = max(results, key=lambda result: len(counting(result)))
         kept = Path(folder) / "campaign"
         print(f"\n| {options.kept} of {most['method']} collected, each | ms | kB |\n| --- | --- | --- |")
-        seconds = _keep(Store(kept, ""), most, options.kept)
+        seconds = _keep(Store(kept, "", UnitResult), most, options.kept)
         print(f"| kept in results.jsonl | {1e3 * seconds / options.kept:.3g} | {len(json.dumps(most)) / 1e3:.3g} |")
         # Alone in its process, so that the largest memory is that of each step.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
@@ -158,7 +158,7 @@ def _read(path: Path) -> Session:
     return Session.read(open_recording(path), None, None)
 
 
-def _keep(store: Store, result: Result, count: int) -> float:
+def _keep(store: Store[Any], result: RecordingResult, count: int) -> float:
     """Keeps results scattered by their sigmas, of units recorded weekly; s that keeping took."""
     rng = np.random.default_rng(0)
     told, text, seconds = unpacked(result["told"]), json.dumps(result), 0.0

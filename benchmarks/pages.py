@@ -12,7 +12,7 @@ import numpy as np
 
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.result import Calibration
 from benchmarks.measure import Cost, Ratio, costs
 from tests.support.browser import CHROMIUM

@@ -43,7 +43,7 @@ from alidade.pipelines.estimation.assumptions import Assumption
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.meanings import NOISES, meaning
 from alidade.pipelines.recording.topics import Topic
-from alidade.pipelines.reports.result import Result
+from alidade.pipelines.reports.result_json import Result
 from alidade.pipelines.settings import DEFAULT_NOISE, Noise, Sensors
 from alidade.pipelines.simulation.scenario import summary
 

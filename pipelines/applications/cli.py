@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from functools import cache, partial
 from pathlib import Path
@@ -21,7 +22,8 @@ from alidade.pipelines.applications.options import ConfigFile, Json, Quiet, Reco
 from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
-    from alidade.pipelines.estimation.problem import AttitudeRate
+    from alidade.pipelines.applications.session import Session
+    from alidade.pipelines.recording.opening import Where
     from alidade.pipelines.reports.result import Calibration
 
 # Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
@@ -47,13 +49,18 @@ class _WithMethods(TyperGroup):
 
 @cache
 def _of_methods() -> Mapping[str, Any]:
+    import logging
+
     from alidade.pipelines import methods
 
     own = typer.Typer(rich_markup_mode=None)
     own.callback()(lambda: None)
     for name in methods.names():
-        for word, command in methods.method(name).commands.items():
-            own.command(word)(command)
+        try:
+            for word, command in methods.method(name).commands.items():
+                own.command(word)(command)
+        except Exception as error:
+            logging.getLogger("alidade").warning("method %s: its commands cannot be loaded: %s", name, error)
     return typer.main.get_group(own).commands
 
 
@@ -195,15 +202,19 @@ def calibrate(
     from tempfile import TemporaryDirectory
 
     from alidade.pipelines import deadline, parallel, progress
-    from alidade.pipelines.applications.joint import calibrate_device
-    from alidade.pipelines.applications.session import calibrate as run
+    from alidade.pipelines.applications.joint import calibrate_together
+    from alidade.pipelines.applications.session import OpenOptions
     from alidade.pipelines.errors import InputError
     from alidade.pipelines.recording.opening import describe_recordings, group_recordings
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
-    rate: AttitudeRate = attitude_rate.value
+    options = OpenOptions(method, config, strict, auto_topics, auto_columns, prior)
+
+    def read(where: "Where") -> "Session":
+        return replace(options.read(where), engine=engine.value, attitude_rate=attitude_rate.value)
+
     recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
         if solver != Solver.batch:
@@ -222,22 +233,10 @@ def calibrate(
     ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
-            calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself, rate)
+            calibration = calibrate_together([partial(read, each) for each in recordings], by_itself)
         else:
-            (calibration,) = run(
-                recordings[0],
-                [solver.value],
-                method,
-                config,
-                parse_window(window),
-                strict,
-                auto_topics,
-                not no_check,
-                prior,
-                engine=engine.value,
-                auto_columns=auto_columns,
-                attitude_rate=rate,
-            )
+            session = read(recordings[0])
+            (calibration,) = session.calibrations([solver.value], parse_window(window), check=not no_check)
         with progress.doing("writing"):
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
@@ -256,6 +255,7 @@ def compare(
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     jobs: _OwnJobs = None,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -263,29 +263,26 @@ def compare(
 
     With errors where the truth is known, and a split-half test with --out.
     """
-    import time
-
-    from alidade.pipelines import parallel, progress
-    from alidade.pipelines.applications.session import Session
-    from alidade.pipelines.recording.recording import open_recording
+    from alidade.pipelines import deadline, parallel, progress
+    from alidade.pipelines.applications.session import OpenOptions
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.compare import write_compare
+    from alidade.pipelines.reports.comparison_report import write_compare
     from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
-    kept, start = parse_window(window), time.perf_counter()
-    with progress.shown(quiet or as_json), parallel.processes(jobs):
-        with progress.doing("reading"):
-            opened = Session.read(open_recording(session, strict), method, config, auto_topics, prior)
-        seconds = {"read": time.perf_counter() - start}
-        calibrations = opened.calibrations(["published", "batch", "incremental"], kept, seconds)
+    kept = parse_window(window)
+    with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
+        opened = OpenOptions(method, config, strict, auto_topics, prior=prior).read(session)
+        calibrations = opened.calibrations(["published", "batch", "incremental"], kept)
     if as_json:
         terminal.show_json(calibrations)
     else:
-        terminal.show(calibrations)
+        terminal.print_calibrations(calibrations)
     if out is not None:
-        with progress.shown(quiet), parallel.processes(jobs), progress.doing("solving parts of the recording"):
-            written = write_compare(out, calibrations, *opened.cross_validate())
+        with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
+            with progress.doing("solving parts of the recording"):
+                tested = opened.cross_validate()
+            written = write_compare(out, calibrations, *tested)
         if not as_json:
             terminal.say(f"Comparison in {written}")
 
@@ -352,6 +349,7 @@ def validate(
     out: Annotated[Path | None, typer.Option(help="Folder for the page [default: RECORDING-validation].")] = None,
     strict: _Strict = False,
     jobs: _OwnJobs = None,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -359,22 +357,20 @@ def validate(
 
     Has the device changed, and what error remains? Exit code 0 valid, 2 unusable input, 3 not observable, 4 changed.
     """
-    from alidade.pipelines import parallel, progress
-    from alidade.pipelines.applications.validate import table, write_validation
+    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.validate import validate as run
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import validation_json
+    from alidade.pipelines.reports.validation_report import validation_report, write_validation
 
-    with progress.shown(quiet or as_json), parallel.processes(jobs), progress.doing("validating"):
-        validated = run(session, calibration, method, config, strict)
+    with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
+        with progress.doing("validating"):
+            validated = run(session, calibration, method, config, strict)
         written = write_validation(out or _beside(session, "validation"), validated)
     if as_json:
         print(validation_json(validated))
     else:
-        for line in table(validated):
-            terminal.say(line)
-        for note in validated.notes:
-            terminal.say(f"  note: {note}")
+        terminal.print_report(validation_report(validated))
         terminal.say(f"Plots in {written}")
     raise typer.Exit(exit_codes.OF_VALIDATION[validated.verdict])
 
@@ -414,6 +410,7 @@ def scenarios(
     `simulate`, `plan` and `montecarlo` find them by name.
     """
     from alidade.pipelines import methods
+    from alidade.pipelines.display.table import Column, Table
     from alidade.pipelines.errors import InputError, nearest_three
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import plain_json
@@ -435,7 +432,8 @@ def scenarios(
     if as_json:
         print(plain_json("scenarios", {"scenarios": listed}))
     else:
-        terminal.show_scenarios(listed)
+        rows = tuple((scenario["name"], scenario["summary"]) for scenario in listed)
+        terminal.print_table(Table("", "", ("scenario", Column("what it shows", "prose")), rows))
 
 
 @app.command()
@@ -456,8 +454,9 @@ def plan(
     from alidade.pipelines import progress
     from alidade.pipelines.applications.planning import make_plan, requirements, write_scenario
     from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import plan_json
-    from alidade.pipelines.reports.plan import plan_html
+    from alidade.pipelines.reports.plan_report import plan_report
     from alidade.pipelines.reports.whole import write_file
 
     with progress.shown(quiet or as_json):
@@ -465,11 +464,11 @@ def plan(
     if out is not None:
         write_scenario(out, planned)
     if page is not None:
-        write_file(page, plan_html(planned))
+        write_file(page, render_html(plan_report(planned)))
     if as_json:
         print(plan_json(planned))
     else:
-        terminal.show_plan(planned)
+        terminal.print_report(plan_report(planned))
         if out is not None:
             terminal.say(f"The better motion is in {out}")
         if page is not None:
@@ -496,6 +495,7 @@ def info(
     from alidade.pipelines.config import configured
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import facts_json
 
     with progress.shown(quiet), progress.doing("reading"):
         recording, settings = configured(open_recording(session, strict), config)
@@ -505,9 +505,9 @@ def info(
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
-        print(terminal.facts_json(facts, found, left, columns))
+        print(facts_json(facts, found, left, columns))
     else:
-        terminal.show_facts(session.name, facts, found, left, columns)
+        terminal.print_facts(session.name, facts, found, left, columns)
 
 
 @app.command()
@@ -518,24 +518,25 @@ def noise(
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json only.")] = False,
     strict: _Strict = False,
     auto_columns: _AutoColumns = False,
+    time_limit: _TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Measure sensor noise at rest (Allan deviation).
 
     Gyros, accelerometers, magnetometers; prints the section `noise` of the config.
     """
-    from alidade.pipelines import progress
+    from alidade.pipelines import deadline, progress
     from alidade.pipelines.applications.noise import noise_of
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.noise import noise_json, write_noise
+    from alidade.pipelines.reports.noise_report import noise_json, noise_report, write_noise
 
-    with progress.shown(quiet):
+    with progress.shown(quiet), deadline.within(time_limit):
         study = noise_of(session, strict, config, auto_columns)
     written = () if out is None else write_noise(out, study)
     if as_json:
         print(noise_json(study), end="")
         return
-    terminal.show_noise(study)
+    terminal.print_report(noise_report(study))
     if out is not None:
         terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
 
@@ -565,7 +566,7 @@ def demo(
         calibrations = run(session, ["published", "batch", "incremental"])
         for calibration in progress.track(calibrations, "writing", len(calibrations)):
             write_results(out / calibration.estimate.solver, calibration)
-    terminal.show(calibrations)
+    terminal.print_calibrations(calibrations)
     terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
 
 
@@ -672,7 +673,7 @@ def export(
     """
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.calibration import load_calibration
-    from alidade.pipelines.reports.export import exported
+    from alidade.pipelines.reports.export_formats import exported
     from alidade.pipelines.reports.plain_json import plain_json
     from alidade.pipelines.reports.whole import write_file
 
@@ -732,7 +733,7 @@ def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_
     if as_json:
         terminal.show_json([calibration])
     else:
-        terminal.show([calibration])
+        terminal.print_calibrations([calibration])
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     raise typer.Exit(exit_codes.OF_STATUS[calibration.status])
 
@@ -753,7 +754,8 @@ def main() -> None:
     except BaseException as error:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
-        code = _TROUBLE.get(type(error).__name__)
+        names = (kind.__name__ for kind in type(error).__mro__)
+        code = next((_TROUBLE[name] for name in names if name in _TROUBLE), None)
         if code is None and not isinstance(error, OSError):
             raise
         print(f"alidade: {_of_system(error) if isinstance(error, OSError) else error}", file=sys.stderr)

@@ -37,7 +37,6 @@ from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
     Array,
-    AttitudeRate,
     ChiSquare,
     Estimate,
     Parameter,
@@ -48,10 +47,9 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts
-from alidade.pipelines.recording.opening import Where
-from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.reports.over_time import recordings_shown
-from alidade.pipelines.reports.result import Calibration, PartParameter, PartResult
+from alidade.pipelines.reports.joint_report import recording_blocks
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import PartParameter, PartResult
 from alidade.pipelines.solvers.joint import Joined, grown, join, tell
 
 # The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
@@ -155,30 +153,6 @@ def _no_steps(_: int) -> Iterator[Step]:
     return iter(())
 
 
-def calibrate_device(
-    recordings: Sequence[Where],
-    method_name: str | None = None,
-    config_file: Path | None = None,
-    strict: bool = False,
-    auto_topics: bool = False,
-    prior: Path | None = None,
-    written: Callable[[Calibration], None] = lambda _: None,
-    attitude_rate: AttitudeRate = "vision",
-) -> Calibration:
-    """The joint calibration of several recordings of one device (arguments as `session.calibrate` has them).
-
-    Raises:
-        InputError: a recording cannot be used, or they are of different methods.
-        IndeterminateError: states other than the parameters are not determined.
-    """
-
-    def read(where: Where) -> Session:
-        session = Session.read(open_recording(where, strict), method_name, config_file, auto_topics, prior)
-        return replace(session, attitude_rate=attitude_rate)
-
-    return calibrate_together([partial(read, where) for where in recordings], written)
-
-
 def calibrate_together(
     sessions: Sequence[Callable[[], Session]], written: Callable[[Calibration], None] = lambda _: None
 ) -> Calibration:
@@ -195,8 +169,7 @@ def calibrate_together(
     with TemporaryDirectory(prefix="alidade-") as folder:
         alone: list[Alone] = []
         for i, read in enumerate(sessions):
-            with progress.doing("reading"):
-                session = read()
+            session = read()
             if alone:
                 session = replace(session, near=alone[0].values)
             calibration = session.calibrated_beside(partial(_with_those_before, session, alone))
@@ -363,7 +336,7 @@ def _calibration(
         config=alone[last].calibration.config,
         recordings=parts,
         changes=changed,
-        plots=recordings_shown,
+        plots=recording_blocks,
     )
 
 

@@ -1,4 +1,4 @@
-"""From a recording to the noise of its gyros, accelerometers and magnetometers: all that the time at rest tells."""
+"""Noise of the gyros, accelerometers and magnetometers of a recording, from its static intervals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines import methods, progress
+from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.noise_spectrum import AxisNoise, axis_noise
@@ -42,7 +42,7 @@ class SensorNoise:
         kind: gyro, accel or mag.
         unit: of its samples, SI.
         rate_hz: of its samples.
-        rests: (P, 2) s from the recording's start, the stretches at rest that were used.
+        rests: (P, 2) s from the recording's start, the static intervals that were used.
         samples: how many; filled: how many of them stand for lost ones.
         axes: x, y, z -> its noise; an axis that never changes is left out.
     """
@@ -58,7 +58,7 @@ class SensorNoise:
 
     @property
     def length_s(self) -> float:
-        """Time at rest, all stretches together."""
+        """Time at rest, all intervals together."""
         return self.samples / self.rate_hz
 
 
@@ -113,11 +113,14 @@ def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_
     found: list[SensorNoise] = []
     troubles: list[str] = []
     notes: list[str] = []
-    for name in progress.track(names, "noise", len(names)):
-        try:
-            found += _topic_noise(recording, name, notes)
-        except InputError as error:
-            troubles.append(str(error))
+    with deadline.usual(recording.duration_s):
+        some = deadline.until_passed(names, "the noise of {} and of what follows it".format, 1)
+        for name in progress.track(some, "noise", len(names)):
+            try:
+                found += _topic_noise(recording, name, notes)
+            except InputError as error:
+                troubles.append(str(error))
+        notes += filter(None, [deadline.stopped()])
     if not found:
         raise InputError(
             "; ".join([*troubles, *notes]) or f"{path}: {', '.join(names)}: no sensor, all values are zero or NaN"
@@ -151,11 +154,11 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
         )
     for kind, values in samples.items():
         part = f"{name} {kind}"
-        # At rest a coarse sensor may read one value, which is told below.
+        # At rest a coarse sensor may read one value, which is noted below.
         sound = drop_faults(part, t, values, dropped, _UNITS[kind], may_stand=True)
         pieces, interval, filled = _pieces(t[sound], values[sound], rests)
         if not pieces:
-            raise InputError(f"topic {part}: too many samples are missing in the {len(rests)} stretches at rest")
+            raise InputError(f"topic {part}: too many samples are missing in the {len(rests)} static intervals")
         axes = {}
         for axis, letter in enumerate("xyz"):
             columns = [piece[:, axis] for piece in pieces]
@@ -202,7 +205,7 @@ def _device(recording: Recording, name: str) -> _Device:
 
 
 def _pieces(t: Array, values: Array, rests: Array) -> tuple[list[Array], float, int]:
-    """Evenly spaced pieces (n, 3) of the stretches at rest, their interval, s, and the number of samples filled in."""
+    """Evenly sampled pieces (n, 3) of static intervals, time between samples, s, and number of samples filled in."""
     pieces, lengths, intervals, filled = [], [], [], 0
     for start, end in rests:
         inside = slice(*np.searchsorted(t, [start, end + 1e-9]))

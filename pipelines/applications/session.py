@@ -70,11 +70,13 @@ SOLVERS = ("batch", "incremental", "published")
 # Steps that a run takes whatever time it has: of fewer there may be no solution at all.
 _LEAST_STEPS = 20
 # What ends for want of time, in this order.
-_HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY = (
+_HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY, _HALVES, _HELD_OUT = (
     "the test of hypotheses",
     "the solution of both sides of a change",
     "the comparison with batch",
     "the sensitivity to fixed inputs",
+    "the split-half test",
+    "the prediction of held-out measurements",
 )
 # What an online run ends with where noise levels maximise the marginal likelihood.
 _CONCLUDED = "at the end all measurements were solved together, at the noise levels of their marginal likelihood"
@@ -183,6 +185,7 @@ class Session:
         engine: that eliminates batch's linear systems.
         near: numbers that rotations are reported near of, as another recording of the device has them.
         attitude_rate: of the trajectory that is reported.
+        read_s: wall time of reading, s; None: nothing was read.
     """
 
     method: Method
@@ -192,6 +195,7 @@ class Session:
     engine: EngineName = "auto"
     near: Mapping[str, float] = field(default_factory=dict)
     attitude_rate: AttitudeRate = "vision"
+    read_s: float | None = None
 
     @classmethod
     def read(
@@ -203,7 +207,7 @@ class Session:
         prior: Path | None = None,
         auto_columns: bool = False,
     ) -> Session:
-        """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
+        """Read and check a recording (arguments and exceptions as `OpenOptions` has them)."""
         recording, config = configured(recording, config_file)
         if auto_columns:
             recording, config = with_columns(recording, config)
@@ -265,9 +269,9 @@ class Session:
     ) -> Calibration:
         """The calibration by one of SOLVERS; `window` in s is the incremental one's, None keeps the whole history.
 
-        With `check` the incremental one is held against batch. Without `report` there are values, sigmas and verdicts,
+        With `check` the incremental one is compared with batch. Without `report` there are values, sigmas and verdicts,
         the same to the last digit, and nothing of what else a report explains: where the variances come from, which
-        measurements move a number most, what inputs taken for exact would do to it, the method's own findings.
+        measurements move a number most, the effect of fixed inputs on it, the method's own findings.
 
         Raises:
             InputError: no such solver, no such window, or the data cannot be used.
@@ -280,11 +284,10 @@ class Session:
         self,
         solvers: Sequence[str],
         window: float | None = 1.0,
-        seconds: Mapping[str, float] | None = None,
         check: bool = False,
         report: bool = True,
     ) -> list[Calibration]:
-        """One calibration a solver; `seconds` is what came before (phase -> s). For the rest see `calibrate`."""
+        """One calibration a solver; for the rest see `calibrate`."""
         if isinstance(solvers, str):
             raise InputError(f"solvers: a list of names is needed, not the text {solvers!r}")
         for solver in solvers:
@@ -293,7 +296,7 @@ class Session:
         check_window(window)
         solved = (self._solve(solver, window, report=report) for solver in solvers)
         with self.usual_time("incremental" in solvers):
-            return self.judged(solved, seconds or {}, check, report)
+            return self.judged(solved, {} if self.read_s is None else {"read": self.read_s}, check, report)
 
     def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
         """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
@@ -389,10 +392,16 @@ class Session:
         """What can be wrong with the data."""
         return self.method.hypotheses()
 
-    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float]]:
-        """The parameters of either half of the recording, and held-out measurements' residuals by family."""
-        halves = split_halves(self.method.graph, self.faults, self.data, self.config)
-        return halves, held_out_residuals(self.problem())
+    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float], str]:
+        """Parameters of either half of the recording, held-out residuals by family, and what the time limit stopped."""
+        with self.usual_time():
+            halves, predicted = {}, {}
+            if not deadline.passed(_HALVES):
+                halves = split_halves(self.method.graph, self.faults, self.data, self.config)
+                deadline.passed(_HALVES)
+            if not deadline.passed(_HELD_OUT):
+                predicted = held_out_residuals(self.problem())
+            return halves, predicted, deadline.stopped()
 
     def _findings(
         self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None
@@ -497,7 +506,7 @@ class Session:
             return estimate, problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
-        """Each input that the graph takes for exact, and the graph with that input off by its step."""
+        """Each fixed input of the graph, and the graph with that input off by its step."""
         for exact in self.method.hypotheses().exact:
             if deadline.passed(_SENSITIVITY):
                 return
@@ -518,48 +527,50 @@ class Session:
             return None
 
 
-def calibrate(
-    path: Where,
-    solvers: Sequence[str],
-    method_name: str | None = None,
-    config_file: Path | None = None,
-    window: float | None = 1.0,
-    strict: bool = False,
-    auto_topics: bool = False,
-    check: bool = False,
-    prior: Path | None = None,
-    report: bool = True,
-    engine: EngineName = "auto",
-    auto_columns: bool = False,
-    attitude_rate: AttitudeRate = "vision",
-) -> list[Calibration]:
-    """One calibration a solver, from one reading of the recording.
+@dataclass(frozen=True)
+class OpenOptions:
+    """How a recording is read.
 
-    Args:
-        path: the recording: a file, a folder of parts, a pattern, or a list of parts.
-        solvers: of SOLVERS.
-        method_name: overrides the config's.
-        config_file: overrides the recording's own config key by key.
-        window: s, of the incremental solver; None keeps the whole history.
+    Attributes:
+        method: its name; None: the config's, or the only one that the recording can serve.
+        config: overrides the recording's own config key by key; a YAML file or a Config.
         strict: refuse a recording of which anything is lost.
-        auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
-        auto_columns: take what `alidade info` concludes of the columns of tables where the config describes none.
-        check: hold an incremental calibration against batch.
-        prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
-        report: with what only a report tells, see `Session.calibrate`.
-        engine: that eliminates batch's linear systems: "chain", "gtsam", or "auto".
-        attitude_rate: of the trajectory that is reported: "vision", or "gyro" for one at each sample of the gyro.
-
-    Raises:
-        InputError: recording or config cannot be used, or there is no such solver.
-        IndeterminateError: states other than the parameters are not determined.
+        auto_topics: use the topics that `alidade info` proposes where those of the method are absent.
+        auto_columns: use the columns of tables that `alidade info` proposes where the config describes none.
+        prior: an earlier calibration of the device, result.json or calibration.yaml.
     """
-    start = time.perf_counter()
-    with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
-    seconds = {"read": time.perf_counter() - start}
-    session = replace(session, engine=engine, attitude_rate=attitude_rate)
-    return session.calibrations(solvers, window, seconds, check, report)
+
+    method: str | None = None
+    config: Path | Config | None = None
+    strict: bool = False
+    auto_topics: bool = False
+    auto_columns: bool = False
+    prior: Path | None = None
+
+    def read(self, path: Where) -> Session:
+        """Read a recording: a file, a folder of parts, a pattern, or a list of parts.
+
+        Raises:
+            InputError: recording, config or prior cannot be used.
+        """
+        start = time.perf_counter()
+        with progress.doing("reading"):
+            session = Session.read(
+                open_recording(path, self.strict),
+                self.method,
+                self.config,
+                self.auto_topics,
+                self.prior,
+                self.auto_columns,
+            )
+        return replace(session, read_s=time.perf_counter() - start)
+
+
+def calibrate(
+    path: Where, solvers: Sequence[str], method: str | None = None, config: Path | Config | None = None
+) -> list[Calibration]:
+    """One calibration a solver, from one reading of a recording (exceptions as of `Session.calibrate`)."""
+    return OpenOptions(method, config).read(path).calibrations(solvers)
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:

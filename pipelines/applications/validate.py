@@ -6,26 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from alidade.pipelines import progress
+from alidade.pipelines import deadline, progress
 from alidade.pipelines.applications.session import Recorded, Session, resolve_method
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.config import configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
-from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Change, Verdict, check_calibration
-from alidade.pipelines.display.units import human_unit, to_digits_of
+from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
+from alidade.pipelines.display.units import format_estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration
 from alidade.pipelines.reports.known import Known, load_known, saved_of, with_covariance
-from alidade.pipelines.reports.validation import validation_html, validation_rows
-from alidade.pipelines.reports.whole import write_page
-
-FILE = "validation.html"
 
 
 @dataclass(frozen=True, eq=False)
 class Validated:
-    """A calibration held against a recording.
+    """A calibration tested on a recording.
 
     Attributes:
         calibration: the one validated.
@@ -64,7 +60,11 @@ class Validated:
         steps = self.held.steps
         if self.verdict == "holds":
             return f"The calibration holds: none of {len(steps)} parameters differs by more than chance."
-        found = [_stepped(step, self.held) for step in steps if step in self.held.changes.found]
+        found = [
+            f"{step.name} changed by {format_estimate(self.held.quantities[step.name], step.size, step.sigma)}"
+            for step in steps
+            if step in self.held.changes.found
+        ]
         what = "; ".join(found) or "all parameters together, none by more than chance for itself"
         small = "" if self.held.matters or not found else " That is less than what is required of them."
         return f"The calibration does not hold: {what}.{small}"
@@ -110,13 +110,16 @@ def validate(
     validations = chosen.validate(data, config, values)
     if known.sha256 == recording.sha256():
         return Validated(calibration, path.name, validations, True, recording.notes)
-    held, own = _held(Session(chosen, data, config, Recorded(recording)), with_covariance(known, calibration_file))
+    session = Session(chosen, data, config, Recorded(recording))
+    with session.usual_time():
+        held, own = _held(session, with_covariance(known, calibration_file))
+        lost = (*recording.notes, *filter(None, [deadline.stopped()]))
     if held is None:
-        return Validated(calibration, path.name, validations, False, recording.notes)
+        return Validated(calibration, path.name, validations, False, lost)
     of_device = walks(chosen, config, [name for name in own if name in calibration.parameters])
     mixed = {**own, **{name: value for name, value in values.items() if name in of_device}}
     device, best = (chosen.validate(data, config, each) for each in (mixed, own))
-    return Validated(calibration, path.name, validations, False, recording.notes, held, device, best)
+    return Validated(calibration, path.name, validations, False, lost, held, device, best)
 
 
 def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict[str, float]]:
@@ -136,60 +139,7 @@ def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict
         return None, {}
     own = problem.numbers(estimate)
     if not estimate.converged or estimate.told is None:
+        deadline.passed("the solution of this recording")
         return None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
     return check_calibration(belief, estimate.told, problem.quantities, inflations), own
-
-
-def _stepped(step: Change, held: CalibrationCheck) -> str:
-    """A parameter that changed, in the unit people read."""
-    unit, factor = human_unit(held.quantities[step.name])
-    size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
-    return f"{step.name} changed by {size} ± {sigma} {unit}".strip()
-
-
-def parameter_rows(validated: Validated) -> list[tuple[str, str, str, str, str]]:
-    """For each parameter that is compared: name, change, its sigma, from what on it would be noticed, unit."""
-    if validated.held is None:
-        return []
-    held, rows = validated.held, []
-    for step in held.steps:
-        unit, factor = human_unit(held.quantities[step.name])
-        numbers = (step.size, step.sigma, held.changes.limit * step.sigma)
-        size, sigma, least = (to_digits_of(factor * x, factor * step.sigma) for x in numbers)
-        rows.append((step.name, size, sigma, least, unit))
-    return rows
-
-
-def table(validated: Validated) -> list[str]:
-    """Lines of text: for each error RMS and peak before and after, then what each parameter changed by."""
-    rows = validation_rows(validated.validations, validated.device, validated.best)
-    width = max(len(row[0]) for row in rows)
-    lines = [
-        f"{'':{width}}  {'RMS':>9} {'':>9} {'':>9} {'':>9}  {'peak':>9}",
-        f"{'error':{width}}  {'before':>9} {'after':>9} {'device':>9} {'expected':>9}  {'before':>9} {'after':>9}",
-        *(
-            f"{row[0]:{width}}  {' '.join(f'{x:>9}' for x in row[1:5])}  {row[5]:>9} {row[6]:>9}  {row[7]}"
-            for row in rows
-        ),
-    ]
-    compared = parameter_rows(validated)
-    if compared:
-        width = max(len(row[0]) for row in compared)
-        lines.append(f"{'parameter':{width}}  {'change':>9} {'sigma':>9} {'noticed':>9}")
-        lines += [f"{name:{width}}  {a:>9} {b:>9} {c:>9}  {unit}" for name, a, b, c, unit in compared]
-    return [*lines, validated.sentence]
-
-
-def write_validation(out_dir: Path, validated: Validated) -> Path:
-    """Write validation.html; returns its path. Raises InputError when it cannot be written."""
-    page = validation_html(
-        validation_rows(validated.validations, validated.device, validated.best),
-        validated.validations,
-        validated.calibration,
-        validated.recording,
-        validated.verdict,
-        validated.sentence,
-        parameter_rows(validated),
-    )
-    return write_page(out_dir, FILE, page)

@@ -47,6 +47,8 @@ Shape = Literal["circle", "ring", "x"]
 Scale = Literal["linear", "log", "datetime"]
 
 _MOST_POINTS = 3000
+# Figures higher than this, px, are as broad as the page.
+_BROAD_PX = 380
 
 
 @dataclass
@@ -54,9 +56,9 @@ class Mark:
     """What is drawn in one colour.
 
     Attributes:
-        kind: points, line, band, boxes, segments, levels, moments, zone, text, heat or patches.
+        kind: points, line, band, boxes, segments, levels, moments, text, heat or patches.
         columns: its numbers, each (n,): x, y; for a band x, low, high; for boxes left, right, low, high; for segments
-            x, y, x1, y1; for levels y; for moments x; for a zone low, high; for heat x, y, value; for patches x, y, one
+            x, y, x1, y1; for levels y; for moments x; for heat x, y, value; for patches x, y, one
             after the other with a nan between, and value.
         color: from PALETTE.
         name: in the legend, and where it is pointed at; marks of one name are shown and hidden together.
@@ -193,10 +195,6 @@ class Figure:
         """Lines upwards at places (n,)."""
         self._add("moments", {"x": x}, slice(None), color, name, False, dash=dash)
 
-    def zone(self, low: float, high: float, color: str, name: str = "") -> None:
-        """All that lies between two heights."""
-        self._add("zone", {"low": low, "high": high}, slice(None), color, name, False, alpha=0.12)
-
     def words(self, x: ArrayLike, y: ArrayLike, texts: Sequence[str]) -> None:
         """Words at places (n,)."""
         self._add("text", {"x": x, "y": y}, slice(None), "ink", "", False, texts=texts)
@@ -228,6 +226,41 @@ class Figure:
     ) -> None:
         numbers = {key: np.atleast_1d(np.asarray(each, dtype=float))[some] for key, each in columns.items()}
         self.marks.append(Mark(kind, numbers, color, name, bool(name) and shown, **look))
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """A figure with its title and caption.
+
+    Attributes:
+        title: in a few words.
+        caption: what is seen, with units.
+        figure: the first figure.
+        beside: figures that belong to it, beside it or below.
+    """
+
+    title: str
+    caption: str
+    figure: Figure
+    beside: tuple[Figure, ...] = ()
+
+    @property
+    def figures(self) -> tuple[Figure, ...]:
+        """All figures, from left to right."""
+        return (self.figure, *self.beside)
+
+    @property
+    def legend(self) -> tuple[Mark, ...]:
+        """The first mark of each name that the legend has."""
+        marks: dict[str, Mark] = {}
+        for mark in (mark for figure in self.figures for mark in figure.marks if mark.shown):
+            marks.setdefault(mark.name, mark)
+        return tuple(marks.values())
+
+    @property
+    def broad(self) -> bool:
+        """Whether it takes the whole width of a page."""
+        return bool(self.beside) or self.figure.height > _BROAD_PX
 
 
 def thin(count: int) -> slice:

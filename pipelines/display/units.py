@@ -87,6 +87,13 @@ def rounded(value: float, digits: int = 2) -> str:
     return f"{round(value, decimals):.{max(decimals, 0)}f}"
 
 
+def format_estimate(quantity: Quantity, value: float, sigma: float) -> str:
+    """Value and sigma, SI, in the unit people read: "1.234 ± 0.056 deg"."""
+    unit, factor = human_unit(quantity)
+    number, spread = (to_digits_of(factor * each, factor * sigma) for each in (value, sigma))
+    return f"{number} ± {spread} {unit}".strip()
+
+
 # What rounding leaves of a fixed parameter, in any unit people read.
 _NOTHING = 1e-9
 

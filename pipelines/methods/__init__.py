@@ -9,6 +9,7 @@ distributions bring theirs as entry points of the group `alidade.methods`, name 
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
@@ -25,16 +26,19 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.display.figure import Plot
+    from alidade.pipelines.display.table import Table
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.calibration import SavedCalibration
-    from alidade.pipelines.reports.result import Calibration, Plot, Table
+    from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config, MethodSection
     from alidade.pipelines.simulation.simulated import Simulated
 
 GROUP = "alidade.methods"
+_log = logging.getLogger("alidade")
 
 # A motion as a simulator's settings, plain values by key.
 Scenario = dict[str, Any]
@@ -210,8 +214,18 @@ _BUILT_IN = ("los", "indexer", "head", "cube", "tumble")
 
 
 def names() -> tuple[str, ...]:
-    """All methods: the toolkit's own, then those that other distributions bring."""
-    return (*_BUILT_IN, *_brought())
+    """The toolkit's methods, then those of other distributions that can be loaded; the others are logged once."""
+    return (*_BUILT_IN, *(name for name in _brought() if _is_sound(name)))
+
+
+@cache
+def _is_sound(name: str) -> bool:
+    try:
+        method(name)
+    except InputError as error:
+        _log.warning("%s", error)
+        return False
+    return True
 
 
 @cache
@@ -248,10 +262,7 @@ def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool
 
 
 def scenarios() -> dict[str, dict[str, Path]]:
-    """Method -> name -> file of the scenarios that are found by name; the name begins with the method's.
-
-    Raises InputError when a method's distribution is broken.
-    """
+    """Method -> name -> file of the scenarios that are found by name; the name begins with the method's."""
     from alidade.pipelines.simulation.scenario import shipped
 
     return {

@@ -10,7 +10,7 @@ from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.solvers.joint import RECORDING, WALK
 
 _PRIOR = "prior of "
-# Smaller shares are told together, and so are those after so many.
+# Smaller shares are summed, and so are those after so many.
 _LEAST, _MOST = 0.02, 4
 REST = "everything else"
 

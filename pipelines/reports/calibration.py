@@ -23,6 +23,7 @@ from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import invalid
 from alidade.pipelines.settings import Config
 
 _HEAD = """\
@@ -123,9 +124,9 @@ class SavedCalibration(_Record):
         """
         from alidade.pipelines.methods import method
 
-        told = "\n".join(self.formulas)
+        text = "\n".join(self.formulas)
         # A formula names a parameter, or the vector that it is a component of.
-        applied = [name for name in self.parameters if re.search(rf"\b({name}|{name[:-2]})\b", told)]
+        applied = [name for name in self.parameters if re.search(rf"\b({name}|{name[:-2]})\b", text)]
         formulas = method(self.method).formulas(applied, self._config)
         if [formula.text for formula in formulas] != self.formulas:
             raise InputError("apply: the formulas in the calibration are not those of its parameters and this config")
@@ -193,9 +194,7 @@ def load_calibration(path: Path, config: Config | None = None) -> SavedCalibrati
     except InputError as error:
         raise InputError(f"{error}; a calibration.yaml as `alidade calibrate` writes it is needed") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the whole"
-        raise InputError(f"{path}: not a calibration.yaml: {where}: {first['msg']}") from error
+        raise invalid(path, "a calibration.yaml", error) from error
 
 
 def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:

@@ -10,25 +10,27 @@ import datetime
 import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from alidade.factors.chi_square import student
+from alidade.pipelines.display.table import Cell, Column, Table
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.meanings import meaning
-from alidade.pipelines.reports.answer import Answer, Tone
+from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.known import load_known
-from alidade.pipelines.reports.templating import environment
+from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
+from alidade.pipelines.reports.result_json import Result, read_result
 from alidade.pipelines.reports.whole import write_whole
 from alidade.pipelines.solvers.joint import RECORDING
 
@@ -37,7 +39,7 @@ FILES = ("certificate.html", "certificate.pdf", "certificate.json")
 _MANY = 1e4
 
 Conformity = Literal["conforms", "does not conform", "no statement"]
-Text = Annotated[str, BeforeValidator(lambda value: value.isoformat() if isinstance(value, datetime.date) else value)]
+_Text = Annotated[str, BeforeValidator(lambda value: value.isoformat() if isinstance(value, datetime.date) else value)]
 
 
 class _Fields(BaseModel):
@@ -45,7 +47,7 @@ class _Fields(BaseModel):
 
 
 class Limits(_Fields):
-    """What a parameter is held against, SI."""
+    """Limits that a parameter is compared with, SI."""
 
     nominal: float = 0.0
     tolerance: Annotated[float, Field(gt=0.0)]
@@ -54,22 +56,22 @@ class Limits(_Fields):
 class Fields(_Fields):
     """What only people know; None where it is not stated."""
 
-    number: Text | None = None
-    laboratory: Text | None = None
-    customer: Text | None = None
-    item: Text | None = None
-    manufacturer: Text | None = None
-    type: Text | None = None
-    serial: Text | None = None
-    place: Text | None = None
-    received: Text | None = None
-    issued: Text | None = None
-    procedure: Text | None = None
-    environment: Text | None = None
-    traceability: Text | None = None
-    adjustment: Text | None = None
-    signatory: Text | None = None
-    remarks: Text | None = None
+    number: _Text | None = None
+    laboratory: _Text | None = None
+    customer: _Text | None = None
+    item: _Text | None = None
+    manufacturer: _Text | None = None
+    type: _Text | None = None
+    serial: _Text | None = None
+    place: _Text | None = None
+    received: _Text | None = None
+    issued: _Text | None = None
+    procedure: _Text | None = None
+    environment: _Text | None = None
+    traceability: _Text | None = None
+    adjustment: _Text | None = None
+    signatory: _Text | None = None
+    remarks: _Text | None = None
     coverage_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.9545
     limits: dict[str, Limits] = {}
 
@@ -101,53 +103,20 @@ class Row:
     budget: Mapping[str, float]
 
 
-class _Read(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True)
-
-
-class _Parameter(_Read):
-    name: str
-    value: float
-    sigma: float
-    unit: str
-    require: float | None
-    group: str | None = None
-
-
-class _Noise(_Read):
-    name: str
-    estimated: float | None
-
-
-class _Fit(_Read):
-    dof: float | None
-
-
-class _ChiSquare(_Fit):
-    families: dict[str, _Fit]
-
-
-class _Session(_Read):
-    recording: str = ""
+class _Recording(NamedTuple):
+    recording: str
     sha256: str
     start: str
     duration_s: float
-    dof: float | None = None
+    dof: float | None
 
 
-class _Result(_Read):
-    schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")]
-    method: str
-    solver: str
-    status: str
-    headline: str
-    parameters: list[_Parameter]
-    chi_square: _ChiSquare
-    noise: list[_Noise]
-    session: _Session
-    software: dict[str, str]
-    budget: dict[str, dict[str, float]] | None
-    recordings: list[_Session] = []
+def _recordings(result: Result) -> list[_Recording]:
+    """The recordings that the result is from; the name of a single one is not in it."""
+    one = result.session
+    if not result.recordings:
+        return [_Recording("", one.sha256, one.start, one.duration_s, None)]
+    return [_Recording(r.recording, r.sha256, r.start, r.duration_s, r.dof) for r in result.recordings]
 
 
 def write_certificate(
@@ -175,7 +144,7 @@ def write_certificate(
     missing = [name for name, value in stated.model_dump(exclude={"remarks", "limits"}).items() if value is None]
     content = _content(result, stated, rows, missing)
 
-    page = _html(result, stated, rows, before)
+    page = render_html(certificate_report(result, stated, rows, missing, before))
     printed = _printed(page) if pdf else None
 
     def make(folder: Path) -> None:
@@ -187,13 +156,9 @@ def write_certificate(
     return write_whole(out or path.parent, FILES, make), missing
 
 
-def _read_result(path: Path) -> _Result:
-    data = read_bytes(path, MAX_RESULT_BYTES)
-    try:
-        result = _Result.model_validate_json(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"{path}: not a result.json: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+def _read_result(path: Path) -> Result:
+    """A result that can be certified. Raises InputError."""
+    result = read_result(path)
     if result.status in ("inconsistent", "unobservable"):
         raise InputError(f"{path}: is {result.status}, there is nothing to certify: {result.headline}")
     return result
@@ -218,7 +183,7 @@ def _earlier(path: Path, method: str) -> dict[str, float]:
     return dict(zip(known.belief.names, known.belief.mean.tolist(), strict=True))
 
 
-def _rows(result: _Result, stated: Fields, earlier: Mapping[str, float]) -> list[Row]:
+def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[Row]:
     rows = []
     for p in result.parameters:
         if p.group is not None or p.require is None or p.sigma == 0.0:
@@ -234,12 +199,12 @@ def _rows(result: _Result, stated: Fields, earlier: Mapping[str, float]) -> list
     return rows
 
 
-def _effective(result: _Result, shares: Mapping[str, float]) -> float | None:
-    """Welch and Satterthwaite: what a family of measurements adds is known as well as its residuals tell its noise.
+def _effective(result: Result, shares: Mapping[str, float]) -> float | None:
+    """Welch and Satterthwaite: the share of a family of measurements has the degrees of freedom of its residuals.
 
     Noise that was stated and not asked of the recording, and priors, count as known.
     """
-    freedoms: dict[str, float | None] = {f"{RECORDING}{part.recording}": part.dof for part in result.recordings}
+    freedoms: dict[str, float | None] = {f"{RECORDING}{part.recording}": part.dof for part in result.recordings or ()}
     if any(noise.estimated is not None for noise in result.noise):
         freedoms |= {name: fit.dof for name, fit in result.chi_square.families.items()}
     doubt = 0.0
@@ -258,7 +223,7 @@ def _conformity(value: float, expanded: float, limits: Limits) -> Conformity:
     return "does not conform" if off - expanded > limits.tolerance else "no statement"
 
 
-def _content(result: _Result, stated: Fields, rows: Sequence[Row], missing: Sequence[str]) -> dict[str, Any]:
+def _content(result: Result, stated: Fields, rows: Sequence[Row], missing: Sequence[str]) -> dict[str, Any]:
     return {
         "schema": "alidade.certificate/1",
         "fields": stated.model_dump(),
@@ -266,52 +231,143 @@ def _content(result: _Result, stated: Fields, rows: Sequence[Row], missing: Sequ
         "method": result.method,
         "solver": result.solver,
         "status": result.status,
-        "recordings": [each.model_dump() for each in result.recordings or [result.session]],
+        "recordings": [each._asdict() for each in _recordings(result)],
         "software": result.software,
         "results": [asdict(row) for row in rows],
     }
 
 
-def _html(result: _Result, stated: Fields, rows: Sequence[Row], before: Path | None) -> str:
-    quantities = {p.name: Quantity(p.name, p.unit, None, 1.0, p.require or math.inf) for p in result.parameters}
-    said = {name: "not stated" if value is None else value for name, value in stated.model_dump().items()}
-    return (
-        environment("alidade.pipelines.reports")
-        .get_template("certificate.html")
-        .render(
-            f=said,
-            result=result,
-            rows=[_readable(row, quantities[row.name], stated) for row in rows],
-            meanings=_meanings(result.method, [row.name for row in rows]),
-            budgets=[(row.name, [(s, 100.0 * x) for s, x in row.budget.items() if x >= 5e-4]) for row in rows],
-            probability=f"{100.0 * stated.coverage_probability:.4g}",
-            before=None if before is None else before.name,
-            limited=any(row.conformity for row in rows),
-            answer=_answer(result, rows, [name for name, value in said.items() if value == "not stated"]),
-        )
+def certificate_report(
+    result: Result, stated: Fields, rows: Sequence[Row], missing: Sequence[str], before: Path | None
+) -> Report:
+    """The certificate as a report."""
+    text = {name: "not stated" if value is None else str(value) for name, value in stated.model_dump().items()}
+    readable = [_readable(row, result) for row in rows]
+    shares = ((row.name, [f"{each} {100.0 * x:.1f} %" for each, x in row.budget.items() if x >= 5e-4]) for row in rows)
+    budgets = tuple(f"{name}: {', '.join(sources)}" for name, sources in shares)
+    adjustment = Text(f"Adjustment: {text['adjustment']}", soft=False)
+    return Report(
+        title=f"Calibration certificate {text['number']}",
+        heading="Calibration certificate",
+        about="",
+        summary=_summary(result, rows, missing),
+        sections=(
+            Section("Item and calibration", (Pairs(_identity(result, text)),)),
+            Section("Results", (_result_table(rows, readable, result, stated),)),
+            Section("Conformity", _conformity_table(rows, readable, stated)),
+            Section("As found, as left", (*_found_table(rows, readable, before), adjustment)),
+            Section("Uncertainty budget", (Bullets(budgets), Text("Shares of the variance of each parameter."))),
+            Section("Remarks", (Text(text["remarks"], False), Text(_RESERVATION), Signature(text["signatory"]))),
+        ),
+        style="certificate",
     )
 
 
-def _meanings(name: str, parameters: Sequence[str]) -> dict[str, str]:
-    """What the parameters are; of a method that is not installed here, nothing."""
-    with suppress(InputError):
-        made_by = method(name)
-        return {parameter: meaning(made_by, parameter) for parameter in parameters}
-    return {}
+_UNIT = Column("unit", "text")
+_Readable = tuple[str, Callable[[float], str]]
+_RESERVATION = (
+    "The results relate only to the item calibrated, as it was then. This certificate may be reproduced only in full, "
+    "unless the laboratory has approved of it in writing."
+)
 
 
-def _answer(result: _Result, rows: Sequence[Row], missing: Sequence[str]) -> Answer:
-    """Whether the item is within its limits, or, where it has none, what the calibration is worth."""
+def _identity(result: Result, text: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
+    """What was calibrated, by whom, when and from which recordings."""
+    recordings = _recordings(result)
+    first = "recordings" if len(recordings) > 1 else "recording"
+    return (
+        *((name, text[name]) for name in ("number", "laboratory", "customer", "item")),
+        ("manufacturer, type", f"{text['manufacturer']}, {text['type']}"),
+        ("serial number", text["serial"]),
+        ("received", text["received"]),
+        ("calibrated", f"{_minute(result.session.start)} UTC"),
+        *((name, text[name]) for name in ("issued", "place", "environment", "procedure")),
+        ("evaluation", f"method {result.method}, {result.solver} solver, alidade {result.software.get('alidade')}"),
+        *(
+            (
+                "" if i else first,
+                f"{part.recording}{', ' if part.recording else ''}{_minute(part.start)} UTC, {part.duration_s:.1f} s, "
+                f"SHA-256 {part.sha256}",
+            )
+            for i, part in enumerate(recordings)
+        ),
+        ("traceability", text["traceability"]),
+    )
+
+
+def _minute(date: str) -> str:
+    return date[:16].replace("T", " ")
+
+
+def _result_table(rows: Sequence[Row], readable: Sequence[_Readable], result: Result, stated: Fields) -> Table:
+    columns = ("parameter", "value", "U", _UNIT, "k", "eff. d.o.f.")
+    cells = tuple(
+        (
+            *(Cell(row.name, _meaning(result, row.name)), shown(row.value), shown(row.expanded), unit),
+            *(f"{row.coverage:.2f}", "∞" if row.degrees is None else f"{row.degrees:.0f}"),
+        )
+        for row, (unit, shown) in zip(rows, readable, strict=True)
+    )
+    caption = (
+        "U is the expanded uncertainty: the standard uncertainty multiplied by the coverage factor k, which for "
+        "Student's t with the effective degrees of freedom corresponds to a coverage probability of about "
+        f"{100.0 * stated.coverage_probability:.4g} %. The status of the calibration is {result.status}."
+    )
+    return Table("", caption, columns, cells, "results", "", None)
+
+
+def _conformity_table(rows: Sequence[Row], readable: Sequence[_Readable], stated: Fields) -> tuple[Block, ...]:
+    columns = ("parameter", "limits", _UNIT, Column("statement", "text"))
+    cells = tuple(
+        (row.name, f"{shown(limits.nominal)} ± {shown(limits.tolerance)}", unit, row.conformity)
+        for row, (unit, shown) in zip(rows, readable, strict=True)
+        if row.conformity and (limits := stated.limits[row.name])
+    )
+    rule = (
+        "Decision rule: guard band of U on either side of each limit. It conforms where the value with U lies within "
+        "the limits, it does not where the value with U lies outside them, and in between there is no statement."
+    )
+    return (Table("", rule, columns, cells, "conformity", "", None),) if cells else ()
+
+
+def _found_table(rows: Sequence[Row], readable: Sequence[_Readable], before: Path | None) -> tuple[Block, ...]:
+    if before is None:
+        return ()
+    columns = ("parameter", "earlier", "as found", "change", _UNIT)
+    cells = tuple(
+        (row.name, shown(row.before), shown(row.value), shown(row.value - row.before), unit)
+        for row, (unit, shown) in zip(rows, readable, strict=True)
+        if row.before is not None
+    )
+    return (Table("", f"Earlier values are those of {before.name}.", columns, cells, "found", "", None),)
+
+
+def _summary(result: Result, rows: Sequence[Row], missing: Sequence[str]) -> Summary:
+    """Whether the item is within its limits, or, where none are stated, the status of the calibration."""
     steps = (f"Still to be stated, in the file given with `--fields`: {', '.join(missing)}.",) if missing else ()
-    held = [row.conformity for row in rows if row.conformity]
+    statements = [row.conformity for row in rows if row.conformity]
     tone: Tone = "good" if result.status == "calibrated" else "warn"
-    if not held:
-        said = f"The status of the calibration is {result.status}; no limits are stated to compare the item with."
-        return Answer("Is the item calibrated?", result.status, tone, said, (), steps)
-    within = held.count("conforms")
-    word = "yes" if within == len(held) else "no" if "does not conform" in held else "no statement"
-    said = f"{within} of {len(held)} parameters with limits conform; the status of the calibration is {result.status}."
-    return Answer("Is the item within its limits?", word, tone if word == "yes" else "bad", said, (), steps)
+    if not statements:
+        text = f"The status of the calibration is {result.status}; no limits are stated to compare the item with."
+        return Summary("Is the item calibrated?", result.status, tone, text, (), steps)
+    within, count = statements.count("conforms"), len(statements)
+    answer = "yes" if within == count else "no" if "does not conform" in statements else "no statement"
+    text = f"{within} of {count} parameters with limits conform; the status of the calibration is {result.status}."
+    return Summary("Is the item within its limits?", answer, tone if answer == "yes" else "bad", text, (), steps)
+
+
+def _readable(row: Row, result: Result) -> _Readable:
+    """The unit people read a row in, and what formats its SI values with as many digits as U warrants."""
+    require = next((p.require for p in result.parameters if p.name == row.name), None)
+    unit, factor = human_unit(Quantity(row.name, row.unit, None, 1.0, require or math.inf))
+    return unit, lambda value: to_digits_of(factor * value, factor * row.expanded)
+
+
+def _meaning(result: Result, name: str) -> str:
+    """Meaning of a parameter; empty for a method that is not installed here."""
+    with suppress(InputError):
+        return meaning(method(result.method), name)
+    return ""
 
 
 def _printed(page: str) -> bytes:
@@ -323,28 +379,6 @@ def _printed(page: str) -> bytes:
             "--pdf needs WeasyPrint, pip install 'alidade[pdf]', and Pango of the system (Debian: apt install "
             "libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0); or print certificate.html by a browser"
         ) from error
-    logging.getLogger("weasyprint").setLevel(logging.ERROR)  # else it tells of every style that is for screens
+    logging.getLogger("weasyprint").setLevel(logging.ERROR)  # else it warns of every style for screens
     out: bytes = HTML(string=page).write_pdf()
     return out
-
-
-def _readable(row: Row, quantity: Quantity, stated: Fields) -> dict[str, str]:
-    """A row in the unit people read, as many digits as U warrants."""
-    unit, factor = human_unit(quantity)
-
-    def shown(value: float) -> str:
-        return to_digits_of(factor * value, factor * row.expanded)
-
-    limits = stated.limits.get(row.name)
-    return {
-        "name": row.name,
-        "unit": unit,
-        "value": shown(row.value),
-        "expanded": shown(row.expanded),
-        "coverage": f"{row.coverage:.2f}",
-        "degrees": "∞" if row.degrees is None else f"{row.degrees:.0f}",
-        "before": "" if row.before is None else shown(row.before),
-        "change": "" if row.before is None else shown(row.value - row.before),
-        "limits": "" if limits is None else f"{shown(limits.nominal)} ± {shown(limits.tolerance)}",
-        "conformity": row.conformity or "",
-    }

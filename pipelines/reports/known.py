@@ -8,16 +8,15 @@ import datetime
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from alidade.pipelines.belief import Belief, independent
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.files import MAX_RESULT_BYTES, read_bytes
 from alidade.pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
+from alidade.pipelines.reports.result_json import read_result
 
 # A covariance is symmetric, and none of its eigenvalues negative, to this share.
 _ROUNDING = 1e-6
@@ -85,36 +84,6 @@ def saved_of(known: Known, path: Path) -> SavedCalibration:
     )
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True)
-
-
-class _Parameter(_Record):
-    name: str
-    value: float
-
-
-class _Covariance(_Record):
-    order: list[str]
-    matrix: list[list[float]]
-
-
-class _Session(_Record):
-    sha256: str
-    start: datetime.datetime
-
-
-class _Result(_Record):
-    schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")]
-    method: str
-    solver: str
-    status: Status
-    parameters: list[_Parameter]
-    covariance: _Covariance
-    session: _Session
-    constants: dict[str, float] = {}
-
-
 def load_known(path: Path) -> Known:
     """Read result.json or calibration.yaml. Raises InputError when the file cannot be used."""
     data = read_bytes(path, MAX_RESULT_BYTES)
@@ -126,12 +95,7 @@ def load_known(path: Path) -> Known:
 
 
 def _of_result(path: Path, text: str) -> Known:
-    try:
-        result = _Result.model_validate_json(text)
-    except ValidationError as error:
-        first: Any = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the whole"
-        raise InputError(f"{path}: not a result.json: {where}: {first['msg']}") from error
+    result = read_result(path, text)
     names = tuple(p.name for p in result.parameters)
     covariance = np.array(result.covariance.matrix, dtype=float) if names else np.empty((0, 0))
     if tuple(result.covariance.order) != names or covariance.shape != (len(names), len(names)):
@@ -142,29 +106,23 @@ def _of_result(path: Path, text: str) -> Known:
     if np.diag(covariance).min(initial=0.0) < 0.0 or max(asymmetry, negative) > _ROUNDING:
         raise InputError(f"{path}: not a result.json: its covariance is none")
     belief = Belief(names, np.array([p.value for p in result.parameters]), covariance, str(path))
-    session = result.session
-    return Known(
-        result.method,
-        result.solver,
-        result.status,
-        session.sha256,
-        _nanoseconds(session.start),
-        belief,
-        result.constants,
-    )
+    start = _nanoseconds(result.session.start, f"{path}: not a result.json: session.start")
+    constants = result.constants or {}
+    return Known(result.method, result.solver, result.status, result.session.sha256, start, belief, constants)
 
 
 def _of_calibration(path: Path) -> Known:
     saved = load_calibration(path)
     given = saved.parameters
     belief = independent(list(given), [p.value for p in given.values()], [p.sigma for p in given.values()], str(path))
+    start = _nanoseconds(saved.recording.start, f"{path}: not a calibration.yaml: recording.start")
+    return Known(saved.method, saved.solver, saved.status, saved.recording.sha256, start, belief)
+
+
+def _nanoseconds(start: str, where: str) -> int:
+    """Unix ns of an ISO 8601 date, UTC where it has no zone, to the second."""
     try:
-        start = datetime.datetime.fromisoformat(saved.recording.start)
+        date = datetime.datetime.fromisoformat(start)
     except ValueError as error:
-        raise InputError(f"{path}: not a calibration.yaml: recording.start: {saved.recording.start!r}") from error
-    return Known(saved.method, saved.solver, saved.status, saved.recording.sha256, _nanoseconds(start), belief)
-
-
-def _nanoseconds(start: datetime.datetime) -> int:
-    known = start if start.tzinfo else start.replace(tzinfo=datetime.UTC)
-    return round(known.timestamp()) * 1_000_000_000
+        raise InputError(f"{where}: {start!r} is no date") from error
+    return round((date if date.tzinfo else date.replace(tzinfo=datetime.UTC)).timestamp()) * 1_000_000_000

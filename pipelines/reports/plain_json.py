@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -12,18 +10,22 @@ from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.reports.sentences import label
 
 if TYPE_CHECKING:
+    from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.fleet.analysis import Population
     from alidade.pipelines.applications.fleet.fleet import Outcome
     from alidade.pipelines.applications.fleet.histories import History
     from alidade.pipelines.applications.fleet.montecarlo import Study
-    from alidade.pipelines.applications.fleet.statistics import Component
     from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.applications.validate import Validated
+    from alidade.pipelines.recording.info import SessionFacts
 
 
 def plain_json(kind: str, content: Mapping[str, Any]) -> str:
     """The text, under its schema `alidade.<kind>/1`."""
-    return json.dumps({"schema": f"alidade.{kind}/1", **_finite(content)}, indent=1, allow_nan=False)
+    from pydantic_core import to_json
+
+    return to_json({"schema": f"alidade.{kind}/1", **content}, indent=1, inf_nan_mode="null").decode()
 
 
 def validation_json(validated: Validated) -> str:
@@ -104,20 +106,16 @@ def fleet_json(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
         {
             "recordings": table(outcome.results, fleet),
             "changes": change_table(found),
-            "attention": [asdict(unit) for unit in units_of_interest(outcome.results, fleet, found)],
+            "attention": units_of_interest(outcome.results, fleet, found),
             "parameters": [
                 {"name": p.name, "method": p.method, "of_device": p.of_device}
-                | {"population": _component(p.population), "repeatability": _component(p.repeatability)}
+                | {"population": p.population, "repeatability": p.repeatability}
                 for p in fleet
             ],
             "wanted": outcome.recordings,
             "interrupted": outcome.interrupted,
         },
     )
-
-
-def _component(component: Component | None) -> dict[str, float] | None:
-    return None if component is None else asdict(component)
 
 
 def study_json(study: Study) -> str:
@@ -137,10 +135,27 @@ def study_json(study: Study) -> str:
     )
 
 
-def _finite(value: Any) -> Any:
-    """Without NaN and infinity, which JSON has not got."""
-    if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def facts_json(
+    facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str], columns: Columns | None = None
+) -> str:
+    """Of `info`: the facts, and what each method has, lacks and could use."""
+    suggested = {suggestion.method: suggestion for suggestion in found}
+    content = asdict(facts)
+    proposed = content.pop("proposed")
+    content["methods"] = {
+        name: {
+            "served": not missing,
+            "missing": missing,
+            "proposed": proposed.get(name, ()),
+            "suggested": {key: source.model_dump() for key, source in suggested[name].topics.items()}
+            if name in suggested
+            else {},
+            "reasons": suggested[name].reasons if name in suggested else (),
+            "still_missing": suggested[name].missing if name in suggested else missing,
+        }
+        for name, missing in content.pop("missing").items()
+    }
+    if columns is not None:
+        tables = {topic: table.model_dump(exclude_defaults=True) for topic, table in columns.columns.items()}
+        content["columns"] = {"columns": tables, "reasons": list(columns.reasons), "doubts": list(columns.doubts)}
+    return plain_json("info", content | {"unused": list(unused)})

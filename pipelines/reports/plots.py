@@ -9,12 +9,12 @@ from itertools import cycle
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure
+from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot
 from alidade.pipelines.display.units import human_unit
 from alidade.pipelines.estimation.problem import Array, History, Quantity, Residuals
-from alidade.pipelines.reports.result import Calibration, Plot, quantities_of
+from alidade.pipelines.reports.result import Calibration, quantities_of
 
-# What tells the numbers of one variable apart: an axis, an element, a harmonic.
+# Suffix of a number of one variable: an axis, an element, a harmonic.
 _AXIS = re.compile(r"_([xyzenu]{1,2}|sin|cos)$|_?\d+$")
 # So many variables are named in a title.
 _MOST_NAMED = 3
@@ -43,11 +43,11 @@ def common_plots(calibration: Calibration) -> list[Plot]:
     return [*plots, *([correlation] if correlation else []), *([ellipses] if ellipses else [])]
 
 
-def components(told: Sequence[str] | None, residuals: Residuals) -> list[str]:
+def components(names: Sequence[str] | None, residuals: Residuals) -> list[str]:
     """What each number of residuals is; where the method does not say, three are x, y, z, eight a tag's corners."""
     width = residuals.whitened.shape[1]
-    if told is not None:
-        return list(told[:width])
+    if names is not None:
+        return list(names[:width])
     if width == 8:
         return [f"corner {i // 2 + 1} {'down' if i % 2 else 'across'}" for i in range(width)]
     return ["x", "y", "z"] if width == 3 else [f"number {i + 1} of {width}" for i in range(width)]

@@ -1,35 +1,39 @@
-"""What a calibration is to the reports, and result.json.
+"""A calibration: estimate, findings and provenance of one or several recordings, for all reports.
 
 calibration = Calibration(problem, estimate, diagnose(...), session_facts(...), ...)
-result_json(calibration)            # the contract's text of result.json
 """
 
 from __future__ import annotations
 
 import datetime
-import math
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib import metadata
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from typing import TYPE_CHECKING, Any
 
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.device_changes import Changes
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest, SolverDifference
 from alidade.pipelines.diagnostics.observability import TimeToAccuracy, Verdict, time_to_accuracy, verdicts
-from alidade.pipelines.display.figure import Figure
+from alidade.pipelines.display.figure import Plot
+from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.assumptions import pull
-from alidade.pipelines.estimation.finding import Finding, Severity, Status, status
-from alidade.pipelines.estimation.noise import Level, Source
+from alidade.pipelines.estimation.finding import Finding, Status, status
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.reports import sentences
+from alidade.pipelines.reports.result_json import (
+    MeasurementResult,
+    NoiseResult,
+    ParameterResult,
+    PartResult,
+    SensitivityResult,
+)
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -39,36 +43,9 @@ if TYPE_CHECKING:
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A figure of the report.
-
-    Attributes:
-        title: in a few words.
-        caption: what is seen, units included.
-        figure: it.
-        beside: figures that belong to it, beside it or below.
-    """
-
-    title: str
-    caption: str
-    figure: Figure
-    beside: tuple[Figure, ...] = ()
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report: title, caption, heads of the columns, and rows of as many texts."""
-
-    title: str
-    caption: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
 @dataclass(frozen=True, repr=False)
 class Calibration:
-    """Everything the reports tell about one calibration.
+    """A calibration with its findings and provenance.
 
     Attributes:
         method: that was calibrated.
@@ -302,7 +279,7 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         """The table for notebooks."""
-        from alidade.pipelines.reports.html import notebook_html
+        from alidade.pipelines.reports.calibration_report import notebook_html
 
         return notebook_html(self)
 
@@ -376,347 +353,6 @@ class Calibration:
         return (*self.facts.notes, *sentences.notes(self.findings, self.quantities), *clipped)
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
-
-
-class ParameterResult(_Record):
-    """One parameter; SI."""
-
-    name: str
-    value: float  # of the estimate
-    sigma: float  # one standard deviation, all else marginalised out
-    unit: str  # SI
-    prior_sigma: float | None  # null: free
-    prior_mean: float = 0.0  # left out where it is 0
-    require: float | None  # sigma wanted; null: none
-    observability: Verdict | None  # verdict; null of an assumption that nothing is required of
-    group: Literal["assumption"] | None = None  # assumption, or left out
-    pull: float | None = None  # z-score of a nuisance parameter: distance from its prior over the expected spread
-    inflation: float = 1.0  # of sigma, by noise that is correlated in time
-
-    @model_serializer(mode="wrap")
-    def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
-        """What is calibrated belongs to no group and has no pull; a prior about 0 has no mean."""
-        content: dict[str, object] = handler(self)
-        left_out = {*(() if self.group else ("group", "pull")), *(() if self.prior_mean else ("prior_mean",))}
-        return {k: v for k, v in content.items() if k not in left_out}
-
-
-class NoiseResult(_Record):
-    """A noise in its unit: stated by whom, estimated from the recording with sigma (null: not asked), and used.
-
-    `inflation` is by what the sigma of a mean of its measurements is larger than if they were independent.
-    """
-
-    name: str
-    unit: str
-    source: Source  # who stated it: config, message or default
-    stated: float  # where the search began
-    estimated: float | None  # what the recording alone says; null: it was not asked
-    sigma: float | None  # of estimated
-    used: float  # used in the solution and all sigmas
-    inflation: float  # by what a mean of such measurements is less certain than of independent ones
-
-
-class CovarianceResult(_Record):
-    """Joint covariance of the parameters, in the order given."""
-
-    order: list[str]  # names of parameters
-    matrix: list[list[float]]  # row by row, SI
-
-
-class DirectionResult(_Record):
-    """A direction that is weak or unobservable."""
-
-    sigma_ratio: float  # its sigma after over before the recording
-    weights: dict[str, float]  # parameter: its part in the direction
-    advice: str  # the motion that would determine it
-
-
-class FitResult(_Record):
-    """Chi-square of a family with its 99.9 % interval; null where there is none."""
-
-    value: float | None  # chi-square
-    dof: float | None  # degrees of freedom
-    low: float | None  # of the interval
-    high: float | None  # of the interval
-
-
-class ChiSquareResult(FitResult):
-    """Chi-square of the whole."""
-
-    families: dict[str, FitResult]  # the same of each family of measurements
-
-
-class CauseResult(_Record):
-    """A hypothesis or a prior conflict that may explain what does not fit, as text; `findings` has the numbers."""
-
-    label: str  # what it is
-    evidence: str  # what shows it
-
-
-class InnovationsResult(_Record):
-    """Whether the innovations of a family are white, and the mean of their squares (NIS) with its 99.9 % interval."""
-
-    autocorrelation: list[float]  # by lag, from 1
-    bound: float  # of the autocorrelation of white noise
-    nis: float  # mean of the squared norms; as large as rows if sigmas are true
-    low: float  # of nis
-    high: float  # of nis
-    rows: int  # numbers in a measurement
-
-
-class LearningResult(_Record):
-    """From when on a parameter was as accurate as required, s, and the tenth of the recording that said most of it."""
-
-    met_s: float | None  # s from the start; null: never
-    stretch: tuple[float, float]  # beginning and end, s
-    share: float  # of the information
-
-
-class StabilityResult(_Record):
-    """Largest change during the recording, with its p-value."""
-
-    statistic: float  # its size as a standard normal number
-    level: float  # p-value
-    time_s: float  # when, from the start
-    change: dict[str, float]  # parameter: the step, SI
-
-
-class SessionResult(_Record):
-    """What went in; it starts at `start`, ISO 8601."""
-
-    sha256: str  # of the file
-    start: str  # ISO 8601
-    duration_s: float  # s
-    counts: dict[str, int]  # messages by topic, measurements used by family
-    dropped: dict[str, int]  # reason: how many were left out
-
-
-class TruthResult(_Record):
-    """A parameter's true value and the error of the estimate; in sigmas unless it is fixed."""
-
-    value: float  # the truth
-    error: float  # estimate less truth
-    error_sigmas: float | None  # null: fixed
-
-
-class SensitivityResult(_Record):
-    """Effect of a fixed input: parameter -> change, SI, per unit of the input.
-
-    `step` is what the input is usually off by, one sigma; unit "1" is a share of the input itself.
-    """
-
-    unit: str  # of the input; 1: a share of itself
-    step: float  # what it is usually off by
-    parameters: dict[str, float]  # parameter: change per unit, SI
-
-
-class MeasurementResult(_Record):
-    """A measurement and the parameter that it shifts most, by `pull` sigmas."""
-
-    family: str  # of measurements
-    time_s: float  # s from the start
-    parameter: str  # that it shifts most
-    pull: float  # shift in sigmas
-
-
-class SelfCheckResult(_Record):
-    """An incremental estimate beside batch's, in sigmas."""
-
-    parameter: str  # the one that differs most
-    difference: float  # incremental less batch, in sigmas
-    sigma_ratio: float  # the smallest of incremental over batch
-
-
-class SecondResult(_Record):
-    """Another solution that is nearly as likely; SI."""
-
-    chi_square: float  # by how much it is higher, priors included
-    parameters: dict[str, float]
-
-
-class PartParameter(_Record):
-    """A number of one recording; SI."""
-
-    name: str
-    value: float
-    sigma: float
-    unit: str
-
-
-class PartResult(_Record):
-    """One recording of a joint calibration.
-
-    `parameters` are its own numbers, and the device's that walk, from all recordings; `alone` is what it says of the
-    device by itself, `status` and `headline` are its own. `dof` are the degrees of freedom of its noise estimate;
-    null where that was stated.
-    """
-
-    recording: str  # name of the file
-    sha256: str
-    start: str  # ISO 8601
-    duration_s: float
-    status: Status
-    headline: str
-    dof: float | None  # of the noise estimate
-    parameters: list[PartParameter]  # its own, and the device's that walk
-    alone: list[PartParameter]  # what it says of the device by itself
-
-
-class ChangeResult(_Record):
-    """A step of a number, SI, between two recordings; it is `found` where it is more than chance."""
-
-    parameter: str
-    before: str  # recording
-    after: str  # recording
-    step: float  # SI
-    sigma: float
-    found: bool  # more than chance
-
-
-class RateResult(_Record):
-    """How far numbers of a kind walk in the root of a day, SI; `upper` is the 95 % bound, null: there is none."""
-
-    rate: float  # SI in the root of a day
-    upper: float | None  # 95 % bound; null: there is none
-
-
-class ChangesResult(_Record):
-    """Changes of the device between recordings, tested at this level for the whole history."""
-
-    level: float  # significance level of the whole history
-    steps: list[ChangeResult]  # from recording to recording
-    rates: dict[str, RateResult]  # kind of parameter: how far it walks
-
-
-class Result(_Record):
-    """result.json; null where the solver has no such figure."""
-
-    schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")] = "alidade.result/1"
-    method: str  # of calibration
-    solver: str  # batch, incremental or published
-    status: Status  # the verdict on the whole
-    parameters: list[ParameterResult]
-    covariance: CovarianceResult
-    null_directions: list[DirectionResult]
-    chi_square: ChiSquareResult
-    noise: list[NoiseResult]
-    session: SessionResult
-    software: dict[str, str]  # package: version
-    timing_s: dict[str, float]  # phase: s of wall time
-    headline: str  # the verdict in one sentence
-    notes: list[str]  # what a reader has to know beside it
-    causes: list[CauseResult]
-    innovations: dict[str, InnovationsResult]  # by family; of the incremental solver
-    learning: dict[str, LearningResult]  # by parameter
-    stability: StabilityResult | None
-    self_check: SelfCheckResult | None
-    budget: dict[str, dict[str, float]] | None  # parameter: source: its share of the variance
-    sensitivity: dict[str, SensitivityResult] | None  # effect of a fixed input
-    measurements: list[MeasurementResult] | None  # the twenty that matter most
-    findings: list[dict[str, object]]  # kind, severity and evidence, the most severe first
-    tables: dict[str, list[dict[str, object]]]  # the method's own
-    second_best: SecondResult | None = None  # where there is another solution that is nearly as likely
-    constants: dict[str, float] | None = None  # that formulas need beside the parameters
-    recordings: list[PartResult] | None = None  # of a joint calibration
-    changes: ChangesResult | None = None  # of a joint calibration
-    truth: dict[str, TruthResult] | None = None  # where the recording brings it
-
-
-def result(calibration: Calibration) -> Result:
-    """result.json as a model. Raises pydantic's ValidationError if a number is not finite."""
-    c = calibration
-    return Result(
-        method=c.problem.method,
-        solver=c.estimate.solver,
-        status=c.status,
-        parameters=list(c.parameters.values()),
-        covariance=CovarianceResult(order=list(c.estimate.names), matrix=c.covariance.tolist()),
-        null_directions=[DirectionResult(**direction.evidence) for direction in c.directions],
-        chi_square=_chi_square(c),
-        noise=c.noises,
-        session=SessionResult(
-            sha256=c.sha256, start=c.start, duration_s=c.facts.duration_s, counts=c.counts, dropped=c.dropped
-        ),
-        software=dict(c.software),
-        timing_s=c.timing,
-        headline=c.headline,
-        notes=list(c.notes),
-        causes=[CauseResult(label=label, evidence=evidence) for label, evidence in c.causes],
-        innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
-        learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
-        stability=_stability(c.stability),
-        self_check=_self_check(c.solver_difference),
-        budget=None if c.budget is None else {name: dict(shares) for name, shares in c.budget.items()},
-        sensitivity=c.sensitivity,
-        measurements=c.measurements,
-        findings=[finding_json(finding) for finding in c.findings],
-        tables={name: [dict(row) for row in rows] for name, rows in c.tables.items()},
-        second_best=_second(c.estimate),
-        constants=dict(c.problem.constants) or None,
-        recordings=list(c.recordings) or None,
-        changes=_changes(c),
-        truth=truth_errors(c) if c.truth is not None else None,
-    )
-
-
-def finding_json(finding: Finding) -> dict[str, object]:
-    """A finding as result.json has it: kind, severity (note, weak, inconsistent, unobservable) and its evidence."""
-    return {
-        "kind": finding.kind,
-        "severity": Severity(finding.severity).name.lower(),
-        **{key: _json(value) for key, value in finding.evidence.items()},
-    }
-
-
-def _json(value: Any) -> object:
-    """Findings within evidence as objects, pairs as lists; null in place of what is no finite number."""
-    if isinstance(value, Finding):
-        return finding_json(value)
-    if isinstance(value, Mapping):
-        return {key: _json(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_json(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _self_check(found: SolverDifference | None) -> SelfCheckResult | None:
-    if found is None:
-        return None
-    return SelfCheckResult(parameter=found.parameter, difference=found.z, sigma_ratio=found.sigma_ratio)
-
-
-def _second(estimate: Estimate) -> SecondResult | None:
-    if estimate.second is None:
-        return None
-    values = dict(zip(estimate.names, estimate.second.values.tolist(), strict=True))
-    return SecondResult(chi_square=estimate.second.chi_square, parameters=values)
-
-
-def result_json(calibration: Calibration) -> str:
-    """The text of result.json; keys that only some calibrations have are left out of the others."""
-    model = result(calibration)
-    seldom = ("truth", "second_best", "constants", "recordings", "changes")
-    left_out = {name for name in seldom if getattr(model, name) is None}
-    return model.model_dump_json(by_alias=True, indent=1, exclude=left_out) + "\n"
-
-
-def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
-    """Parameter -> truth and error, for those whose truth is known."""
-    known = calibration.truth or {}
-    found = {}
-    for p in calibration.parameters.values():
-        truth = known.get(p.name)
-        if isinstance(truth, int | float) and math.isfinite(truth):
-            error = p.value - truth
-            found[p.name] = TruthResult(
-                value=truth, error=error, error_sigmas=error / p.sigma if p.sigma > 0.0 else None
-            )
-    return found
-
-
 def quantities_of(problem: Problem, estimate: Estimate) -> tuple[Quantity, ...]:
     """The quantities of an estimate, in its order; a published solver may know fewer than the problem has."""
     known = {q.name: q for q in problem.quantities}
@@ -732,48 +368,3 @@ def software_versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             versions[package] = "not installed"
     return versions
-
-
-def _stability(found: Stability | None) -> StabilityResult | None:
-    if found is None:
-        return None
-    change = found.departures if found.changed else {}
-    return StabilityResult(statistic=found.statistic, level=found.level, time_s=found.time_s, change=change)
-
-
-def _changes(c: Calibration) -> ChangesResult | None:
-    """Every step as it is with nothing else changed; those found as they are with all found."""
-    if c.changes is None:
-        return None
-    found = {(step.name, step.after): step for step in c.changes.found}
-    steps = []
-    for step in c.changes.steps:
-        told = found.get((step.name, step.after), step)
-        names = [c.recordings[i].recording for i in (step.after, step.after + 1)]
-        steps.append(
-            ChangeResult(
-                parameter=step.name,
-                before=names[0],
-                after=names[1],
-                step=told.size,
-                sigma=told.sigma,
-                found=(step.name, step.after) in found,
-            )
-        )
-    rates = {
-        name: RateResult(rate=rate.rate, upper=rate.upper if math.isfinite(rate.upper) else None)
-        for name, rate in c.changes.rates.items()
-    }
-    return ChangesResult(level=c.changes.level, steps=steps, rates=rates)
-
-
-def _chi_square(c: Calibration) -> ChiSquareResult:
-    if c.fit is None:
-        return ChiSquareResult(value=None, dof=None, low=None, high=None, families={})
-    families = {family: FitResult(**_numbers(fit)) for family, fit in c.family_fits.items()}
-    return ChiSquareResult(**_numbers(c.fit), families=families)
-
-
-def _numbers(fit: Fit) -> dict[str, float | None]:
-    numbers = {"value": fit.value, "dof": fit.dof, "low": fit.low, "high": fit.high}
-    return {name: number if math.isfinite(number) else None for name, number in numbers.items()}

@@ -14,7 +14,7 @@ from itertools import groupby
 from typing import Any
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
-from alidade.pipelines.display.units import human_unit, noise_unit, rounded, to_digits_of
+from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.finding import Finding, Severity, status
 from alidade.pipelines.estimation.problem import Quantity
 
@@ -150,7 +150,7 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
     q = quantities[e["parameter"]]
     unit, factor = human_unit(q)
     prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
-    numbers = f"{_number(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
+    numbers = f"{format_estimate(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
     if not (q.assumed or q.tight):
         return f"{q.name} is far from its prior", f"{numbers}; {_FAR}"
     inseparable = f" (or {', '.join(e['inseparable'])}, inseparable from it)" if e["inseparable"] else ""
@@ -179,12 +179,14 @@ def _fixed(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[s
     stated = f"{to_digits_of(factor * e['stated'], factor * e['sigma'])} {unit}".strip()
     inseparable = f" (or {', '.join(e['inseparable'][:_MAX_NAMED])})" if e["inseparable"] else ""
     what = f"{q.name} is fixed at {stated} by the config, and the recording contradicts it{inseparable}"
-    numbers = f"{_number(q, e['value'], e['sigma'])} if free (z = {e['z']:.1f})"
+    numbers = f"{format_estimate(q, e['value'], e['sigma'])} if free (z = {e['z']:.1f})"
     return what, numbers + _shift(e["effect"], q.name, quantities, "freeing it")
 
 
 def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
-    steps = [f"{name} by {_number(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]]
+    steps = [
+        f"{name} by {format_estimate(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]
+    ]
     small = " Immaterial; included in the sigmas." if severity == Severity.NOTE else ""
     return f"Change {_when(e)}{': ' if steps else ''}{', '.join(steps)}.{small}"
 
@@ -201,7 +203,7 @@ def _when(e: Mapping[str, Any]) -> str:
 
 
 def _device_change(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
-    step = _number(quantities[e["parameter"]], e["step"], e["sigma"])
+    step = format_estimate(quantities[e["parameter"]], e["step"], e["sigma"])
     return f"Change of the device {between(e['recordings'], e['dates'])}: {e['parameter']} by {step}."
 
 
@@ -306,13 +308,6 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
 
 
 _CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict, "contradiction": _fixed}
-
-
-def _number(q: Quantity, value: float, sigma: float) -> str:
-    """Value and sigma, SI, in the unit and with the digits that people read."""
-    unit, factor = human_unit(q)
-    number, spread = (to_digits_of(factor * each, factor * sigma) for each in (value, sigma))
-    return f"{number} ± {spread} {unit}".strip()
 
 
 def between(recordings: Sequence[str], dates: Sequence[str]) -> str:

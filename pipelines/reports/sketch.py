@@ -45,7 +45,7 @@ def angle(transform: SavedTransform) -> float:
     return float(np.linalg.norm(so3.log(np.array(transform.wxyz))))
 
 
-def told(transform: SavedTransform) -> str:
+def rotation_text(transform: SavedTransform) -> str:
     """A rotation as people read it: the angle, and its rotation vector."""
     if angle(transform) < _NOTHING:
         return "not turned"

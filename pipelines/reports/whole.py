@@ -1,7 +1,8 @@
 """Files that belong together, written whole or not at all.
 
 Processes that write into one folder wait for each other: the files there are those of one of them, never of two. A
-process that is killed leaves those of before, or none.
+command that finds the results of another that ended first leaves them and says so. A process that is killed leaves
+those of before, or none.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -21,9 +21,8 @@ from alidade.pipelines.errors import InputError
 # Others are waited for so long, s: pages and tables are made in a few seconds. Looked at so often, s.
 _PATIENCE_S, _GLANCE_S = 60.0, 0.02
 _PART = ".alidade."
-# When this process began, and the files that it has written itself, with the time of the last change, ns.
-_BEGAN_NS = time.time_ns()
-_own: dict[Path, int] = {}
+# Folder -> when a command of this process claimed it, or wrote there last, Unix ns.
+_claimed: dict[Path, int] = {}
 
 
 def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None]) -> tuple[Path, ...]:
@@ -39,7 +38,8 @@ def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None
         make: writes the files.
 
     Raises:
-        InputError: out_dir is a file, cannot be written to, or another process does not come to an end there.
+        InputError: out_dir is a file, cannot be written to, another process does not come to an end there, or has
+            written there since this one claimed the folder (`require_room`).
     """
     new = not out_dir.exists()
     try:
@@ -92,9 +92,10 @@ def _locked(lock: int, patience: float, folder: Path) -> bool:
 
 
 def require_room(out_dir: Path | None) -> None:
-    """Tell before the work that results could not be written after it. Raises InputError."""
+    """Claim a folder before the work, of which results are written after it. Raises InputError if they cannot be."""
     if out_dir is None:
         return
+    _claimed[out_dir.absolute()] = time.time_ns()
     there = next(folder for folder in (out_dir, *out_dir.absolute().parents) if folder.exists())
     if not there.is_dir():
         raise InputError(f"{out_dir}: no folder to write results to ({there} is no folder)")
@@ -129,9 +130,12 @@ def _write(path: Path, content: str | bytes) -> None:
 
 
 def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:
-    last = (out_dir / names[-1]).absolute()
-    if last.exists() and last.stat().st_mtime_ns > max(_BEGAN_NS, _own.get(last, 0)):
-        print(f"alidade: {out_dir}: another process has written there meanwhile; it is replaced", file=sys.stderr)
+    last, claimed = out_dir / names[-1], _claimed.get(out_dir.absolute())
+    if claimed is not None and last.exists() and last.stat().st_mtime_ns > claimed:
+        raise InputError(
+            f"{out_dir}: another process has written its results there since this one began; those of this one are "
+            "not written: give another folder"
+        )
     last.unlink(missing_ok=True)
     written = []
     for name in names:
@@ -140,5 +144,6 @@ def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:
             written.append(out_dir / name)
         else:
             (out_dir / name).unlink(missing_ok=True)
-    _own[last] = last.stat().st_mtime_ns
+    if claimed is not None:
+        _claimed[out_dir.absolute()] = last.stat().st_mtime_ns
     return tuple(written)

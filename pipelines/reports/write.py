@@ -6,13 +6,15 @@ import shutil
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Attitudes
 from alidade.pipelines.reports.calibration import calibration_yaml
-from alidade.pipelines.reports.estimates import write_estimates
-from alidade.pipelines.reports.foxglove import foxglove_layout
-from alidade.pipelines.reports.html import report_html
-from alidade.pipelines.reports.result import Calibration, result_json
-from alidade.pipelines.reports.trajectory import tum
+from alidade.pipelines.reports.calibration_report import report_html
+from alidade.pipelines.reports.estimates_mcap import foxglove_layout, write_estimates
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import result_json
 from alidade.pipelines.reports.whole import write_whole
 
 # In the order in which they take their places: result.json, gone first and back last, says that the others are its own.
@@ -58,3 +60,15 @@ def _make(folder: Path, calibration: Calibration) -> None:
     if estimate.history is not None and len(estimate.history.time):
         write_estimates(folder / "estimates.mcap", calibration, estimate.history)
         (folder / "foxglove.json").write_text(foxglove_layout(calibration), encoding="utf-8")
+
+
+def tum(attitudes: Attitudes, epoch_ns: int) -> str:
+    """attitude.tum: lines `t tx ty tz qx qy qz qw` by time; t is Unix time in s to the ns, the position zero."""
+    order = np.argsort(attitudes.time, kind="stable")
+    stamps = epoch_ns + np.round(attitudes.time[order] * 1e9).astype(np.int64)
+    lines = []
+    for t_ns, (w, x, y, z) in zip(stamps.tolist(), attitudes.wxyz[order].tolist(), strict=True):
+        # In whole numbers: a double holds today's Unix time to a quarter of a microsecond only.
+        seconds, rest = divmod(t_ns, 1_000_000_000)
+        lines.append(f"{seconds}.{rest:09d} 0 0 0 {x:.12f} {y:.12f} {z:.12f} {w:.12f}\n")
+    return "".join(lines)

@@ -84,7 +84,7 @@ def test_a_calibration_shows_itself_and_writes_itself(calibration: alidade.Calib
     assert repr(calibration) == "<Calibration head, batch, of arrays: calibrated>"
     assert "time_offset" in str(calibration)
     assert "calibrated." in str(calibration)
-    assert "<td>time_offset</td>" in calibration._repr_html_()
+    assert "<td>time_offset<small>" in calibration._repr_html_()
     assert calibration.status == "calibrated"
     assert calibration.headline == "7 of 7 parameters meet the required accuracy."
     assert calibration.covariance.shape == 2 * (len(calibration.parameters),)

@@ -110,7 +110,7 @@ def test_plan_finds_the_second_axis(command: Command, folder: Path, tmp_path: Pa
     """The scenario is one that the distribution brings, by its name."""
     better = tmp_path / "better.yaml"
     done = command(folder, "plan", "gyro_pair", "--scenario", "gyro_pair_one_axis", "--out", str(better), code=3)
-    assert "the body: sway by 20 deg" in done.out
+    assert "The body: sway by 20 deg" in done.out
     command(folder, "plan", "gyro_pair", "--scenario", str(better), "--quiet")
 
 

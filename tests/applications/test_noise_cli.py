@@ -17,7 +17,7 @@ from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.even import even_pieces
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.reports.noise import length
+from alidade.pipelines.reports.noise_report import length
 from datasets.broad import read_trial
 from tests.support import noises
 from tests.support.broad_trials import TRIALS
@@ -140,7 +140,7 @@ def test_stretches_of_a_recording_in_motion_are_pooled(alidade: Command, tmp_pat
     write_session(tmp_path / "s.mcap", {"/imu": series.ImuSeries(stamps(t), gyro, accel)})
     run = alidade("noise", tmp_path / "s.mcap")
     assert run.code == 0, run.err
-    assert "3 stretches at rest" in run.out
+    assert "3 static intervals" in run.out
     (found, _) = noise_of(tmp_path / "s.mcap").sensors
     for start, end in found.rests:
         assert not motion[(t >= start) & (t <= end)].any()

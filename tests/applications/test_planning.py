@@ -19,8 +19,9 @@ from alidade.pipelines.methods.cube.next_poses import next_poses
 from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plain_json import plan_json
-from alidade.pipelines.reports.plan import plan_html
+from alidade.pipelines.reports.plan_report import plan_report
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.simulation.scenario import load_scenario
@@ -94,7 +95,7 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
     assert status in ("weak", "unobservable")
     assert any("azimuth" in direction.evidence["advice"] for direction in plan.now.directions)
     assert plan.steps
-    page = plan_html(plan)
+    page = render_html(plan_report(plan))
     fits(page, tmp_path)
     assert "Does the planned motion determine what is wanted? no" in Page(page).text
     assert "delta_px Boresight in elevation" in Page(page).text

@@ -141,3 +141,15 @@ def test_one_command_calibrates_a_phones_table(tmp_path: Path, alidade: Command)
     assert any(
         note.startswith("columns taken as concluded: phone.csv: Time (s) is the time") for note in result["notes"]
     )
+
+
+def test_several_tables_of_one_device_have_their_columns_proposed(tmp_path: Path, alidade: Command) -> None:
+    """`--auto-columns` was once lost where several recordings are calibrated together."""
+    header = ",".join(["Time (s)", *(f"Magnetic Field {axis} (µT)" for axis in "xyz")])
+    paths = []
+    for name in ("march", "june"):
+        field = 45.0 * DIRECTIONS @ np.diag([1.05, 0.97, 1.0]) + [12.0, -30.0, 7.0] + 0.1 * RNG.normal(size=(N, 3))
+        paths.append(write(tmp_path / f"{name}.csv", header, SECONDS, field))
+    done = alidade("calibrate", *map(str, paths), "--auto-columns", "--json", "--out", str(tmp_path / "out"))
+    assert done.code == 0, done.err
+    assert [part["recording"] for part in json.loads(done.out)["recordings"]] == ["march.csv", "june.csv"]

@@ -15,8 +15,11 @@ import numpy as np
 import pytest
 
 from alidade.pipelines import deadline, parallel
+from alidade.pipelines.applications.noise import noise_of
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import simulate
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import open_recording
 from tests.support.command import Command
 
@@ -106,6 +109,39 @@ def test_a_result_is_written_when_the_time_is_over(alidade: Command, recording: 
     assert run.code in (0, 3, 4), run.err
     assert json.loads((tmp_path / "out" / "result.json").read_text())["parameters"]
     assert (tmp_path / "out" / "report.html").exists()
+
+
+def test_compare_and_validate_say_what_the_time_limit_stopped(
+    alidade: Command, recording: Path, tmp_path: Path
+) -> None:
+    compared = alidade("compare", recording, "--time-limit", "0.1", "--out", tmp_path / "compared", "--jobs", "1")
+    assert compared.code == 0, compared.err
+    page = (tmp_path / "compared" / "compare.html").read_text()
+    assert "The time limit of 0.1 s stopped" in page
+    assert alidade("calibrate", recording, "--out", tmp_path / "out", "--jobs", "1").code in (0, 3)
+    (tmp_path / "scenario.yaml").write_text("{duration_s: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100}")
+    simulate("los", str(tmp_path / "scenario.yaml"), 1, tmp_path / "t.mcap", False)
+    held = tmp_path / "out" / "calibration.yaml"
+    limited = ("--calibration", held, "--time-limit", "0.1", "--out", tmp_path / "held", "--json", "--jobs", "1")
+    start = time.monotonic()
+    validated = alidade("validate", tmp_path / "t.mcap", *limited)
+    assert validated.code in (0, 3, 4), validated.err
+    assert time.monotonic() - start < 10.0
+
+
+def test_noise_takes_the_topics_for_which_there_is_time(tmp_path: Path, clock: list[float]) -> None:
+    n = 2000
+    stamps, rng = np.arange(n) * 10_000_000, np.random.default_rng(0)
+    imu = series.ImuSeries(stamps, 1e-4 * rng.normal(size=(n, 3)), [0.0, 0.0, 9.8] + 1e-3 * rng.normal(size=(n, 3)))
+    topics = {"/first/imu": imu, "/second/imu": imu}
+    write_session(tmp_path / "s.mcap", topics)
+    study = noise_of(tmp_path / "s.mcap")
+    assert {sensor.topic for sensor in study.sensors} == set(topics)
+    with deadline.within(1.0):
+        clock[0] += 2.0
+        study = noise_of(tmp_path / "s.mcap")
+    assert {sensor.topic for sensor in study.sensors} == {"/first/imu"}
+    assert any("stopped the noise of /second/imu" in note for note in study.notes)
 
 
 @pytest.mark.parametrize("after", [0.5, 2.0, 3.5, 5.0])

@@ -24,12 +24,13 @@ from alidade.pipelines.applications.joint import calibrate_together
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
+from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Array, Told
 from alidade.pipelines.recording.opening import group_recordings
-from alidade.pipelines.reports.over_time import forecasts, recordings_shown
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.joint_report import forecasts, recording_blocks
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.joint import join
 from tests.support.broad_trials import TRIALS, converted
 from tests.support.one_graph import one_graph, solved
@@ -321,7 +322,7 @@ def test_how_far_it_walks_is_told_by_the_recordings() -> None:
     assert len({p.value for p in own}) == 8
     (told,) = [text for name, text in forecasts(found) if name == "theta_y"]
     assert "within what is required for" in told
-    (shown,) = [each for each in recordings_shown(found) if isinstance(each, Plot) and each.title.startswith("theta")]
+    (shown,) = [each for each in recording_blocks(found) if isinstance(each, Plot) and each.title.startswith("theta")]
     (band,) = [mark for mark in shown.figure.named("theta_y") if mark.kind == "band"]
     # From the first recording on, and on beyond the last, ever wider.
     assert len(band.x) > 8

@@ -16,7 +16,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.device_changes import LEVEL, Changes, changes
 from alidade.pipelines.estimation.problem import Array, Told
-from alidade.pipelines.reports.over_time import forecasts
+from alidade.pipelines.reports.joint_report import forecasts
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.joint import join
 from tests.support.short_problems import COARSE

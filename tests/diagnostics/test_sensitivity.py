@@ -17,8 +17,9 @@ from alidade.pipelines.diagnostics.fault_models import ExactInput
 from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Step
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.scenario import CubeScenario
-from alidade.pipelines.reports.html import report_html
-from alidade.pipelines.reports.result import Calibration, result
+from alidade.pipelines.reports.calibration_report import report_html
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import result
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.pages import Page

@@ -65,7 +65,7 @@ def test_wrong_noise_is_said_plainly_and_changes_nothing(
     name = next(iter(TRIALS))
     converted(shared_data / "broad" / f"{name}.mat", tmp_path / "s.mcap")
     (tmp_path / "noise.yaml").write_text("noise: {vision_attitude: 0.004}\n")
-    (calibration,) = calibrate(tmp_path / "s.mcap", ["batch"], config_file=tmp_path / "noise.yaml")
+    (calibration,) = calibrate(tmp_path / "s.mcap", ["batch"], config=tmp_path / "noise.yaml")
     right = scored[name][0]
     assert calibration.status == right.status == "calibrated"
     assert any(f.kind == "noise" and f.evidence["noise"] == "vision_attitude" for f in calibration.findings)

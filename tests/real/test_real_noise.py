@@ -42,7 +42,7 @@ def test_a_helmet_without_a_word_about_noise(name: str, shared_data: Path, tmp_p
     trial = shared_data / "broad" / f"{name}.mat"
     converted(trial, tmp_path / "s.mcap")
     (tmp_path / "c.yaml").write_text("noise: {gyro_density: null, vision_attitude: null, gyro_bias_walk: null}\n")
-    (found,) = calibrate(tmp_path / "s.mcap", ["batch"], config_file=tmp_path / "c.yaml")
+    (found,) = calibrate(tmp_path / "s.mcap", ["batch"], config=tmp_path / "c.yaml")
     assert found.status == "calibrated", found.headline
     write_results(tmp_path / "results", found)
     score = score_results(read_trial(trial), tmp_path / "results")

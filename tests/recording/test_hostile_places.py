@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from alidade.pipelines import files
-from alidade.pipelines.applications.fleet.store import Store
+from alidade.pipelines.applications.fleet.store import RecordingResult, Store
 from alidade.pipelines.applications.fleet.tables import write_csv
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
@@ -182,6 +182,8 @@ LINES = [
     b"[" * 100_000 + b"\n",
     b'{"settings": "s", "name": 1, "result": {}}\n',
     b'{"settings": "s", "name": "x", "result": 3}\n',
+    b'{"settings": "s", "name": "x", "result": {}}\n',
+    b'{"settings": "s", "name": "x", "result": {"status": "x", "exit_code": 0, "reason": "", "parameters": {}}}\n',
     b'{"settings": "s"}\n',
     b"\n",
     b'{"settings": "s", "name": "cut',
@@ -189,15 +191,16 @@ LINES = [
 
 
 def test_lines_that_are_no_results_are_passed_over_and_the_file_goes_on(tmp_path: Path) -> None:
-    good = json.dumps({"settings": "s", "name": "a", "result": {"status": "x"}}).encode() + b"\n"
+    failed = RecordingResult(status="failed", exit_code=2, reason="no topics", parameters={})
+    good = json.dumps({"settings": "s", "name": "a", "result": failed}).encode() + b"\n"
     (tmp_path / "results.jsonl").write_bytes(good.join(LINES))
-    store = Store(tmp_path, "s")
-    assert store.results == {"a": {"status": "x"}}
-    store.add("b", {"status": "y"})
+    store = Store(tmp_path, "s", RecordingResult)
+    assert store.results == {"a": failed}
+    store.add("b", failed)
     with pytest.raises(InputError, match="another process keeps its results there"):
-        Store(tmp_path, "s")
+        Store(tmp_path, "s", RecordingResult)
     del store
-    assert Store(tmp_path, "s").results.keys() == {"a", "b"}
+    assert Store(tmp_path, "s", RecordingResult).results.keys() == {"a", "b"}
 
 
 def test_no_cell_of_a_table_is_a_formula(tmp_path: Path) -> None:

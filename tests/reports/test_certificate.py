@@ -148,7 +148,8 @@ def test_without_a_printer_nothing_is_written(results: Path, tmp_path: Path, mon
 
 def test_of_several_recordings_each_counts_with_its_freedoms(results: Path, tmp_path: Path) -> None:
     changed = json.loads((results / "result.json").read_text())
-    part = {"start": "2026-03-01T12:00:00+00:00", "duration_s": 60.0}
+    part = {"start": "2026-03-01T12:00:00+00:00", "duration_s": 60.0, "status": "calibrated", "headline": ""}
+    part |= {"parameters": [], "alone": []}
     sources = {"march.mcap": 20.0, "june.mcap": 5.0, "stated.mcap": None}
     changed["recordings"] = [{"recording": name, "sha256": name, "dof": dof, **part} for name, dof in sources.items()]
     changed["noise"] = []

@@ -8,7 +8,7 @@ import pytest
 
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.calibration_report import report_html
 from tests.support.browser import drawn, needs_browser, sheets
 
 SCENARIOS = {

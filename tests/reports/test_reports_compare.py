@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.reports.compare import compare_html, write_compare
+from alidade.pipelines.reports.comparison_report import comparison_report, write_compare
+from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plots import common_plots
 from alidade.pipelines.reports.result import Calibration
 from tests.support.browser import drawn, needs_browser
 from tests.support.builders import make_calibration
 from tests.support.pages import Page
+
+
+def page_of(*compared: Any) -> str:
+    return render_html(comparison_report(*compared))
 
 
 def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:
@@ -27,7 +33,7 @@ def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:
 
 
 def test_differences_are_in_sigmas_of_batch() -> None:
-    page = Page(compare_html(solvers(), {}, {}))
+    page = Page(page_of(solvers(), {}, {}))
     assert page.loaded == []
     estimated = [q for q in solvers()[0].problem.quantities if q.prior_sigma != 0.0]
     assert page.text.count("+2.0") == len(estimated)
@@ -37,17 +43,17 @@ def test_differences_are_in_sigmas_of_batch() -> None:
 
 def test_truth_halves_and_held_out_measurements_are_told() -> None:
     halves = {"time_offset": SplitHalf(0.010, 0.003, 0.020, 0.004)}
-    page = Page(compare_html(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
+    page = Page(page_of(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
     assert "error of batch, σ" in page.text
-    assert "Does the recording agree with itself? yes Its two halves" in page.text
+    assert "Do both halves of the recording agree? yes Its two halves" in page.text
     assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
-    assert "1.06 sigmas (vision)" in page.text
+    assert "predicted to 1.06 (vision) of their sigmas" in page.text
 
 
 def test_halves_that_differ_by_more_than_chance_are_told() -> None:
     halves = {"time_offset": SplitHalf(0.010, 0.003, 0.040, 0.004), "gyro_bias_x": SplitHalf(0.0, 1e-3, 1e-4, 1e-3)}
-    page = Page(compare_html(solvers(), halves, {}))
-    assert "Does the recording agree with itself? no" in page.text
+    page = Page(page_of(solvers(), halves, {}))
+    assert "Do both halves of the recording agree? no" in page.text
     assert "time_offset (+6.0)" in page.text
 
 
@@ -70,5 +76,5 @@ def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
 
 @needs_browser
 def test_a_browser_draws_it_without_complaint(tmp_path: Path) -> None:
-    text = compare_html(solvers(), {"time_offset": SplitHalf(0.010, 0.003, 0.020, 0.004)}, {"vision": 1.06})
+    text = page_of(solvers(), {"time_offset": SplitHalf(0.010, 0.003, 0.020, 0.004)}, {"vision": 1.06})
     assert drawn(text, tmp_path) == text.count('class="plot"') >= 2

@@ -24,9 +24,9 @@ from alidade.pipelines.estimation.problem import (
 from alidade.pipelines.recording.messages import definition
 from alidade.pipelines.reports import write
 from alidade.pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration
-from alidade.pipelines.reports.result import Calibration, result_json
-from alidade.pipelines.reports.trajectory import tum
-from alidade.pipelines.reports.write import write_results
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import result_json
+from alidade.pipelines.reports.write import tum, write_results
 from tests.support.builders import EPOCH_NS, MOUNT, NAMES, make_calibration
 
 

@@ -13,8 +13,8 @@ from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.estimation.finding import KINDS, Finding, Severity, status
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Quantity, Residuals
-from alidade.pipelines.reports.html import report_html
-from alidade.pipelines.reports.result import finding_json, result_json
+from alidade.pipelines.reports.calibration_report import report_html
+from alidade.pipelines.reports.result_json import finding_json, result_json
 from alidade.pipelines.reports.sentences import cause, headline, notes, sentence
 from tests.support.builders import make_calibration
 from tests.support.pages import Page

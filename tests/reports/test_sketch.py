@@ -10,7 +10,7 @@ import pytest
 from alidade.factors import so3
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.calibration import SavedTransform
-from alidade.pipelines.reports.sketch import enlarged, sketch_with, told
+from alidade.pipelines.reports.sketch import enlarged, rotation_text, sketch_with
 
 
 def turned(*degrees: float) -> SavedTransform:
@@ -34,6 +34,6 @@ def test_the_axes_found_are_drawn_where_the_parents_are() -> None:
 def test_small_turns_are_enlarged_and_told_so() -> None:
     assert enlarged(turned(0.5, 0.0, 0.0))
     assert not enlarged(turned(20.0, 0.0, 0.0))
-    assert told(turned(0.5, 0.0, 0.0)).startswith("0.500 deg, rotation vector [0.500, ")
-    assert told(turned(0.0, 0.0, 0.0)) == "not turned"
+    assert rotation_text(turned(0.5, 0.0, 0.0)).startswith("0.500 deg, rotation vector [0.500, ")
+    assert rotation_text(turned(0.0, 0.0, 0.0)) == "not turned"
     assert not enlarged(turned(0.0, 0.0, 0.0))

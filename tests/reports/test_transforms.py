@@ -14,9 +14,8 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration, saved
-from alidade.pipelines.reports.export import exported
+from alidade.pipelines.reports.export_formats import exported, roll_pitch_yaw
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.reports.transforms import roll_pitch_yaw
 
 FRAMES = {
     "indexer": {"mRt": ("imu", "platform")},

@@ -22,11 +22,14 @@ NAMES = ("a", "b", "c", "result")
 WRITER = """
 import sys, time
 from pathlib import Path
-from alidade.pipelines.reports.whole import write_whole
+from alidade.pipelines.reports.whole import require_room, write_whole
 who, folder, rounds = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
 def make(part):
     for name in ("a", "b", "c", "result"):
         (part / name).write_text(f"{who} {i}")
+require_room(folder)
+print("begun", flush=True)
+sys.stdin.readline()
 for i in range(rounds):
     write_whole(folder, ("a", "b", "c", "result"), make)
     print(i, flush=True)
@@ -35,7 +38,17 @@ for i in range(rounds):
 
 def _writer(who: str, folder: Path, rounds: int) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", WRITER, who, str(folder), str(rounds)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    writer = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+    assert writer.stdout is not None
+    assert writer.stdout.readline() == "begun\n"
+    return writer
+
+
+def _go(writer: subprocess.Popen[str]) -> None:
+    assert writer.stdin is not None
+    writer.stdin.write("\n")
+    writer.stdin.flush()
 
 
 def _state(folder: Path) -> set[str]:
@@ -45,15 +58,17 @@ def _state(folder: Path) -> set[str]:
     return {(folder / name).read_text() for name in NAMES}
 
 
-def test_two_processes_never_mix(tmp_path: Path) -> None:
+def test_two_processes_never_mix_and_the_later_one_says_so(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     writers = [_writer(who, folder, 150) for who in "xy"]
+    for writer in writers:
+        _go(writer)
     said = [writer.communicate(timeout=120)[1] for writer in writers]
-    assert [writer.returncode for writer in writers] == [0, 0], said
-    (state,) = _state(folder)
-    assert state in ("x 149", "y 149")
+    lost = [writer.returncode for writer in writers].index(1)
+    assert writers[1 - lost].returncode == 0, said
+    assert "another process has written its results there since this one began" in said[lost]
+    assert _state(folder) == {f"{'yx'[lost]} 149"}
     assert sorted(path.name for path in folder.iterdir()) == sorted(NAMES)
-    assert any("another process has written there meanwhile; it is replaced" in text for text in said)
 
 
 @pytest.mark.parametrize("rounds", [15, pytest.param(200, marks=pytest.mark.slow)])
@@ -62,6 +77,7 @@ def test_a_process_that_is_killed_leaves_results_whole_or_absent(rounds: int, tm
     for _ in range(rounds):
         writer = _writer("x", folder, 10_000)
         assert writer.stdout is not None
+        _go(writer)
         writer.stdout.readline()
         time.sleep(rng.uniform(0.0, 0.01))
         writer.send_signal(signal.SIGKILL)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Array, Component, Spread, Trend
-from alidade.pipelines.applications.fleet.store import Result
+from alidade.pipelines.applications.fleet.store import RecordingResult, UnitResult
 from alidade.pipelines.applications.fleet.tables import Cell, Row
 
 DAY = 86400.0
@@ -80,14 +81,14 @@ class Population:
         return int((np.abs(self.z) > 3.0).sum())
 
 
-def counting(result: Result) -> list[str]:
+def counting(result: RecordingResult | UnitResult) -> list[str]:
     """The parameters of a recording that count."""
     if result["status"] not in _COUNTED:
         return []
     return [name for name, p in result["parameters"].items() if p["verdict"] in _DETERMINED]
 
 
-def populations(results: Mapping[str, Result], histories: Sequence[History] = ()) -> list[Population]:
+def populations(results: Mapping[str, UnitResult], histories: Sequence[History] = ()) -> list[Population]:
     """Every parameter of the fleet, in the order of the recordings' own lists; units that changed by `histories`."""
     members: dict[tuple[str, str], list[str]] = {}
     for recording, result in results.items():
@@ -101,14 +102,15 @@ def populations(results: Mapping[str, Result], histories: Sequence[History] = ()
     ]
 
 
-def table(results: Mapping[str, Result], fleet: Sequence[Population]) -> list[Row]:
+def table(results: Mapping[str, UnitResult], fleet: Sequence[Population]) -> list[Row]:
     """A row a recording: what became of it, then value, sigma and z of every parameter, SI."""
     z = {(r, p.name): float(p.z[i]) for p in fleet if p.spread for i, r in enumerate(p.recordings)}
     rows: list[Row] = []
     for recording, result in results.items():
         row: dict[str, Cell] = {"recording": recording, "unit": result["unit"], "date": iso(result["date"])}
-        row |= {key: result.get(key) for key in ("method", "status", "exit_code", "reason", "duration_s", "seconds")}
-        row["sha256"] = result.get("sha256")
+        cells = cast("Mapping[str, Cell]", result)
+        keys = ("method", "status", "exit_code", "reason", "duration_s", "seconds", "sha256")
+        row |= {key: cells.get(key) for key in keys}
         for name, parameter in result["parameters"].items():
             row |= {
                 name: parameter["value"],
@@ -127,7 +129,7 @@ def iso(date: float | None) -> str | None:
 
 
 def _population(
-    results: Mapping[str, Result],
+    results: Mapping[str, UnitResult],
     method: str,
     name: str,
     recordings: Sequence[str],

@@ -10,14 +10,13 @@ from typing import Literal
 
 import numpy as np
 
-from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.fleet.analysis import Population, iso
 from alidade.pipelines.applications.fleet.histories import History
-from alidade.pipelines.applications.fleet.store import Result
+from alidade.pipelines.applications.fleet.store import UnitResult
 from alidade.pipelines.diagnostics.device_changes import Change
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.reports.over_time import what
+from alidade.pipelines.reports.joint_report import what
 
 Kind = Literal["changed", "outlying", "failed", "inconsistent", "unobservable", "weak"]
 # In the order of how much they matter.
@@ -43,7 +42,7 @@ class Unit:
 
 
 def units_of_interest(
-    results: Mapping[str, Result], fleet: Sequence[Population], found: Sequence[History]
+    results: Mapping[str, UnitResult], fleet: Sequence[Population], found: Sequence[History]
 ) -> list[Unit]:
     """The units that need attention, those that changed or are outlying by most first."""
     units: dict[str, list[Finding]] = {}
@@ -54,7 +53,7 @@ def units_of_interest(
         for i in _farthest(p):
             units.setdefault(p.units[i], []).append(_outlying(p, i))
     for recording, result in results.items():
-        if result["exit_code"] != exit_codes.OF_STATUS["calibrated"]:
+        if result["status"] != "calibrated":
             reason = result["reason"].removeprefix(f"{recording}: ") or result["status"]
             text = f"{Path(recording).name}, exit code {result['exit_code']}: {reason}"
             units.setdefault(result["unit"], []).append(Finding(result["status"], text))
@@ -85,7 +84,7 @@ def _changed(history: History, fleet: Mapping[tuple[str, str], Population]) -> l
     def between(after: int) -> str:
         return f"between {_day(history.dates[after])} and {_day(history.dates[after + 1])}"
 
-    def told(step: Change) -> str:
+    def step_text(step: Change) -> str:
         unit, factor = readable(fleet[history.method, step.name])
         size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
         return f"{what(step)} by {size} ± {sigma} {unit} ".rstrip() + f" {between(step.after)}"
@@ -94,7 +93,7 @@ def _changed(history: History, fleet: Mapping[tuple[str, str], Population]) -> l
         Finding("changed", f"all parameters together {between(after)}, none by more than chance for itself")
         for after in history.together
     ]
-    return [*(Finding("changed", told(step), step.z) for step in history.found), *jointly]
+    return [*(Finding("changed", step_text(step), step.z) for step in history.found), *jointly]
 
 
 def _farthest(p: Population) -> list[int]:

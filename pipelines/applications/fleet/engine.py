@@ -68,7 +68,7 @@ def cluster(scheduler: str | None, jobs: int | None) -> Iterator[Client]:
 
     if jobs is not None and (scheduler is not None or jobs < 1):
         raise InputError(f"--jobs {jobs}: a number of local workers, 1 or more, and not together with --scheduler")
-    # What it logs of lost workers and connections is told by the results, or in one line.
+    # Lost workers and connections are in the results, or an error of one line.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
@@ -216,7 +216,7 @@ def _address(client: Client) -> str:
 
 
 def _source_version() -> Callable[[], str]:
-    """The function that tells the version, nested so that it travels as code to workers with another alidade."""
+    """The function that returns the version, nested so that it travels as code to workers with another alidade."""
 
     def version() -> str:
         digest = hashlib.sha256()

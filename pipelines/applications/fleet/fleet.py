@@ -19,9 +19,16 @@ from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.fleet import require_extra
 from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
 from alidade.pipelines.applications.fleet.histories import packed
-from alidade.pipelines.applications.fleet.isolated import failure, quarantined, run_isolated
 from alidade.pipelines.applications.fleet.recordings import Recording, as_date, from_metadata, from_name, local
-from alidade.pipelines.applications.fleet.store import Result, Store, settings_key
+from alidade.pipelines.applications.fleet.store import (
+    RecordingResult,
+    Store,
+    UnitResult,
+    failure,
+    quarantined,
+    run_isolated,
+    settings_key,
+)
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.config import load_config
@@ -87,7 +94,7 @@ class Outcome:
         interrupted: Ctrl-C came before the end.
     """
 
-    results: Mapping[str, Result]
+    results: Mapping[str, UnitResult]
     recordings: int
     kept: int
     interrupted: bool
@@ -124,28 +131,28 @@ def calibrate_fleet(
     Raises:
         InputError: out cannot be written to, no cluster can be had, or a name does not fit.
     """
-    told = {name: from_name(name, names) for name in recordings}
-    for fields in told.values():
+    named = {name: from_name(name, names) for name in recordings}
+    for fields in named.values():
         if "date" in fields:
             as_date(fields["date"])
-    store = Store(out, settings_key(source_version(), asdict(settings)))
+    store = Store(out, settings_key(source_version(), asdict(settings)), RecordingResult)
     unchanged = {name for name in recordings if _unchanged(recordings[name], settings, store.results.get(name))}
     tasks = {
-        name: (recording, settings, told[name].get("unit"), _inputs(store.results.get(name)))
+        name: (recording, settings, named[name].get("unit"), _inputs(store.results.get(name)))
         for name, recording in recordings.items()
         if name not in unchanged
     }
     fresh, again, interrupted = _calibrated_all(tasks, store, scheduler, jobs)
     known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}
-    results = {name: _placed(name, known[name], told[name]) for name in recordings if name in known}
+    results = {name: _placed(name, known[name], named[name]) for name in recordings if name in known}
     return Outcome(results, len(recordings), len(unchanged) + again, interrupted)
 
 
 def _calibrated_all(
-    tasks: Mapping[str, tuple[Any, ...]], store: Store, scheduler: str | None, jobs: int | None
-) -> tuple[dict[str, Result], int, bool]:
+    tasks: Mapping[str, tuple[Any, ...]], store: Store[RecordingResult], scheduler: str | None, jobs: int | None
+) -> tuple[dict[str, RecordingResult], int, bool]:
     """Results that are not to be kept; how many kept ones stand; and whether Ctrl-C came before the end."""
-    fresh: dict[str, Result] = {}
+    fresh: dict[str, RecordingResult] = {}
     again = 0
     if not tasks:
         return fresh, again, False
@@ -169,7 +176,7 @@ def _calibrated_all(
 
 def calibrate_recording(
     recording: Recording, settings: Settings, unit: str | None = None, known: tuple[str, str | None] | None = None
-) -> Result | None:
+) -> RecordingResult | None:
     """On the worker: the result of one recording, None when it was made of the very same.
 
     A result without `sha256` is of a file that could not be read at all; the next run tries again.
@@ -182,9 +189,9 @@ def calibrate_recording(
     """
     try:
         with local(recording.file, recording.is_bag) as path:
-            told = _told(path)
-            with _prior(settings, unit or told.get("unit") or Path(recording.file.path).stem) as prior:
-                result = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **told}
+            stated = _metadata(path)
+            with _prior(settings, unit or stated.get("unit") or Path(recording.file.path).stem) as prior:
+                result: Any = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **stated}
                 if _inputs(result) == known:
                     return None
                 return {**result, "tag": recording.tag, **_calibrated(path, settings, prior)}
@@ -192,12 +199,12 @@ def calibrate_recording(
         return failure(exit_codes.BAD_INPUT, str(error))
 
 
-def _inputs(result: Result | None) -> tuple[str, str | None] | None:
+def _inputs(result: RecordingResult | None) -> tuple[str, str | None] | None:
     """What a result was made of."""
     return (result["sha256"], result["prior_sha256"]) if result else None
 
 
-def _unchanged(recording: Recording, settings: Settings, kept: Result | None) -> bool:
+def _unchanged(recording: Recording, settings: Settings, kept: RecordingResult | None) -> bool:
     """Whether a kept result stands by what the listing says, so that nothing is to be fetched for it."""
     return bool(kept and recording.tag and kept.get("tag") == recording.tag and settings.prior is None)
 
@@ -216,12 +223,12 @@ def _earlier(address: str) -> Iterator[Path]:
         yield path
 
 
-def _told(path: Path) -> Result:
+def _metadata(path: Path) -> dict[str, str]:
     """Unit and date by the recording's own metadata."""
     return {key: value for key, value in from_metadata(path).items() if key != "date" or as_date(value)}
 
 
-def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Result:
+def _calibrated(path: Path, settings: Settings, prior: Path | None) -> RecordingResult:
     with TemporaryDirectory(prefix="alidade.") as folder:
         config = None
         if settings.config is not None:
@@ -231,15 +238,13 @@ def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Result:
 
 
 def _calibration(path: Path, settings: Settings, config: Path | None, prior: Path | None) -> Calibration:
-    from alidade.pipelines.applications.session import calibrate
+    from alidade.pipelines.applications.session import OpenOptions
 
-    (calibration,) = calibrate(
-        path, [settings.solver], settings.method, config, settings.window, prior=prior, report=False
-    )
-    return calibration
+    session = OpenOptions(settings.method, config, prior=prior).read(path)
+    return session.calibrate(settings.solver, settings.window, report=False)
 
 
-def _summary(calibration: Calibration) -> Result:
+def _summary(calibration: Calibration) -> dict[str, Any]:
     """The numbers of a calibration that a fleet is about; SI."""
     names = [q.name for q in calibration.problem.quantities]
     return {
@@ -263,7 +268,7 @@ def _summary(calibration: Calibration) -> Result:
 
 
 def _says(calibration: Calibration) -> Told:
-    """What a calibration says of its numbers; of solvers that do not tell it, by their covariance."""
+    """Information of a calibration about its numbers; of solvers without it, from their covariance."""
     from alidade.pipelines.solvers.posterior import told_of
 
     estimate = calibration.estimate
@@ -275,10 +280,10 @@ def _says(calibration: Calibration) -> Told:
     return told_of(belief, [scales[name] for name in belief.names])
 
 
-def _placed(name: str, result: Result, told: Mapping[str, str]) -> Result:
+def _placed(name: str, result: RecordingResult, named: Mapping[str, str]) -> UnitResult:
     """With unit and date: by the file's name, else by the recording's metadata, else the file and its start."""
-    unit = told.get("unit") or result.get("unit") or Path(name).stem
-    text = told.get("date") or result.get("date")
+    unit = named.get("unit") or result.get("unit") or Path(name).stem
+    text = named.get("date") or result.get("date")
     date = as_date(text).timestamp() if text else result.get("start_ns", 0) * 1e-9 or None
     return {**result, "unit": unit, "date": date}
 

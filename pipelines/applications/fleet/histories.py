@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alidade.pipelines.applications.fleet import statistics
-from alidade.pipelines.applications.fleet.store import Result
+from alidade.pipelines.applications.fleet.store import UnitResult
 from alidade.pipelines.applications.fleet.tables import Row
 from alidade.pipelines.applications.sharing import DAY_S
 from alidade.pipelines.diagnostics.device_changes import Change, Changes, changes
@@ -89,7 +89,7 @@ def unpacked(text: str) -> Told:
         )
 
 
-def histories(results: Mapping[str, Result], asked: Mapping[str, Sequence[str]]) -> list[History]:
+def histories(results: Mapping[str, UnitResult], asked: Mapping[str, Sequence[str]]) -> list[History]:
     """Of every unit that was recorded several times.
 
     Args:
@@ -125,22 +125,23 @@ def change_table(found: Sequence[History]) -> list[Row]:
 
 
 def _history(
-    results: Mapping[str, Result],
+    results: Mapping[str, UnitResult],
     unit: str,
     method: str,
     recordings: Sequence[str],
     asked: Mapping[str, Sequence[str]],
     level: float,
 ) -> History:
-    order = sorted(recordings, key=lambda recording: results[recording]["date"])
+    at = {recording: results[recording]["date"] or 0.0 for recording in recordings}
+    order = sorted(recordings, key=lambda recording: at[recording])
     parameters = [results[recording]["parameters"] for recording in order]
-    days = [results[recording]["date"] / DAY_S for recording in order]
+    days = [at[recording] / DAY_S for recording in order]
     joined = join([unpacked(results[recording]["told"]) for recording in order], results[order[-1]]["device"], days)
     names = {name for recording in order for name in asked[recording]}
     known = {name: [each[name] for each in parameters if name in each] for name in names}
     inflations = {name: grown([p["sigma"] for p in own], [p["inflation"] for p in own]) for name, own in known.items()}
     found = changes(joined, days, inflations, names, level)
-    dates = tuple(results[recording]["date"] for recording in order)
+    dates = tuple(at[recording] for recording in order)
     return History(unit, method, tuple(order), dates, found, found.found)
 
 

@@ -1,4 +1,4 @@
-"""Are the sigmas true? Many simulated recordings of one scenario, solved, and their errors held against the sigmas.
+"""Monte Carlo studies: errors of many simulated recordings of one scenario, compared with their sigmas.
 
     study = run_study("head", "head_nominal", seeds=range(200), solvers=SOLVERS, out=Path("study"))
     study.nees("batch").consistent
@@ -14,15 +14,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.fleet import require_extra, statistics
 from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
-from alidade.pipelines.applications.fleet.isolated import quarantined, run_isolated
-from alidade.pipelines.applications.fleet.store import Result, Store, settings_key
+from alidade.pipelines.applications.fleet.store import (
+    ParameterError,
+    RunResult,
+    Store,
+    quarantined,
+    run_isolated,
+    settings_key,
+)
 from alidade.pipelines.applications.fleet.tables import Cell, Row
 from alidade.pipelines.errors import InputError
 
@@ -52,7 +58,7 @@ class Study:
     method: str
     scenario: str
     solvers: tuple[str, ...]
-    results: Mapping[int, Mapping[str, Result]]
+    results: Mapping[int, Mapping[str, RunResult]]
     seeds: int
     kept: int
     interrupted: bool
@@ -73,9 +79,9 @@ class Study:
             lines += [f"{solver}: seed {seed}: {reason}" for seed, reason in self.failures(solver).items()]
         return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
 
-    def estimates(self, solver: str) -> list[Result]:
+    def estimates(self, solver: str) -> list[RunResult]:
         """The results of the runs in which this solver came to an estimate whose truth is known."""
-        return [run[solver] for run in self.results.values() if run.get(solver, {}).get("dof")]
+        return [run[solver] for run in self.results.values() if solver in run and run[solver].get("dof")]
 
     def failures(self, solver: str) -> dict[int, str]:
         """Seed -> why there is no estimate."""
@@ -99,9 +105,9 @@ class Study:
         """All errors in sigmas, over runs and parameters."""
         return np.array([p["error"] / p["sigma"] for r in self.estimates(solver) for p in r["parameters"].values()])
 
-    def accuracies(self, solver: str) -> dict[str, tuple[statistics.Accuracy, Result]]:
+    def accuracies(self, solver: str) -> dict[str, tuple[statistics.Accuracy, ParameterError]]:
         """Parameter -> accuracy over the runs, and what one result says of the parameter (unit, require)."""
-        members: dict[str, list[Result]] = {}
+        members: dict[str, list[ParameterError]] = {}
         for result in self.estimates(solver):
             for name, parameter in result["parameters"].items():
                 members.setdefault(name, []).append(parameter)
@@ -147,13 +153,17 @@ def run_study(
         raise InputError("--runs: at least one run is needed")
     chosen = methods.method(method)
     settings = chosen.settings(scenario)
-    # The first recording tells this scenario and simulator from others; and one that cannot be drawn is refused here.
-    store = Store(out, settings_key(source_version(), *_first(chosen, settings, seeds[0]), list(solvers), window))
+    # The first recording identifies scenario and simulator; one that cannot be drawn is refused here.
+    store = Store(
+        out,
+        settings_key(source_version(), *_first(chosen, settings, seeds[0]), list(solvers), window),
+        dict[str, RunResult],
+    )
     tasks = {
         str(seed): (method, settings, seed, tuple(solvers), window) for seed in seeds if str(seed) not in store.results
     }
     kept, interrupted = len(seeds) - len(tasks), False
-    killed: dict[str, Result] = {}
+    killed: dict[str, dict[str, RunResult]] = {}
     if tasks:
         with cluster(scheduler, jobs) as client:
             try:
@@ -174,7 +184,7 @@ def run_study(
 
 def simulate_and_solve(
     method: str, scenario: BaseModel, seed: int, solvers: Sequence[str], window: float | None
-) -> dict[str, Result]:
+) -> dict[str, RunResult]:
     """On the worker: solver -> numbers of one seed of a scenario."""
     from alidade.pipelines.applications.session import Session
 
@@ -191,8 +201,9 @@ def run_table(study: Study) -> list[Row]:
     for seed, run in study.results.items():
         for solver, result in run.items():
             row: dict[str, Cell] = {"seed": seed, "solver": solver}
-            row |= {k: result.get(k) for k in ("status", "exit_code", "reason", "nees", "dof")}
-            row |= {k: result.get(k) for k in ("chi_square", "chi_square_dof")}
+            cells = cast("Mapping[str, Cell]", result)
+            row |= {key: cells.get(key) for key in ("status", "exit_code", "reason", "nees", "dof")}
+            row |= {key: cells.get(key) for key in ("chi_square", "chi_square_dof")}
             for name, parameter in result["parameters"].items():
                 row |= {f"{name}_error": parameter["error"], f"{name}_sigma": parameter["sigma"]}
             rows.append(row)
@@ -229,20 +240,20 @@ def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
 
 
 def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, str, dict[str, float]]:
-    """What tells a study's recordings from others: method, data of one, their config and truth."""
+    """Identity of the recordings of a study: method, data of one, their config and truth."""
     from alidade.pipelines.applications.session import Arrays
 
     simulated = method.simulate(scenario, seed)
     return method.name, Arrays(method, simulated.data).sha256(), simulated.config, dict(simulated.truth)
 
 
-def _numbers(calibration: Calibration) -> Result:
+def _numbers(calibration: Calibration) -> dict[str, Any]:
     """Errors against sigmas, of what was estimated and whose truth is known."""
-    from alidade.pipelines.reports.result import truth_errors
+    from alidade.pipelines.reports.result_json import truth_errors
 
     errors = truth_errors(calibration)
     judged = [p for p in calibration.parameters.values() if p.name in errors and p.sigma > 0.0]
-    numbers: Result = {
+    numbers: dict[str, Any] = {
         "parameters": {
             p.name: {"error": errors[p.name].error, "sigma": p.sigma, "unit": p.unit, "require": p.require}
             for p in judged

@@ -1,9 +1,9 @@
-"""The pages of studies and fleets: HTML that opens offline."""
+"""Reports of fleets and of Monte Carlo studies."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
@@ -15,19 +15,17 @@ from alidade.pipelines.applications.fleet.analysis import Population, iso
 from alidade.pipelines.applications.fleet.attention import Unit, readable, sentence, units_of_interest
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component
-from alidade.pipelines.display.figure import COLORS, REJECTED, Figure, Shape, milliseconds, thin
+from alidade.pipelines.display.figure import COLORS, REJECTED, Figure, Plot, Shape, milliseconds, thin
+from alidade.pipelines.display.table import Cell, Column, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.meanings import meaning
-from alidade.pipelines.reports.answer import Answer
-from alidade.pipelines.reports.result import Plot
-from alidade.pipelines.reports.templating import page
+from alidade.pipelines.reports.report import Block, Bullets, Plots, Report, Section, Summary, Text
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.fleet.fleet import Outcome
     from alidade.pipelines.applications.fleet.montecarlo import Study
-    from alidade.pipelines.applications.fleet.store import Result
 
 # Rows of a list on the page; the CSV has all.
 _MOST_LISTED = 200
@@ -35,92 +33,143 @@ _MONTH = 30.0
 _MOST_BARS = 60
 
 
-def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
-    """The page of a fleet."""
+def fleet_report(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> Report:
+    """The report of a fleet."""
     results = outcome.results
     attention = units_of_interest(results, fleet, found)
     statuses = [r["status"] for r in results.values()]
     dates = [r["date"] for r in results.values() if r["date"] is not None]
-    return page(
-        "alidade.pipelines.applications.fleet",
-        "fleet.html",
-        [_population_plot(p) for p in fleet],
-        outcome=outcome,
-        counts={status: statuses.count(status) for status in sorted(set(statuses))},
-        units=len({r["unit"] for r in results.values()}),
-        first=iso(min(dates, default=None)),
-        last=iso(max(dates, default=None)),
-        several=len(found),
-        answer=_attention(attention, len({r["unit"] for r in results.values()}), bool(fleet)),
-        attention=attention[:_MOST_LISTED],
-        hidden=max(len(attention) - _MOST_LISTED, 0),
-        parameters=[_parameter_row(p) for p in fleet],
-        methods=len({p.method for p in fleet}),
+    units = len({r["unit"] for r in results.values()})
+    first, last = ((iso(date) or "no date")[:10] for date in (min(dates, default=None), max(dates, default=None)))
+    counts = ", ".join(f"{statuses.count(status)} {status}" for status in sorted(set(statuses)))
+    interrupted = " (interrupted: the same command continues)" if outcome.interrupted else ""
+    heading = f"Fleet of {units} units"
+    return Report(
+        title=heading,
+        heading=heading,
+        about=f"{len(results)} of {outcome.recordings} recordings{interrupted}, {first} to {last}: {counts}",
+        summary=_attention(attention, units, bool(fleet)),
+        sections=(
+            Section("Units outside the control limits", _attention_blocks(attention, len(found))),
+            Section("Parameters", (_parameter_table(fleet),)),
+            Section("Parameters over time", (Plots(tuple(map(_population_plot, fleet))),) if fleet else ()),
+        ),
+        style="wide",
     )
 
 
-def _attention(found: Sequence[Unit], units: int, parameters: bool) -> Answer:
-    """Which units need attention."""
-    question = "Which units need attention?"
-    if not found:
-        word = "none" if parameters else "cannot say"
-        said = f"None of {units} units stands out." if parameters else "No recording gave a calibration to compare."
-        step = "Run the same command when there are new recordings; those finished are kept."
-        return Answer(question, word, "good" if parameters else "fixed", said, (), (step,))
-    steps = (
-        "Start with the first in the table: units that changed, then those unlike the others.",
-        "Record a unit again before it is sent back: what stands out twice is the unit, not the recording.",
-    )
-    return Answer(question, f"{len(found)} of {units}", "warn", f"Of {units} units, {sentence(found)}.", (), steps)
-
-
-def study_html(study: Study) -> str:
-    """The page of a Monte Carlo study."""
+def study_report(study: Study) -> Report:
+    """The report of a Monte Carlo study."""
     solvers = [solver for solver in study.solvers if study.estimates(solver)]
-    return page(
-        "alidade.pipelines.applications.fleet",
-        "montecarlo.html",
-        [plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver))],
-        study=study,
-        title=method(study.method).title,
-        answer=_truth(study, solvers),
-        finished=len(study.results),
-        rows=[_consistency_row(study, solver) for solver in solvers],
-        failures={solver: study.failures(solver) for solver in study.solvers},
-        accuracies=[
-            _accuracy_row(study, solver, *row) for solver in solvers for row in study.accuracies(solver).items()
-        ],
+    interrupted = " (interrupted: the same command continues)" if study.interrupted else ""
+    plots = tuple(plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver)))
+    failures = (
+        Section(
+            f"{solver}: {len(seeds)} runs without an estimate",
+            (Bullets(tuple(f"seed {seed}: {reason}" for seed, reason in seeds.items())),),
+        )
+        for solver in study.solvers
+        if (seeds := study.failures(solver))
+    )
+    return Report(
+        title=f"{study.method}: {study.scenario}",
+        heading=f"{method(study.method).title}: {study.scenario}, simulated {len(study.results)} times",
+        about=f"{len(study.results)} of {study.seeds} runs{interrupted}",
+        summary=_consistency(study, solvers),
+        sections=(
+            Section("Consistency", (_consistency_table(study, solvers),)),
+            *failures,
+            Section("Parameters", (_accuracy_table(study, solvers),)),
+            Section("Distributions", (Plots(plots),) if plots else ()),
+        ),
     )
 
 
 # -- fleets
 
 
-def _parameter_row(p: Population) -> dict[str, Any]:
-    """The cells of a parameter, in the unit people read."""
+def _attention(found: Sequence[Unit], units: int, parameters: bool) -> Summary:
+    """Which units need attention."""
+    question = "Which units need attention?"
+    if not found:
+        answer = "none" if parameters else "cannot say"
+        text = f"None of {units} units stands out." if parameters else "No recording gave a calibration to compare."
+        step = "Run the same command when there are new recordings; those finished are kept."
+        return Summary(question, answer, "good" if parameters else "fixed", text, (), (step,))
+    steps = (
+        "Start with the first in the table: units that changed, then those unlike the others.",
+        "Record a unit again before it is sent back: what stands out twice is the unit, not the recording.",
+    )
+    return Summary(question, f"{len(found)} of {units}", "warn", f"Of {units} units, {sentence(found)}.", (), steps)
+
+
+def _attention_blocks(attention: Sequence[Unit], several: int) -> tuple[Block, ...]:
+    """A row a finding, and of which units changes could be found at all."""
+    rows = tuple(
+        (
+            unit.name if i == 0 else "",
+            Cell(f.kind, tone="" if f.kind in ("weak", "unobservable") else "bad"),
+            f.text,
+            "" if f.z is None else f"{f.z:+.1f}",
+        )
+        for unit in attention[:_MOST_LISTED]
+        for i, f in enumerate(unit.findings)
+    )
+    columns = ("unit", Column("finding", "text", wide=True), Column("description", "prose"), "z")
+    hidden = len(attention) - _MOST_LISTED
+    repeated = (
+        f"{several} units were recorded several times; changes of what belongs to the device are looked for in these."
+        if several
+        else "No unit was recorded several times: none can be seen to have changed."
+    )
+    return (
+        *((Table("", "", columns, rows, "attention", "", None),) if rows else ()),
+        *((Text(f"{hidden} more are in the tables beside this page."),) if hidden > 0 else ()),
+        Text(repeated),
+    )
+
+
+def _parameter_table(fleet: Sequence[Population]) -> Table:
+    """A row a parameter, in the unit people read."""
+    several = len({p.method for p in fleet}) > 1
+    columns = (
+        "parameter",
+        *((Column("method", "text"),) if several else ()),
+        *(Column("belongs to", "text"), Column("unit", "text"), "recordings", "centre"),
+        *(Column(head, wide=True) for head in ("between units", "within a unit", "typical sigma", "control limits")),
+        *("beyond", "outlying", "changed", Column("drift in 30 days", wide=True)),
+    )
+    caption = (
+        "Between units, within a unit: standard deviations beyond the sigmas, each with its sigma or a 95 % bound, "
+        "outliers excluded. Parameters of a recording (turn-on bias) differ each time and are no change. z: distance "
+        "from the centre over spread and sigma, or a change over its sigma. Beyond: recordings with |z| above 3 "
+        "(0.27 % expected). Outlying, changed: p = 0.01 for the whole fleet."
+    )
+    rows = tuple(_parameter_row(p, several) for p in fleet)
+    return Table("", caption, columns, rows, style="many", most_rows=None)
+
+
+def _parameter_row(p: Population, several: bool) -> tuple[Cell | str, ...]:
     unit, factor = readable(p)
     sigma = factor * float(np.median(p.sigmas))
-    row: dict[str, Any] = {
-        "name": p.name,
-        "meaning": meaning(method(p.method), p.name),
-        "method": p.method,
-        "unit": unit,
-        "count": len(p.values),
-    }
-    row |= {"sigma": rounded(sigma)}
-    row |= {"centre": "", "low": "", "high": "", "beyond": "", "drift": "", "drifts": p.drifts}
-    row |= {"outlying": int(p.outlying.sum()), "changed": len({p.units[i] for i in np.flatnonzero(p.changed)})}
-    row |= {"of": "device" if p.of_device else "recording"}
-    row |= {"population": _component(p.population, factor), "repeatability": _component(p.repeatability, factor)}
+    centre = limits = beyond = drift = ""
     if p.spread and p.control:
         scatter = float(np.hypot(factor * p.spread.tau, sigma))
-        row["centre"] = to_digits_of(factor * p.spread.centre, scatter)
-        low, high = (to_digits_of(factor * bound, scatter) for bound in p.control)
-        row |= {"low": low, "high": high, "beyond": p.beyond}
+        centre = to_digits_of(factor * p.spread.centre, scatter)
+        limits = " … ".join(to_digits_of(factor * bound, scatter) for bound in p.control)
+        beyond = str(p.beyond)
     if p.drift:
         slope, slope_sigma = (_MONTH * factor * number for number in (p.drift.slope, p.drift.sigma))
-        row["drift"] = f"{to_digits_of(slope, slope_sigma)} ± {rounded(slope_sigma)}"
-    return row
+        drift = f"{to_digits_of(slope, slope_sigma)} ± {rounded(slope_sigma)}"
+    outlying, changed = int(p.outlying.sum()), len({p.units[i] for i in np.flatnonzero(p.changed)})
+    return (
+        Cell(p.name, meaning(method(p.method), p.name)),
+        *((p.method,) if several else ()),
+        *("device" if p.of_device else "recording", unit, str(len(p.values)), centre),
+        *(_component(p.population, factor), _component(p.repeatability, factor), rounded(sigma), limits, beyond),
+        *(Cell(str(count), tone="bad" if count else "") for count in (outlying, changed)),
+        Cell(drift, tone="bad" if p.drifts else ""),
+    )
 
 
 def _component(component: Component | None, factor: float) -> str:
@@ -141,10 +190,10 @@ def _population_plot(p: Population) -> Plot:
     good = np.flatnonzero(~flagged)
     _add_recordings(out, p, good[thin(len(good))], factor, "recording", COLORS[0])
     edges = np.histogram_bin_edges(factor * p.values, bins=int(np.clip(2.0 * math.sqrt(len(p.values)), 10, _MOST_BARS)))
-    told = _add_counts(counts, factor * p.values[good], edges, "recording", COLORS[0])
+    ends = _add_counts(counts, factor * p.values[good], edges, "recording", COLORS[0])
     if flagged.any():
         _add_recordings(out, p, np.flatnonzero(flagged), factor, "outlying or changed", REJECTED)
-        _add_counts(counts, factor * p.values[flagged], edges, "outlying or changed", REJECTED, told)
+        _add_counts(counts, factor * p.values[flagged], edges, "outlying or changed", REJECTED, ends)
     if p.spread and p.control:
         out.levels(factor * p.spread.centre, dash="solid")
         out.levels(factor * np.array(p.control), dash="dashed")
@@ -173,62 +222,90 @@ def _add_counts(
 # -- studies
 
 
-def _truth(study: Study, solvers: Sequence[str]) -> Answer:
-    """Whether the sigmas are true; of the published solver, whose are not its own, nothing is promised."""
+def _consistency(study: Study, solvers: Sequence[str]) -> Summary:
+    """Whether the sigmas are consistent; those of the published solver, which are not ours, count where it is alone."""
     question = "Are the sigmas consistent?"
     judged = {solver: study.nees(solver) for solver in solvers if solver != "published"} or {
         solver: study.nees(solver) for solver in solvers
     }
     if not judged:
-        return Answer(
-            question, "cannot say", "fixed", "No run gave an estimate.", (), ("See below why the runs failed.",)
-        )
+        steps = ("See below why the runs failed.",)
+        return Summary(question, "cannot say", "fixed", "No run gave an estimate.", (), steps)
     said = ", ".join(
-        f"{solver} has a mean NEES of {rounded(nees.mean, 3)} where {nees.dof:g} is right and chance allows "
+        f"{solver} has a mean NEES of {rounded(nees.mean, 3)}, expected {nees.dof:g}, 99 % interval "
         f"{rounded(nees.low, 3)} to {rounded(nees.high, 3)}"
         for solver, nees in judged.items()
     )
     wrong = [solver for solver, nees in judged.items() if not nees.consistent]
     if not wrong:
         steps = ("Rely on the sigmas of recordings like this one; another motion or sensor is another study.",)
-        return Answer(question, "yes", "good", f"Errors are as large as the sigmas say: {said}.", (), steps)
+        return Summary(question, "yes", "good", f"Errors are as large as the sigmas say: {said}.", (), steps)
     steps = ("See below which parameters' ratio of error to sigma is far from 1, and which are biased.",)
-    return Answer(question, "no", "bad", f"Not those of {', '.join(wrong)}: {said}.", (), steps)
+    return Summary(question, "no", "bad", f"Not those of {', '.join(wrong)}: {said}.", (), steps)
 
 
-def _consistency_row(study: Study, solver: str) -> dict[str, Any]:
-    nees = study.nees(solver)
-    return {
-        "solver": solver,
-        "nees": nees,
-        "coverage": statistics.coverage(study.normalised(solver)),
-        "statuses": ", ".join(f"{count} {status}" for status, count in study.statuses(solver).items()),
-        "seconds": float(np.median([result["seconds"] for result in study.estimates(solver)])),
-    }
+_WITHIN = ("within 1 sigma", "2 sigmas", "3 sigmas")
 
 
-def _accuracy_row(study: Study, solver: str, name: str, row: tuple[statistics.Accuracy, Result]) -> dict[str, Any]:
-    a, parameter = row
-    unit, factor = human_unit(Quantity(name, parameter["unit"], None, 1.0, parameter["require"] or math.inf))
-    return {
-        "solver": solver,
-        "name": name,
-        "meaning": meaning(method(study.method), name),
-        "unit": unit,
-        "bias": f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {rounded(factor * a.bias_sigma)}",
-        "biased": abs(a.bias) > 3.0 * a.bias_sigma,
-        "rms": rounded(factor * a.rms, 3),
-        "sigma": rounded(factor * a.sigma, 3),
-        "ratio": a.rms / a.sigma,
-        "coverage": a.coverage,
-    }
+def _consistency_table(study: Study, solvers: Sequence[str]) -> Table:
+    rows: list[Row] = []
+    for solver in solvers:
+        nees, seconds = study.nees(solver), [result["seconds"] for result in study.estimates(solver)]
+        rows.append(
+            (
+                *(solver, str(nees.runs), f"{nees.dof:g}", f"{nees.mean:.4g}", f"{nees.low:.3f} … {nees.high:.3f}"),
+                Cell("yes", tone="good") if nees.consistent else Cell("no", tone="bad"),
+                *_shares(statistics.coverage(study.normalised(solver))),
+                f"{float(np.median(seconds)):.2g}",
+                ", ".join(f"{count} {status}" for status, count in study.statuses(solver).items()),
+            )
+        )
+    columns = (
+        *("solver", "runs", "parameters", "mean NEES", Column("99 % interval", wide=True), Column("inside", "text")),
+        *(*_WITHIN, "median time, s", Column("verdicts", "text", wide=True)),
+    )
+    caption = (
+        "NEES: squared estimation error in units of the joint covariance; its mean is the number of parameters if the "
+        "covariance is right. Normal errors: 68.3 %, 95.4 % and 99.7 % within 1, 2 and 3 sigmas."
+    )
+    return Table("", caption, columns, tuple(rows), style="many", most_rows=None)
+
+
+def _accuracy_table(study: Study, solvers: Sequence[str]) -> Table:
+    rows: list[Row] = []
+    for solver in solvers:
+        for name, (a, parameter) in study.accuracies(solver).items():
+            quantity = Quantity(name, parameter["unit"], None, 1.0, parameter["require"] or math.inf)
+            unit, factor = human_unit(quantity)
+            bias = f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {rounded(factor * a.bias_sigma)}"
+            rows.append(
+                (
+                    *(Cell(name, meaning(method(study.method), name)), solver, unit),
+                    Cell(bias, tone="bad" if abs(a.bias) > 3.0 * a.bias_sigma else ""),
+                    *(rounded(factor * a.rms, 3), rounded(factor * a.sigma, 3), f"{a.rms / a.sigma:.3g}"),
+                    *_shares(a.coverage),
+                )
+            )
+    columns = (
+        *("parameter", Column("solver", "text"), Column("unit", "text"), Column("bias", wide=True)),
+        *("RMS error", "RMS sigma", "ratio", *_WITHIN),
+    )
+    caption = (
+        "Bias: mean error with its standard error; red beyond three of them. The RMS error should be what the sigmas "
+        "predict: a ratio of 1."
+    )
+    return Table("", caption, columns, tuple(rows), style="many", most_rows=None)
+
+
+def _shares(coverage: Iterable[float]) -> tuple[str, ...]:
+    return tuple(f"{100.0 * share:.1f} %" for share in coverage)
 
 
 def _nees_plot(study: Study, solver: str) -> Plot:
     found = study.estimates(solver)
     values = np.array([result["nees"] for result in found])
     dof = study.nees(solver).dof
-    # What lies far out is told by the table.
+    # Outliers are in the table.
     top = 1.5 * max(float(np.quantile(values, 0.95)), dof + 3.0 * math.sqrt(2.0 * dof))
     out = Figure("runs", "NEES")
     _histogram(out, np.minimum(values, top), 0.0, top, lambda x: _chi_square_density(x, dof), f"chi-square of {dof:g}")

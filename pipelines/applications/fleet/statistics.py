@@ -1,7 +1,7 @@
 """Statistics of many calibrations: are the sigmas true, which units stand out, which have changed.
 
 Values x_i come with their own sigmas s_i. A fleet has a spread t of its own beside them, so that x_i scatters about the
-centre with variance t^2 + s_i^2; centre and t are told from medians, which up to half of the units cannot spoil.
+centre with variance t^2 + s_i^2; centre and t are estimated from medians, which up to half of the units cannot spoil.
 Of what does not stand out, t is taken apart into what units differ by and what recordings of one unit differ by.
 """
 
@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 
 # Chance that anything at all is flagged among good units, over all tests of a page.
 FALSE_ALARM = 0.01
-# Fewer values than these tell no spread.
+# A spread is estimated from at least so many values.
 ENOUGH = 5
 # Median of chi-square with one degree of freedom.
 _MEDIAN = NormalDist().inv_cdf(0.75) ** 2
-# A median tells a spread as well as the usual estimate from this share of the values.
+# Efficiency of the median as an estimate of spread: the share of the values that the usual estimate would need.
 _EFFICIENCY = 0.37
 
 
@@ -118,7 +118,7 @@ def limit(tests: int, values: int | None = None) -> float:
 
     Args:
         tests: made on the whole page.
-        values: the spread was told from so many (Student's t then, by Wallace's approximation of 1959, which is
+        values: the spread was estimated from so many (Student's t then, by Wallace's approximation of 1959, which is
             2 % large at 40 values, 10 % at 12); None: it is known.
     """
     z = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARM / max(tests, 1))
@@ -168,7 +168,7 @@ class Component:
 def components(values: Array, sigmas: Array, units: NDArray[np.intp]) -> tuple[Component | None, Component | None]:
     """From unit to unit, and from recording to recording of one unit: x = centre + unit + recording + noise.
 
-    The second is told by what recordings differ from their unit's mean, the first by these means, each by its
+    The second is estimated from differences to the mean of the unit, the first from these means, each by its
     restricted likelihood (Searle, Casella, McCulloch, Variance Components, 1992, 3.7 and 6.6).
 
     Args:

@@ -1,6 +1,7 @@
-"""What is finished, kept as it comes: a line of JSON a result, so that an interrupted run goes on where it stopped.
+"""Results of many calibrations, kept as they come, and a calibration whose failure is a result.
 
-A line that is none, whatever it holds, is passed over: that result is made again.
+A line of JSON is a result: an interrupted run continues where it stopped. A line that is no result, whatever it holds,
+is passed over, and that result is made again.
 """
 
 from __future__ import annotations
@@ -11,16 +12,89 @@ import json
 import os
 import re
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Generic, Literal, Required, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from typing_extensions import TypedDict  # pydantic needs it below Python 3.12, and brings it
 
+from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from alidade.pipelines.reports.result import Calibration
 
 FILE = "results.jsonl"
 
-Result = dict[str, Any]
+Result = TypeVar("Result")
+RunStatus = Literal["calibrated", "weak", "unobservable", "inconsistent", "failed"]
+
+
+class ParameterNumbers(TypedDict):
+    """A parameter of one recording; SI."""
+
+    value: float
+    sigma: float
+    unit: str
+    require: float | None
+    verdict: str | None
+    inflation: float
+
+
+class _Calibrated(TypedDict, total=False):
+    """What became of a recording: without an estimate, a reason and no parameters."""
+
+    status: Required[RunStatus]
+    exit_code: Required[int]
+    reason: Required[str]  # empty where it is calibrated
+    parameters: Required[dict[str, ParameterNumbers]]
+    seconds: float  # wall time
+    sha256: str  # absent where the file could not be read: it is tried again
+    prior_sha256: str | None
+    tag: str | None  # what a listing says of the file, by which it is known to be unchanged
+    start_ns: int  # Unix
+    duration_s: float
+    method: str
+    device: dict[str, float]  # parameter of the device: walk in the root of a day
+    told: str  # information about the parameters, see `histories.packed`
+
+
+class RecordingResult(_Calibrated, total=False):
+    """A result as it is kept; unit and date as the recording's metadata have them."""
+
+    unit: str
+    date: str
+
+
+class UnitResult(_Calibrated, total=False):
+    """A result in its place in the fleet; the date in Unix s, None where there is none."""
+
+    unit: Required[str]
+    date: Required[float | None]
+
+
+class ParameterError(TypedDict):
+    """Error of a parameter in a simulated run; SI."""
+
+    error: float
+    sigma: float
+    unit: str
+    require: float | None
+
+
+class RunResult(TypedDict, total=False):
+    """One solver's result of a simulated run."""
+
+    status: Required[RunStatus]
+    exit_code: Required[int]
+    reason: Required[str]
+    parameters: Required[dict[str, ParameterError]]
+    seconds: float
+    nees: float
+    dof: int
+    chi_square: float
+    chi_square_dof: float
 
 
 def settings_key(*settings: Any) -> str:
@@ -28,14 +102,14 @@ def settings_key(*settings: Any) -> str:
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 
-class Store:
-    """Results by name in `results.jsonl` of a folder; only those of the same settings count.
+class Store(Generic[Result]):
+    """Results of a kind by name in `results.jsonl` of a folder; only those of the same settings count.
 
     Raises InputError when the folder cannot be written to, or another process keeps its results there.
     """
 
-    def __init__(self, folder: Path, settings: str) -> None:
-        self._path, self._settings = folder / FILE, settings
+    def __init__(self, folder: Path, settings: str, kind: type[Result]) -> None:
+        self._path, self._settings, self._kind = folder / FILE, settings, TypeAdapter(kind)
         self.results: dict[str, Result] = {}
         require_writable(folder)
         try:
@@ -63,10 +137,10 @@ class Store:
         for line in self._stream:
             try:
                 entry = _Entry.model_validate_json(line)
+                if entry.settings == self._settings:
+                    self.results[entry.name] = self._kind.validate_python(entry.result)
             except ValidationError:
                 continue  # cut off when the machine went down, or another's; that one is done again
-            if entry.settings == self._settings:
-                self.results[entry.name] = entry.result
         if not line.endswith(b"\n"):
             self._stream.write(b"\n")
             self._stream.flush()
@@ -79,7 +153,7 @@ class _Entry(BaseModel):
 
     settings: str
     name: str
-    result: Result
+    result: dict[str, Any]
 
 
 def require_writable(folder: Path) -> None:
@@ -92,3 +166,34 @@ def require_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise InputError(f"{folder}: no folder to write results to ({os.strerror(error.errno or 0)})") from error
+
+
+def run_isolated(summarise: Callable[[Calibration], dict[str, Any]], calibrate: Callable[[], Calibration]) -> Any:
+    """Status, exit code, reason, seconds of wall time, and the keys of `summarise`; an exception is a failure."""
+    from alidade.pipelines.solvers.chain import IndeterminateError
+
+    try:
+        calibration = calibrate()
+        return {
+            "status": calibration.status,
+            "exit_code": exit_codes.OF_STATUS[calibration.status],
+            "reason": "" if calibration.status == "calibrated" else calibration.headline,
+            "seconds": sum(calibration.timing.values()),
+            **summarise(calibration),
+        }
+    except InputError as error:
+        return failure(exit_codes.BAD_INPUT, str(error))
+    except IndeterminateError as error:
+        return failure(exit_codes.UNDETERMINED, str(error))
+    except Exception as error:
+        return failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
+
+
+def failure(exit_code: int, reason: str) -> Any:
+    """The result of a calibration without an estimate, of a recording or a run."""
+    return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
+
+
+def quarantined() -> Any:
+    """The result of a calibration that killed its workers."""
+    return failure(exit_codes.KILLED, "killed its worker each time it was tried, at last alone; quarantined")

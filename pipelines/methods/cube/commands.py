@@ -9,7 +9,7 @@ from alidade.pipelines.applications.options import ConfigFile, Json, Quiet
 from alidade.pipelines.errors import InputError
 
 if TYPE_CHECKING:
-    from alidade.pipelines.vision.layout import Layout
+    pass
 
 
 def cube_layout(
@@ -32,9 +32,10 @@ def cube_layout(
     from alidade.pipelines.config import configured
     from alidade.pipelines.methods.cube.layout import cube_layout as estimate
     from alidade.pipelines.methods.cube.layout import layout_yaml
-    from alidade.pipelines.methods.cube.layout_page import layout_html, layout_json
+    from alidade.pipelines.methods.cube.layout_page import layout_json, layout_report
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.whole import write_file
 
     page = out.with_suffix(".html")
@@ -43,35 +44,13 @@ def cube_layout(
     with progress.shown(quiet), progress.doing("finding where the tags are"):
         layout = estimate([configured(open_recording(session), config) for session in sessions], refine_camera)
     write_file(out, layout_yaml(layout))
-    write_file(page, layout_html(layout, [session.name for session in sessions]))
+    report = layout_report(layout, [session.name for session in sessions])
+    write_file(page, render_html(report))
     if as_json:
         print(layout_json(layout))
         return
-    _show(layout)
+    terminal.print_report(report)
     terminal.say(f"Wrote {out} for calibrate --config, and {page}")
-
-
-def _show(layout: "Layout") -> None:
-    """A table of the tags, what became of them, and what to do."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from alidade.pipelines.methods.cube.layout_page import COLUMNS, advice, camera_rows, headline, rows
-    from alidade.pipelines.reports import terminal
-
-    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for column in COLUMNS:
-        table.add_column(column, justify="right", no_wrap=True)
-    for row in rows(layout):
-        table.add_row(*row)
-    terminal.console.print(table)
-    terminal.say(headline(layout))
-    for sentence in advice(layout):
-        terminal.say(f"  {sentence}")
-    for camera, name, given, found, sigma in camera_rows(layout):
-        terminal.say(f"  camera {camera}: {name} {found} ± {sigma}, given {given}")
-    if layout.camera_sigma is not None and layout.with_camera is None:
-        terminal.say("  calibrate takes the camera's numbers from a layout of one camera; here they are several")
 
 
 def cube_print(

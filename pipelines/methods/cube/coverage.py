@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.sphere_map import described, sphere_map, widest_gap
 from alidade.pipelines.methods.cube.tables import rows_of
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.result import Calibration
 
 
 def coverage(calibration: Calibration) -> Plot | None:

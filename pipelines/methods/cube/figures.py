@@ -9,7 +9,8 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.display.figure import BEFORE, COLORS, FAINT, Figure, thin
+from alidade.pipelines.display.figure import BEFORE, COLORS, FAINT, Figure, Plot, thin
+from alidade.pipelines.display.table import Table
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.compensation import calibrated, calibrated_rates
@@ -18,7 +19,7 @@ from alidade.pipelines.methods.cube.data import CubeData, local_field, nominal
 from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from alidade.pipelines.methods.cube.tables import NAMES, cube_tables
 from alidade.pipelines.methods.cube.topics import CubeConfig
-from alidade.pipelines.reports.result import Calibration, Plot, Table
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
 # Unit that people read an error in, and what to multiply its SI number by.

@@ -1,4 +1,4 @@
-"""A layout of tags as people read it: a headline, a table, and a page with the layout as a picture."""
+"""The page of a layout of tags, what `cube-layout` prints, and its JSON."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.display.figure import COLORS, Figure
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.display.units import to_digits_of
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.reports.answer import Answer, Tone
 from alidade.pipelines.reports.plain_json import plain_json
-from alidade.pipelines.reports.result import Plot
-from alidade.pipelines.reports.templating import page
+from alidade.pipelines.reports.report import Block, Bullets, Plots, Report, Section, Summary, Tone
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.layout import Layout
@@ -25,8 +24,8 @@ COLUMNS = ("tag", "pictures", "px", "sigma, deg", "sigma, mm", "false", "correla
 _SELDOM = 0.25
 # A tag that misses by this many times the others' median is no flat square of its size.
 _MISFIT = 2.5
-# A sigma below this share of its prior's is told by the pictures.
-_TOLD = 0.5
+# Pictures determine a number whose sigma is below this share of its prior's.
+_DETERMINED = 0.5
 
 
 def headline(layout: Layout) -> str:
@@ -60,19 +59,8 @@ def advice(layout: Layout) -> list[str]:
     return out
 
 
-def rows(layout: Layout) -> list[tuple[str, ...]]:
-    """A row of COLUMNS a placed tag."""
-    sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
-    degrees, mm = np.rad2deg(sigmas[:, :3].max(axis=1)), 1e3 * sigmas[:, 3:].max(axis=1)
-    cells = [("0", "0"), *((f"{a:.2g}", f"{b:.2g}") for a, b in zip(degrees, mm, strict=True))]
-    return [
-        (str(tag), str(s.pictures), f"{s.rms_px:.2f}", *cell, str(s.rejected), f"{s.inflation:.1f}")
-        for (tag, s), cell in zip(layout.seen.items(), cells, strict=True)
-    ]
-
-
 def layout_json(layout: Layout) -> str:
-    """What the terminal tells, in SI and pixels: every tag placed with its sigmas, and why others are not."""
+    """Every tag placed with its sigmas, SI and pixels, and why others are not."""
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6).tolist()
     body = layout.body
     return plain_json(
@@ -103,46 +91,66 @@ def layout_json(layout: Layout) -> str:
     )
 
 
-def camera_rows(layout: Layout) -> list[tuple[str, ...]]:
-    """Camera, name, value given, value found and sigma of each number that was adjusted and that pictures tell."""
+def layout_report(layout: Layout, recordings: Sequence[str]) -> Report:
+    """The report of a layout."""
+    steps = tuple(f"{step[:1].upper()}{step[1:]}." for step in advice(layout))
+    tone: Tone = "warn" if steps else "good"
+    apply = "Use the section `cube: tags` that was written, in the config of recordings of this cube."
+    answer = "in part" if layout.unplaced else "yes"
+    unplaced = tuple(f"Tag {tag}: {why}." for tag, why in layout.unplaced.items())
+    return Report(
+        title=f"Layout of the tags ({', '.join(recordings)})",
+        heading="Layout of the tags",
+        about=", ".join(recordings),
+        summary=Summary("Are all tags located?", answer, tone, f"{headline(layout)}.", (), (*steps, apply)),
+        sections=(
+            Section("Not placed", (Bullets(unplaced),) if unplaced else (), page_only=True),
+            Section("Plots", (Plots((_picture(layout), _bars(layout))),)),
+            Section("Tag by tag", (_tag_table(layout),)),
+            Section("Cameras", _cameras(layout)),
+        ),
+    )
+
+
+def _tag_table(layout: Layout) -> Table:
+    """A row a placed tag; the first one defines the frame of the body."""
+    sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
+    degrees, mm = np.rad2deg(sigmas[:, :3].max(axis=1)), 1e3 * sigmas[:, 3:].max(axis=1)
+    cells = [("0", "0"), *((f"{a:.2g}", f"{b:.2g}") for a, b in zip(degrees, mm, strict=True))]
+    rows = tuple(
+        (str(tag), str(s.pictures), f"{s.rms_px:.2f}", *cell, str(s.rejected), f"{s.inflation:.1f}")
+        for (tag, s), cell in zip(layout.seen.items(), cells, strict=True)
+    )
+    caption = (
+        "px: root mean square error of the corners, per axis, sharp pictures weighted more than blurred ones. Sigmas "
+        "are those of the worst axis. False: pictures in which the tag does not fit the others of the same picture by "
+        "far, left out. Correlation: by how much the sigmas exceed those of corners that err independently and of tags "
+        f"that are flat squares: in all pictures alike corners are off by {layout.bend:.2%} of the tag's size, one "
+        "sigma each way, whether the paper is bent or the print is askew."
+    )
+    return Table("", caption, COLUMNS, rows, "tags", most_rows=None)
+
+
+def _cameras(layout: Layout) -> tuple[Block, ...]:
+    """Numbers of the cameras that were adjusted and that the pictures determine."""
     from alidade.pipelines.vision.layout import LINE_TIME
 
-    out: list[tuple[str, ...]] = []
+    rows: list[tuple[str, ...]] = []
     for k, (found, given) in enumerate(zip(layout.cameras, layout.given_cameras, strict=True)):
         count = len(given.intrinsics) - 4
         names = ["fx, px", "fy, px", "cx, px", "cy, px", *(f"distortion {i + 1}" for i in range(count))]
         sigmas = np.zeros(len(names)) if layout.camera_sigma is None else layout.camera_sigma[k]
         numbers = list(zip(names, given.intrinsics, found.intrinsics, sigmas, strict=False))
-        if layout.line_time_sigma[k] < _TOLD * LINE_TIME:
+        if layout.line_time_sigma[k] < _DETERMINED * LINE_TIME:
             numbers.append(("line time, us", 0.0, 1e6 * layout.line_time[k], 1e6 * layout.line_time_sigma[k]))
-        out += [
+        rows += [
             (str(k + 1), name, to_digits_of(a, s), to_digits_of(b, s), f"{s:.2g}") for name, a, b, s in numbers if s
         ]
-    return out
-
-
-def layout_html(layout: Layout, recordings: Sequence[str]) -> str:
-    """The page as one HTML text that opens offline."""
-    return page(
-        "alidade.pipelines.methods.cube",
-        "layout.html",
-        [_picture(layout), _bars(layout)],
-        recordings=", ".join(recordings),
-        answer=_answer(layout),
-        unplaced=layout.unplaced,
-        columns=COLUMNS,
-        rows=rows(layout),
-        cameras=camera_rows(layout),
-        bend=f"{layout.bend:.2%}",
-    )
-
-
-def _answer(layout: Layout) -> Answer:
-    steps = tuple(f"{step[:1].upper()}{step[1:]}." for step in advice(layout))
-    word = "in part" if layout.unplaced else "yes"
-    apply = "Use the section `cube: tags` that was written, in the config of recordings of this cube."
-    tone: Tone = "warn" if steps else "good"
-    return Answer("Are all tags located?", word, tone, headline(layout) + ".", (), (*steps, apply))
+    columns = ("camera", Column("number", "text"), "given", "found", "sigma")
+    several = layout.camera_sigma is not None and layout.with_camera is None
+    note = "calibrate takes the camera's numbers from a layout of one camera; here they are several"
+    table = Table("", "", columns, tuple(rows), "cameras", most_rows=None)
+    return ((table,) if rows else ()) + ((Bullets((note,)),) if several else ())
 
 
 _CAPTION = (

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from alidade.pipelines.display.sphere_map import described
+from alidade.pipelines.display.table import Table
 from alidade.pipelines.display.units import rounded, to_digits_of
-from alidade.pipelines.reports.result import Calibration, Table
+from alidade.pipelines.reports.result import Calibration
 
 NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 _NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg(60.0)), "mag": ("nT/√Hz", 1e9)}

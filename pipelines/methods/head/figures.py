@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.pipelines.display.figure import COLORS, PALE, Figure
+from alidade.pipelines.display.figure import COLORS, PALE, Figure, Plot
 from alidade.pipelines.estimation.problem import Array, Attitudes
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.head.recording import HeadData
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.result import Calibration
 
 _AXES = "xyz"
 

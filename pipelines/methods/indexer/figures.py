@@ -8,7 +8,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.indexer import IndexerAverageFactor, mounting
-from alidade.pipelines.display.figure import COLORS, Figure
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.indexer.groups import Group, groups_of
@@ -17,7 +17,7 @@ from alidade.pipelines.methods.indexer.published import half_differences
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.runs import axis_motion
 from alidade.pipelines.methods.indexer.validation import misfit, validate
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
 _ARCSEC = np.rad2deg(1.0) * 3600.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from alidade.factors.gimbal import SLOW
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.display.figure import COLORS, Figure
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
@@ -20,7 +20,7 @@ from alidade.pipelines.methods.los.guess import camera, carried_errors
 from alidade.pipelines.methods.los.parameters import ANGLES, OFFSET
 from alidade.pipelines.methods.los.pictures import select_pictures
 from alidade.pipelines.methods.los.recording import LosData
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import DEFAULT_NOISE, first_given
 
 _AXES = ("phx", "phz")

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.display.figure import Plot
+    from alidade.pipelines.display.table import Table
     from alidade.pipelines.estimation.problem import Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.methods.tumble.recording import TumbleData
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.calibration import SavedCalibration
-    from alidade.pipelines.reports.result import Calibration, Plot, Table
+    from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config
     from alidade.pipelines.simulation.simulated import Simulated
 

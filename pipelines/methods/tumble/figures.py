@@ -6,14 +6,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, thin
+from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, sphere_map
+from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.findings import NAMES, directions
 from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.reports.result import Calibration, Plot, Table
+from alidade.pipelines.reports.result import Calibration
 
 
 def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:

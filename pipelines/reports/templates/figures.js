@@ -4,30 +4,21 @@
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const color = name => getComputedStyle(root).getPropertyValue("--" + name).trim();
   const drawn = new Map();
-  let figures, numbers, library;
+  let figures, library;
 
   async function inflate(id) {
     const packed = Uint8Array.from(atob(document.getElementById(id).textContent), c => c.charCodeAt(0));
-    return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+    return new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
   }
 
   const load = () => library ??= (async () => {
-    const [script, text, planes] = await Promise.all(["bokeh", "figures", "numbers"].map(inflate));
-    figures = JSON.parse(new TextDecoder().decode(text));
-    // Numbers stand byte by byte: first bytes of all, second bytes of all, ...
-    const from = new Uint8Array(planes), count = from.length / 4, to = new Uint8Array(from.length);
-    for (let k = 0; k < 4; k++) for (let i = 0; i < count; i++) to[4 * i + k] = from[k * count + i];
-    numbers = new Float32Array(to.buffer);
+    const [script, text] = await Promise.all(["bokeh", "figures"].map(inflate));
+    figures = JSON.parse(text);
     const element = document.createElement("script");
-    element.textContent = new TextDecoder().decode(script);
+    element.textContent = script;
     document.head.append(element);
     Bokeh.logger.set_level("warn");
   })();
-
-  function column([start, count, origin]) {
-    return origin ? Float64Array.from(numbers.subarray(start, start + count), v => v + origin)
-                  : Array.from(numbers.subarray(start, start + count));
-  }
 
   const mix = (a, b, t) => "#" + [1, 3, 5].map(k => {
     const [u, v] = [a, b].map(c => parseInt(c.slice(k, k + 2), 16));
@@ -36,7 +27,7 @@
   const blend = (a, b, count) => Array.from({ length: count }, (_, i) => mix(a, b, i / (count - 1)));
 
   function add(figure, mark, spec) {
-    const data = Object.fromEntries(Object.entries(mark.columns).map(([key, at]) => [key, column(at)]));
+    const data = Object.fromEntries(Object.entries(mark.columns).map(([key, values]) => [key, values.map(v => v ?? NaN)]));
     const ink = color(mark.color);
     if (mark.texts.length) data.text = mark.texts;
     const line = { line_color: ink, line_width: mark.size, line_dash: mark.dash };
@@ -48,11 +39,6 @@
     switch (mark.kind) {
       case "levels": return spans(data.y, "width");
       case "moments": return spans(data.x, "height");
-      case "zone": {
-        const zone = new Bokeh.BoxAnnotation({ bottom: data.low[0], top: data.high[0], fill_color: ink, fill_alpha: mark.alpha, line_color: null });
-        figure.add_layout(zone);
-        return [zone];
-      }
       case "patches": {
         const split = values => values.reduce((all, v) => (isNaN(v) ? all.push([]) : all.at(-1).push(v), all), [[]]).slice(0, -1);
         data.x = split(data.x); data.y = split(data.y);

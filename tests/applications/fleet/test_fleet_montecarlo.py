@@ -13,7 +13,7 @@ import pytest
 from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, _first, run_study, simulate_and_solve
 from alidade.pipelines.applications.session import Session, calibrate
 from alidade.pipelines.methods import method, names
-from alidade.pipelines.reports.result import truth_errors
+from alidade.pipelines.reports.result_json import truth_errors
 from benchmarks import consistency
 from tests.support.browser import fits
 from tests.support.fleet_command import alidade

@@ -136,12 +136,14 @@ def test_objects_that_cannot_be_read_cost_their_row(bucket: Bucket, recordings: 
         bucket.put(recordings / f"U{unit}.mcap", f"U{unit}.mcap")
     found = find(["s3://campaign/*.mcap"])
     bucket.store.rm("campaign/U1.mcap")
-    results = {name.rsplit("/")[-1]: calibrate_recording(each, Settings()) or {} for name, each in found.items()}
+    made = {name.rsplit("/")[-1]: calibrate_recording(each, Settings()) for name, each in found.items()}
+    results = {name: result for name, result in made.items() if result is not None}
     assert {name: result["exit_code"] for name, result in results.items()} == {"U0.mcap": 2, "U1.mcap": 2, "U2.mcap": 0}
     assert "sha256" in results["U0.mcap"]
     assert results["U1.mcap"]["reason"].startswith("s3://campaign/U1.mcap: cannot be read: ")
     bucket.server.stop()
-    unreached = calibrate_recording(found["s3://campaign/U2.mcap"], Settings()) or {}
+    unreached = calibrate_recording(found["s3://campaign/U2.mcap"], Settings())
+    assert unreached is not None
     assert unreached["exit_code"] == 2
     assert "s3://campaign/U2.mcap: cannot be read: Could not connect" in unreached["reason"]
     assert not {"sha256", "tag"} & {*results["U1.mcap"], *unreached}

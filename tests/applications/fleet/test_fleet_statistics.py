@@ -10,7 +10,7 @@ from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.analysis import Population, counting, populations
 from alidade.pipelines.applications.fleet.attention import units_of_interest
 from alidade.pipelines.applications.fleet.histories import History, change_table, histories, packed
-from alidade.pipelines.applications.fleet.store import Result
+from alidade.pipelines.applications.fleet.store import ParameterNumbers, UnitResult
 from alidade.pipelines.belief import independent
 from alidade.pipelines.solvers.posterior import told_of
 
@@ -90,19 +90,27 @@ def test_trend_is_the_weighted_line() -> None:
     assert statistics.trend(np.zeros(5), values[:5], sigmas[:5]) is None
 
 
-def a_fleet(seed: int, units: int = 30, dates: int = 3, wander: float = 0.0, slope: float = 0.0) -> dict[str, Result]:
+def a_fleet(
+    seed: int, units: int = 30, dates: int = 3, wander: float = 0.0, slope: float = 0.0
+) -> dict[str, UnitResult]:
     """Results of units whose parameter a is steady and b another in every session; SI."""
     rng = np.random.default_rng(seed)
-    results: dict[str, Result] = {}
+    results: dict[str, UnitResult] = {}
     for unit in range(units):
         own = 0.01 * rng.standard_normal()
         for date in range(dates):
             sigma = rng.uniform(0.001, 0.003)
             a = own + wander * date * (unit == 4) + slope * date + sigma * rng.standard_normal()
             b = 0.1 * rng.standard_normal()
-            parameters = {
-                name: {"value": value, "sigma": sigma, "unit": "rad", "require": 1e-2, "verdict": "observable"}
-                | {"inflation": 1.0}
+            parameters: dict[str, ParameterNumbers] = {
+                name: {
+                    "value": value,
+                    "sigma": sigma,
+                    "unit": "rad",
+                    "require": 1e-2,
+                    "verdict": "observable",
+                    "inflation": 1.0,
+                }
                 for name, value in (("a", a), ("b", b))
             }
             says = independent(["a", "b"], [a, b], [sigma, sigma])
@@ -120,7 +128,7 @@ def a_fleet(seed: int, units: int = 30, dates: int = 3, wander: float = 0.0, slo
     return results
 
 
-def judged(results: dict[str, Result]) -> tuple[list[Population], list[History]]:
+def judged(results: dict[str, UnitResult]) -> tuple[list[Population], list[History]]:
     found = histories(results, {name: counting(result) for name, result in results.items()})
     return populations(results, found), found
 

@@ -15,7 +15,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.printing import print_cube, tag_size
 from alidade.pipelines.methods.cube.topics import CubeConfig
 from alidade.pipelines.reports.calibration import SavedCalibration
-from alidade.pipelines.reports.export import exported
+from alidade.pipelines.reports.export_formats import exported
 
 RNG = np.random.default_rng(1)
 BIAS = {"accel": 0.3, "gyro": 0.02, "mag": 2e-5}

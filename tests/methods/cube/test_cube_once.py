@@ -11,7 +11,7 @@ import pytest
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.methods.cube import static_intervals
-from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.vision import pose
 
 POSES = 6

@@ -10,7 +10,9 @@ import pytest
 
 from alidade.factors import so3
 from alidade.pipelines.config import load_config
+from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.sphere_map import described
+from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods.cube.data import CubeData
 from alidade.pipelines.methods.cube.figures import cube_plots
@@ -19,7 +21,7 @@ from alidade.pipelines.methods.cube.graph import problem
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.triads import parts_of
-from alidade.pipelines.reports.result import Calibration, Plot, Table
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.config import load_config
+from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.methods.los.figures import los_plots
 from alidade.pipelines.methods.los.graph import problem
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.batch import solve_batch
 
 SCENARIO = LosScenario(duration_s=20.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)

@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.estimation.problem import Estimate, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
-    from alidade.pipelines.reports.result import Calibration, Plot
+    from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config
     from alidade.pipelines.simulation.simulated import Simulated
     from gyro_pair.recording import GyroPairData

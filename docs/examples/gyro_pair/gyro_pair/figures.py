@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from alidade.pipelines.diagnostics.cross_validation import rms
-from alidade.pipelines.display.figure import COLORS, Figure
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.reports.result import Calibration
 from gyro_pair.recording import GyroPairData
 from gyro_pair.validation import rates
 

@@ -1,4 +1,4 @@
-"""estimates.mcap: every parameter and its sigma over time, for Foxglove, Rerun and PlotJuggler.
+"""estimates.mcap and foxglove.json: every parameter and its sigma over time, for Foxglove, Rerun and PlotJuggler.
 
 One topic per parameter, `/estimate/<parameter>`, of one ROS 2 message whose definition stands in the file: Foxglove and
 PlotJuggler plot the numbers of any ROS 2 message as they come, and so does whatever reads the recordings themselves.
@@ -7,18 +7,22 @@ moves along has `/smoothed/<parameter>` as well: its value at each moment from t
 
 Rerun plots the messages that it knows. Of those of ROS sensor_msgs/JointState is the one with named numbers, which
 PlotJuggler shows by their names too: `/plot/<variable>` has a variable's values and the edges of their bands,
-`/sigma/<variable>` its sigmas, as positions.
+`/sigma/<variable>` its sigmas, as positions. foxglove.json is a layout that Foxglove or Lichtblick imports.
 """
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import cycle
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.display.figure import COLORS, PALETTE
 from alidade.pipelines.estimation.problem import Array, History
 from alidade.pipelines.recording.array_container import encode_series
 from alidade.pipelines.recording.messages import JOINT_STATE, definition_text
@@ -105,3 +109,56 @@ def _encode(stamps: NDArray[np.int64], value: Array, sigma: Array) -> NDArray[np
     out["sec"], out["nanosec"] = np.divmod(stamps, 1_000_000_000)
     out["numbers"] = np.column_stack([value, sigma, value - sigma, value + sigma])
     return out
+
+
+_PLOT = {
+    "showXAxisLabels": True,
+    "showYAxisLabels": True,
+    "showLegend": True,
+    "legendDisplay": "floating",
+    "showPlotValuesInLegend": True,
+    "isSynced": True,
+    "xAxisVal": "timestamp",
+    "sidebarDimension": 240,
+}
+
+
+def foxglove_layout(calibration: Calibration) -> str:
+    """The layout as JSON: a plot a variable, with the values of its numbers and the edges of their one-sigma bands."""
+    panels = {}
+    for title, unit, members in variables(calibration):
+        paths = [
+            {
+                "value": f"/estimate/{q.name}.{field}",
+                "label": q.name if field == "value" else f"{q.name} {field}",
+                "enabled": True,
+                "color": PALETTE[color][0],
+                "lineSize": 2 if field == "value" else 0.5,
+                "timestampMethod": "headerStamp",
+            }
+            for q, color in zip(members, cycle(COLORS))
+            for field in ("value", "lower", "upper")
+        ]
+        panels[f"Plot!{title}"] = {"title": f"{title}, {unit}", "paths": paths, **_PLOT}
+    layout = {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _split(list(panels), "row"),
+    }
+    return json.dumps(layout, indent=1) + "\n"
+
+
+def _split(panels: Sequence[str], direction: str) -> Any:
+    """Panels side by side and one above the other, in turns, as evenly as it goes."""
+    if len(panels) == 1:
+        return panels[0]
+    half = (len(panels) + 1) // 2
+    other = "column" if direction == "row" else "row"
+    return {
+        "direction": direction,
+        "first": _split(panels[:half], other),
+        "second": _split(panels[half:], other),
+        "splitPercentage": round(100 * half / len(panels)),
+    }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -16,10 +15,11 @@ import numpy as np
 from alidade.pipelines.applications.noise import NoiseStudy, SensorNoise
 from alidade.pipelines.diagnostics.allan import allan_variance
 from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
-from alidade.pipelines.display.figure import COLORS, Figure
-from alidade.pipelines.reports.answer import Answer
-from alidade.pipelines.reports.result import Plot, software_versions
-from alidade.pipelines.reports.templating import page
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
+from alidade.pipelines.reports.html import render_html
+from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
+from alidade.pipelines.reports.result import software_versions
 from alidade.pipelines.reports.whole import write_whole
 
 FILES = ("noise.html", "noise.json")
@@ -55,17 +55,6 @@ _UNITS: dict[str, dict[str, tuple[str, str, float]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Row:
-    """One coefficient of a sensor: name, unit people use, a cell for each axis; the same in SI."""
-
-    name: str
-    unit: str
-    cells: tuple[str, ...]
-    si_unit: str
-    si_cells: tuple[str, ...]
-
-
 def title(sensor: SensorNoise) -> str:
     """Topic and kind, rate and time at rest of a sensor, in a line."""
     count = len(sensor.rests)
@@ -73,22 +62,9 @@ def title(sensor: SensorNoise) -> str:
     rests = (
         f"at rest from {sensor.rests[0, 0]:.1f} to {sensor.rests[0, 1]:.1f} s"
         if count == 1
-        else f"{count} stretches at rest, {length(sensor.length_s)} in all, the longest {length(longest)}"
+        else f"{count} static intervals, {length(sensor.length_s)} in all, the longest {length(longest)}"
     )
     return f"{sensor.topic} {_TITLES[sensor.kind]}, {sensor.rate_hz:.4g} Hz, {rests}"
-
-
-def rows(sensor: SensorNoise) -> list[Row]:
-    """The coefficients of a sensor; quantisation only where it shows."""
-    out = []
-    for name, words in _COEFFICIENTS.items():
-        found = [_of(sensor, axis, name) for axis in sensor.axes]
-        if name == "Q" and all(c.value is None for c in found):
-            continue
-        si_unit, unit, factor = _UNITS[sensor.kind][name]
-        cells = tuple(_cell(c, factor) for c in found)
-        out.append(Row(f"{words} {name}", unit, cells, si_unit, tuple(_scientific(c) for c in found)))
-    return out
 
 
 def remarks(sensor: SensorNoise) -> list[str]:
@@ -128,7 +104,7 @@ def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
     """The config's keys with their values, and the `noise:` section to paste, with comments.
 
     A value is the root mean square over the axes. The first topic of a kind gives the keys, that of the platform its
-    own; what no key is for, or is not told, stands as a comment.
+    own; what has no key, or is not determined, stands as a comment.
     """
     values: dict[str, float] = {}
     lines = ["noise:"]
@@ -143,7 +119,7 @@ def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
 
 
 def noise_json(study: NoiseStudy) -> str:
-    """noise.json: everything, SI; null where something is not told or has no bound."""
+    """noise.json: everything, SI; null where a number is not determined or has no bound."""
     values, text = section(study)
     content = {
         "schema": "alidade.noise/1",
@@ -158,36 +134,57 @@ def noise_json(study: NoiseStudy) -> str:
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
 
-def noise_html(study: NoiseStudy) -> str:
-    """The page as one HTML text that opens offline."""
-    return page(
-        "alidade.pipelines.reports",
-        "noise.html",
-        [_plot(sensor) for sensor in study.sensors],
-        answer=_answer(study),
-        recording=study.recording,
-        section=section(study)[1],
-        sensors=[(list(sensor.axes), rows(sensor), remarks(sensor)) for sensor in study.sensors],
+def noise_report(study: NoiseStudy) -> Report:
+    """The report of a noise analysis."""
+    config = Section("For the config", (Code(section(study)[1], copied=True),))
+    sensors = (
+        Section(title(sensor), (_sensor_table(sensor), Bullets(tuple(remarks(sensor))), Plots((_plot(sensor),))))
+        for sensor in study.sensors
+    )
+    return Report(
+        title=f"Noise ({study.recording})",
+        heading="Noise of the sensors",
+        about=study.recording,
+        summary=_summary(study),
+        sections=(config, *sensors),
     )
 
 
-def _answer(study: NoiseStudy) -> Answer:
-    """Which coefficients the time at rest tells."""
+def _sensor_table(sensor: SensorNoise) -> Table:
+    """The coefficients of each axis, with SI in small print; quantisation only where it shows."""
+    rows: list[Row] = []
+    for name, words in _COEFFICIENTS.items():
+        found = [_of(sensor, axis, name) for axis in sensor.axes]
+        if name == "Q" and all(c.value is None for c in found):
+            continue
+        si_unit, unit, factor = _UNITS[sensor.kind][name]
+        cells = (Cell(_cell(c, factor), _scientific(c)) for c in found)
+        rows.append((f"{words} {name}", Cell(unit, si_unit), *cells))
+    columns: Columns = ("noise", Column("unit", "text", wide=True), *(Column(axis, wide=True) for axis in sensor.axes))
+    caption = (
+        "± one sigma; < not determined, below this with 95 % confidence. In small print the same in SI, as the config "
+        "has it."
+    )
+    return Table("", caption, columns, tuple(rows), style="", most_rows=None)
+
+
+def _summary(study: NoiseStudy) -> Summary:
+    """Which coefficients the time at rest determines."""
     silent = sum(
         _of(sensor, axis, name).value is None for sensor in study.sensors for axis in sensor.axes for name in "NBK"
     )
     asked = 3 * sum(len(sensor.axes) for sensor in study.sensors)
     question, notes = "What is the noise of the sensors?", tuple(note.removesuffix(".") for note in study.notes)
-    steps = ("Paste the section below into the config of your recordings.",)
+    steps = ("Paste the section `noise` into the config of your recordings.",)
     if not silent:
-        sentence = "White noise, bias instability and random walk of every axis are determined."
-        return Answer(question, "known", "good", sentence, notes, steps)
-    sentence = (
+        text = "White noise, bias instability and random walk of every axis are determined."
+        return Summary(question, "known", "good", text, notes, steps)
+    text = (
         f"{asked - silent} of {asked} coefficients (white noise, bias instability and random walk of each axis) are "
         "determined; for the others there are upper bounds."
     )
     longer = "Leave the sensors at rest for longer where the remarks ask for it, if you need the others."
-    return Answer(question, "known in part", "warn", sentence, notes, (*steps, longer))
+    return Summary(question, "known in part", "warn", text, notes, (*steps, longer))
 
 
 def write_noise(out_dir: Path, study: NoiseStudy) -> tuple[Path, ...]:
@@ -204,7 +201,7 @@ def length(seconds: float) -> str:
 
 
 def _make(folder: Path, study: NoiseStudy) -> None:
-    (folder / "noise.html").write_text(noise_html(study), encoding="utf-8")
+    (folder / "noise.html").write_text(render_html(noise_report(study)), encoding="utf-8")
     (folder / "noise.json").write_text(noise_json(study), encoding="utf-8")
 
 
@@ -239,12 +236,12 @@ def _needed(silent: Sequence[Coefficient]) -> str:
 def _line(sensor: SensorNoise, name: str, key: str, values: dict[str, float] | None) -> str:
     """A line of the section; the value goes into `values`, None: it stands as a comment."""
     found = {axis: _of(sensor, axis, name) for axis in sensor.axes}
-    told = [c.value for c in found.values() if c.value is not None]
+    known = [c.value for c in found.values() if c.value is not None]
     each = ", ".join(f"{axis} {_scientific(c)}" for axis, c in found.items())
     comment = f"{_UNITS[sensor.kind][name][0]}, {sensor.topic}: {each}"
-    if not told:
+    if not known:
         return f"  # {key}: {comment}"
-    value = float(f"{math.sqrt(sum(x * x for x in told) / len(told)):.3g}")
+    value = float(f"{math.sqrt(sum(x * x for x in known) / len(known)):.3g}")
     mantissa, exponent = f"{value:.2e}".split("e")
     text = f"{key}: {mantissa}e{int(exponent)}"
     if values is None:

@@ -9,11 +9,13 @@ from itertools import cycle
 import numpy as np
 
 from alidade.pipelines.diagnostics.device_changes import Change
-from alidade.pipelines.display.figure import COLORS, Figure, milliseconds
-from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.display.figure import COLORS, Figure, Plot, milliseconds
+from alidade.pipelines.display.table import Table
+from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.estimation.assumptions import kind
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.reports.result import Calibration, PartResult, Plot, Table
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import PartResult
 from alidade.pipelines.reports.sentences import between
 
 # Beyond so many days a forecast says nothing.
@@ -27,7 +29,7 @@ def forecasts(calibration: Calibration) -> list[tuple[str, str]]:
     changes = calibration.changes
     if changes is None:
         return []
-    told = []
+    forecast = []
     for q in calibration.problem.quantities:
         rate = changes.rates.get(kind(q.name))
         found = calibration.parameters.get(q.name)
@@ -37,8 +39,8 @@ def forecasts(calibration: Calibration) -> list[tuple[str, str]]:
         per_day = f"{rounded(factor * rate.rate)} {unit}".strip()
         at_most = rounded(factor * rate.upper) if math.isfinite(rate.upper) else "unknown"
         likely, soonest = (_days(q.require, found.sigma, each) for each in (rate.rate, rate.upper))
-        told.append((q.name, f"walks {per_day} in the root of a day (at most {at_most}); {_when(likely, soonest)}"))
-    return told
+        forecast.append((q.name, f"walks {per_day} in the root of a day (at most {at_most}); {_when(likely, soonest)}"))
+    return forecast
 
 
 def _days(require: float, sigma: float, rate: float) -> float:
@@ -54,19 +56,20 @@ def _when(likely: float, soonest: float) -> str:
     return f"within what is required {first}, {surely} for {min(soonest, _FAR_DAYS):.0f}"
 
 
-def recordings_shown(calibration: Calibration) -> list[Plot | Table]:
+def recording_blocks(calibration: Calibration) -> list[Plot | Table]:
     """Tables and figures for the report."""
     parts, known = calibration.recordings, {q.name: q for q in calibration.problem.quantities}
     rows = tuple((p.recording, p.start[:16].replace("T", " "), f"{p.duration_s:.0f} s", p.status) for p in parts)
     own = []
     for name in dict.fromkeys(n.name for p in parts for n in p.parameters if n.name in known):
         numbers = [next((n for n in p.parameters if n.name == name), None) for p in parts]
-        own.append((name, *("" if n is None else _shown(n.value, n.sigma, known[name]) for n in numbers)))
+        own.append((name, *("" if n is None else format_estimate(known[name], n.value, n.sigma) for n in numbers)))
     heads = ("parameter", *(p.recording for p in parts))
     changes = calibration.changes
     found = [] if changes is None else sorted(changes.found, key=lambda step: step.after)
     steps = tuple(
-        (what(s), _between(s.after, parts), _shown(s.size, s.sigma, known[s.name]), f"{s.z:+.1f}") for s in found
+        (what(s), _between(s.after, parts), format_estimate(known[s.name], s.size, s.sigma), f"{s.z:+.1f}")
+        for s in found
     )
     tables = [
         Table("Recordings", "In the order of their dates, each with its verdict by itself.", _RECORDINGS, rows),
@@ -106,10 +109,10 @@ def _figures(calibration: Calibration) -> list[Plot]:
 
 def _add(out: Figure, calibration: Calibration, q: Quantity, factor: float, color: str) -> None:
     parts, joint = calibration.recordings, calibration.parameters[q.name]
-    told = [(p.start, n) for p in parts for n in p.alone if n.name == q.name]
-    dates = milliseconds(start for start, _ in told)
-    values = factor * np.array([n.value - joint.value for _, n in told])
-    spread = 2.0 * factor * np.array([n.sigma for _, n in told])
+    alone = [(p.start, n) for p in parts for n in p.alone if n.name == q.name]
+    dates = milliseconds(start for start, _ in alone)
+    values = factor * np.array([n.value - joint.value for _, n in alone])
+    spread = 2.0 * factor * np.array([n.sigma for _, n in alone])
     out.segments(dates, values - spread, dates, values + spread, color, q.name)
     out.points(dates, values, q.name, color, 7)
     _band(out, calibration, q, factor, color)
@@ -148,9 +151,3 @@ def _between(after: int, parts: Sequence[PartResult]) -> str:
     """The dates, or names, of a recording and the next."""
     both = parts[after : after + 2]
     return between([part.recording for part in both], [part.start for part in both])
-
-
-def _shown(value: float, sigma: float, quantity: Quantity) -> str:
-    unit, factor = human_unit(quantity)
-    number, spread = (to_digits_of(factor * x, factor * sigma) for x in (value, sigma))
-    return f"{number} ± {spread} {unit}".strip()

@@ -1,0 +1,96 @@
+"""plan.html and what `plan` prints: whether a planned motion suffices, what would be better, error budgets."""
+
+from __future__ import annotations
+
+from alidade.pipelines import methods
+from alidade.pipelines.applications.planning import Plan
+from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
+from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
+from alidade.pipelines.display.units import human_unit, rounded
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.reports.budget import limits
+from alidade.pipelines.reports.calibration_report import direction_blocks
+from alidade.pipelines.reports.report import Code, Plots, Report, Section, Summary, Text
+
+# Bars of the plot end at so many times the requirement.
+_MAX_RATIO = 3.0
+
+
+def plan_report(plan: Plan) -> Report:
+    """The report of a planned motion."""
+    title = f"{methods.method(plan.method).title}: a planned motion"
+    motion = (
+        Code(plan.scenario_text),
+        Text("A scenario file for `alidade simulate` and `alidade plan`; what is not in it is as by default."),
+    )
+    return Report(
+        title=title,
+        heading=title,
+        about=f"{plan.now.duration:.0f} s, predicted from the noise that the scenario states; nothing was recorded.",
+        summary=_summary(plan),
+        sections=(
+            Section("Parameters", (_parameter_table(plan),)),
+            Section("Unobservable and weak directions", direction_blocks(plan.now.directions)),
+            Section("Plots", (Plots((_plot(plan),)),)),
+            Section("The better motion" if plan.steps else "The motion", motion, page_only=True),
+        ),
+    )
+
+
+def _parameter_table(plan: Plan) -> Table:
+    method, now, best = methods.method(plan.method), plan.now.sigmas, plan.best.sigmas
+    budgets = {limit.name: limit for limit in limits(plan.best.budget, plan.best.quantities)}
+    changed = ("with changes",) if plan.steps else ()
+    rows: list[Row] = []
+    for q in plan.now.quantities:
+        if not q.judged:
+            continue
+        unit, factor = human_unit(q)
+        sigmas = (q.require, now[q.name], *(best[q.name] for _ in changed))
+        source, share = budgets[q.name].parts[0] if q.name in budgets else ("", 0.0)
+        verdict = plan.now.verdicts[q.name]
+        cells: Row = (unit, *(rounded(factor * sigma) for sigma in sigmas), Cell(verdict, tone=verdict))
+        largest = f"{source}, {100.0 * share:.0f} %" if source else ""
+        rows.append((Cell(q.name, meaning(method, q.name)), *cells, largest))
+    columns: Columns = (
+        *("parameter", Column("unit", "text"), "required", "predicted"),
+        *changed,
+        *(Column("verdict", "text"), Column("limited by", "text", wide=True)),
+    )
+    caption = "Required and predicted are standard deviations in the unit of the row."
+    return Table("", caption, columns, tuple(rows), "parameters", "dense", None)
+
+
+def _summary(plan: Plan) -> Summary:
+    question, duration = "Does the planned motion determine what is wanted?", plan.now.duration
+    if not plan.now.missing:
+        text = f"This motion, {duration:.0f} s of it, determines everything as accurately as required."
+        return Summary(question, "yes", "good", text, (), ("Record it.",))
+    short = ", ".join(f"{name} by a factor of {rounded(ratio)}" for name, ratio in plan.now.missing.items())
+    steps = [
+        f"{step.change[:1].upper()}{step.change[1:]} ({step.gain:.1f} nats of what is missing)." for step in plan.steps
+    ]
+    if not steps:
+        steps = ["None of the changes tried determines what is missing; a tighter prior would."]
+    elif plan.best.missing:
+        left = ", ".join(f"{name} by {ratio:.2g}" for name, ratio in plan.best.missing.items())
+        steps.append(f"Still short with that: {left}.")
+    else:
+        steps.append(f"With that, {plan.best.duration:.0f} s determine everything as accurately as required.")
+    return Summary(question, "no", "bad", f"It falls short of {short}.", (), tuple(steps))
+
+
+def _plot(plan: Plan) -> Plot:
+    """Predicted over required sigmas."""
+    shown = [q for q in plan.now.quantities if q.judged and q.prior_sigma != 0.0]
+    out = Figure("sigma / required", "", x_labels=tuple(q.name for q in shown))
+    sides = [("planned", plan.now, BEFORE), *([("with changes", plan.best, COLORS[0])] if plan.steps else [])]
+    for i, (name, prediction, color) in enumerate(sides):
+        sigmas = prediction.sigmas
+        out.bars([min(sigmas[q.name] / q.require, _MAX_RATIO) for q in shown], name, color, (i, len(sides)))
+    out.levels(1.0)
+    caption = (
+        "Over those required: below the dotted line a parameter is as accurate as required. "
+        f"Bars end at {_MAX_RATIO:g}."
+    )
+    return Plot("Predicted sigmas", caption, out)

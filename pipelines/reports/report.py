@@ -1,0 +1,159 @@
+"""The view model of all pages, terminal output and notebooks: a summary, and sections of blocks.
+
+`html.py` renders a report as one page, `terminal.py` prints it; whoever has something to show builds a `Report`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from alidade.pipelines.display.figure import Plot
+from alidade.pipelines.display.table import Table
+
+Tone = Literal["good", "warn", "bad", "fixed"]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The first box of a page: a question, its answer, and what to do next.
+
+    Attributes:
+        question: that the report answers.
+        answer: in a few words.
+        tone: good, warn, bad, or fixed where it is neither.
+        text: the answer in sentences; `code` stands between backquotes.
+        notes: what a reader must know beside it, without full stops.
+        next_steps: what to do now, one sentence each.
+    """
+
+    question: str
+    answer: str
+    tone: Tone
+    text: str
+    notes: tuple[str, ...] = ()
+    next_steps: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph, in small print if `soft`; `code` stands between backquotes."""
+
+    text: str
+    soft: bool = True
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of sentences; `code` stands between backquotes."""
+
+    items: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Code:
+    """Preformatted text; `copied`: with a button that copies it."""
+
+    text: str
+    copied: bool = False
+
+
+@dataclass(frozen=True)
+class Svg:
+    """A drawing of the project's own, as SVG."""
+
+    markup: str
+
+
+@dataclass(frozen=True)
+class Details:
+    """Blocks that a page folds under a line; `style` and `id` are those of style.css."""
+
+    summary: str
+    blocks: tuple[Block, ...]
+    style: str = ""
+    id: str = ""
+
+
+@dataclass(frozen=True)
+class Card:
+    """Blocks in one box; `style` and `id` are those of style.css."""
+
+    blocks: tuple[Block, ...]
+    title: str = ""
+    id: str = ""
+    style: str = ""
+
+
+@dataclass(frozen=True)
+class Plots:
+    """Figures beside one another."""
+
+    plots: tuple[Plot, ...]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Tables beside one another on paper."""
+
+    tables: tuple[Table, ...]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Names and what they stand for, one below the other."""
+
+    items: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Signature:
+    """A line to sign, with the name below."""
+
+    name: str
+
+
+Block = Pairs | Signature | Text | Bullets | Code | Svg | Details | Card | Plots | Tables | Table
+
+
+@dataclass(frozen=True)
+class Section:
+    """Blocks under a heading; those for pages only are not printed in a terminal."""
+
+    title: str
+    blocks: tuple[Block, ...]
+    page_only: bool = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """A page.
+
+    Attributes:
+        title: of the window.
+        heading: of the page.
+        about: the line below the heading.
+        sections: in their order; those without blocks are left out.
+        summary: what comes first.
+        style: of the page, "wide" for large tables.
+    """
+
+    title: str
+    heading: str
+    about: str
+    sections: tuple[Section, ...]
+    summary: Summary | None = None
+    style: Literal["", "wide", "certificate"] = ""
+
+
+def plots_of(blocks: Sequence[Block]) -> list[Plot]:
+    """All plots in the order of the page."""
+    found: list[Plot] = []
+    for block in blocks:
+        match block:
+            case Plots(plots):
+                found += plots
+            case Card(inner) | Details(_, inner):
+                found += plots_of(inner)
+    return found

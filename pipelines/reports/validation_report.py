@@ -1,0 +1,130 @@
+"""validation.html and what `validate` prints: whether a calibration holds, errors before and after compensation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from alidade.pipelines.diagnostics.cross_validation import Validation, peak, rms
+from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
+from alidade.pipelines.display.table import Cell, Column, Table
+from alidade.pipelines.display.units import human_unit, to_digits_of
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.reports.html import render_html
+from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
+from alidade.pipelines.reports.whole import write_page
+
+if TYPE_CHECKING:
+    from alidade.pipelines.applications.validate import Validated
+
+FILE = "validation.html"
+# Angles smaller than this, rad, are shown in arc seconds.
+_FINE_RAD = 2e-4
+# Verdict -> answer, tone and next steps.
+_ANSWERS: Mapping[str, tuple[str, Tone, tuple[str, ...]]] = {
+    "holds": ("yes", "good", ("Continue to use it.",)),
+    "changed": (
+        "no",
+        "bad",
+        (
+            "Do not use it any longer: run `alidade calibrate` on this recording, and apply the result.",
+            "If the change is larger than wear explains, look at mounts and screws first.",
+        ),
+    ),
+    "unknown": ("cannot say", "warn", ("Record a motion as for a calibration, so that the parameters can be seen.",)),
+    "same": ("cannot say", "fixed", ("Validate on a recording that the calibration was not made from.",)),
+}
+
+
+def validation_report(validated: Validated) -> Report:
+    """The report of a validation."""
+    calibration = validated.calibration
+    source, title = calibration.recording, method(calibration.method).title
+    answer, tone, steps = _ANSWERS[validated.verdict]
+    notes = tuple(note.removesuffix(".") for note in validated.notes)
+    return Report(
+        title=f"{title} validation ({validated.recording})",
+        heading=f"{title}: an earlier calibration on a new recording",
+        about=(
+            f"{validated.recording}, with the calibration from {source.file} of {source.start[:16].replace('T', ' ')} "
+            f"UTC ({calibration.solver} solver, {calibration.status}; SHA-256 of its recording {source.sha256[:16]}…)"
+        ),
+        summary=Summary("Is the calibration still valid?", answer, tone, validated.sentence, notes, steps),
+        sections=(
+            Section("Change since the calibration", _changes(validated)),
+            Section("Errors before and after compensation", (_error_table(validated),)),
+            Section("Plots", (Plots(tuple(_plot(v) for v in validated.validations)),)),
+        ),
+    )
+
+
+def write_validation(out_dir: Path, validated: Validated) -> Path:
+    """Write validation.html; returns its path. Raises InputError when it cannot be written."""
+    return write_page(out_dir, FILE, render_html(validation_report(validated)))
+
+
+def _changes(validated: Validated) -> tuple[Block, ...]:
+    """The change of each parameter that is compared, and the smallest one that would be significant."""
+    if validated.held is None:
+        return ()
+    rows = []
+    for step in validated.held.steps:
+        unit, factor = human_unit(validated.held.quantities[step.name])
+        numbers = (step.size, step.sigma, validated.held.changes.limit * step.sigma)
+        change, sigma, threshold = (to_digits_of(factor * x, factor * step.sigma) for x in numbers)
+        name = Cell(step.name, meaning(method(validated.calibration.method), step.name))
+        rows.append((name, change, sigma, threshold, unit))
+    caption = (
+        "Change: this recording's estimate less the calibration's. Threshold: beyond it a change is significant "
+        "(p = 0.05 for all parameters together)."
+    )
+    columns = ("parameter", "change", "sigma", "threshold", Column("unit", "text"))
+    return (Table("", caption, columns, tuple(rows), "changes", most_rows=None),) if rows else ()
+
+
+def _error_table(validated: Validated) -> Table:
+    """RMS and peak of each kind of error, before and after compensation."""
+    others = [{v.name: rms(v.after) for v in each} for each in (validated.device, validated.best)]
+    rows = []
+    for v in validated.validations:
+        unit, factor = _unit(v)
+        after = (each.get(v.name) for each in others)
+        sizes = (rms(v.before), rms(v.after), *after, peak(v.before), peak(v.after))
+        rows.append((v.name, *("" if size is None else _three_digits(factor * size) for size in sizes), unit))
+    caption = (
+        "RMS is the root mean square. After is with the calibration as it is; device with its device parameters and "
+        "this recording's own bias, time offset and the like; expected with this recording's own calibration, which is "
+        "what one that holds would leave."
+    )
+    heads = ("RMS before", "RMS after", "RMS, device", "RMS expected", "peak before", "peak after")
+    columns = (Column(head, group=head[:3]) for head in heads)
+    return Table("", caption, ("error", *columns, Column("unit", "text")), tuple(rows), "errors", most_rows=None)
+
+
+def _three_digits(number: float) -> str:
+    return np.format_float_positional(number, precision=3, fractional=False, trim="-")
+
+
+def _plot(validation: Validation) -> Plot:
+    unit, factor = _unit(validation)
+    out = Figure(f"error, {unit}")
+    for name, errors, color in (("before", validation.before, BEFORE), ("after", validation.after, COLORS[0])):
+        out.points(validation.time, factor * np.linalg.norm(errors, axis=1), name, color, 3)
+    note = f" {validation.note[:1].upper()}{validation.note[1:]}." if validation.note else ""
+    caption = f"Length of the error over time, before and after compensation.{note}"
+    return Plot(f"{validation.name[:1].upper()}{validation.name[1:]}", caption, out)
+
+
+def _unit(validation: Validation) -> tuple[str, float]:
+    """Unit to show and its factor from SI, the same before and after compensation."""
+    if validation.unit != "rad":
+        return validation.unit, 1.0
+    if validation.micro:
+        return "µrad", 1e6
+    fine = rms(validation.after) < _FINE_RAD
+    return ("arcsec", math.degrees(3600.0)) if fine else ("deg", math.degrees(1.0))
