@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -32,7 +33,7 @@ from alidade.pipelines.estimation.problem import (
     Residuals,
     Told,
 )
-from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem
+from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
     Influence,
@@ -130,9 +131,11 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
     engine: Engine = compiled.engine
     solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config.robust)
     if levels is None and problem.marginal_likelihood and isinstance(engine, Linearization):
-        if solution.converged and any(level.noise.estimated for level in start):
-            compiled, solution, start = solve_likelihood(compiled, solution, start, config.robust.minimizer)
-            problem = compiled.problem
+        # Noise far from what was stated may be why there is no minimum yet.
+        if np.isfinite(solution.cost) and any(level.noise.estimated for level in start):
+            with suppress(*(() if solution.converged else (IndeterminateStateError,))):
+                compiled, solution, start = solve_likelihood(compiled, solution, start, config.robust.minimizer)
+                problem = compiled.problem
     elif levels is None:
         solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)

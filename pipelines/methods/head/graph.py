@@ -204,11 +204,12 @@ def _prepare(
     time, pictures = time[late:], pictures[late:] - pictures[late]
     frames = slice(len(taken) - pictures[-1], None)
     stamps, taken, measured = stamps[frames], taken[frames], measured[frames]
+    gyro = GyroPath(data.head_t, data.head_gyro, bias_hat, acting(parameters.gyro, drivers))
     chain = GyroChain.over(
         time,
         np.arange(len(time)) == 0,
-        so3.interpolate(taken, so3.multiply(measured, so3.inverse(vRh)), time),
-        GyroPath(data.head_t, data.head_gyro, bias_hat, acting(parameters.gyro, drivers)),
+        _between(gyro, platform, taken, so3.multiply(measured, so3.inverse(vRh)), time),
+        gyro,
         density=density,
         other_density=platform_density,
         walk=noises["gyro_bias_walk"].used,
@@ -234,6 +235,17 @@ def _prepare(
         reference=reference,
         noises=noises,
     )
+
+
+def _between(gyro: GyroPath, platform: GyroPath | None, taken: Array, bRv: Array, at: Array) -> Array:
+    """Attitudes at some times (n, 4) from those of pictures, carried by the gyros: gaps may hold more than a turn."""
+
+    def held(times: Array) -> tuple[Array, Array]:
+        return so3.identity(len(times)) if platform is None else platform.attitude(times), gyro.attitude(times)
+
+    (base, own), (base_at, own_at) = held(taken), held(at)
+    frame = so3.interpolate(taken, so3.compose(base, bRv, so3.inverse(own)), at)
+    return so3.compose(so3.inverse(base_at), frame, own_at)
 
 
 def _all_around(attitudes: Array) -> bool:

@@ -10,8 +10,10 @@ from typer.testing import CliRunner
 
 import alidade
 from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.estimation.problem import Array, Attitudes
+from alidade.pipelines.methods.head.graph import _between
 from alidade.pipelines.methods.head.recording import HeadData, write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.head.trajectory import carried
@@ -100,3 +102,14 @@ def test_other_methods_and_rates_are_refused_in_a_line() -> None:
         alidade.calibrate(simulated, attitude_rate="gyro")
     with pytest.raises(alidade.InputError, match="no attitude rate 'imu'; there are vision, gyro"):
         alidade.calibrate(simulated, attitude_rate="imu")  # type: ignore[arg-type]
+
+
+def test_first_attitudes_in_a_gap_of_more_than_a_turn() -> None:
+    """Two pictures two seconds apart, 8 rad: between them the gyro tells, not the shortest way."""
+    t, rate = np.arange(0.0, 4.0, 0.01), np.array([0.5, -1.0, 4.0])
+    gyro = GyroPath(t, np.tile(rate, (len(t), 1)))
+    truth = so3.exp(np.linspace(0.5, 3.5, 25)[:, None] * rate)
+    seen = so3.multiply(so3.exp(np.array([0.3, 0.2, 0.1])), truth[[0, 4, 20, 24]])
+    found = _between(gyro, None, np.linspace(0.5, 3.5, 25)[[0, 4, 20, 24]], seen, np.linspace(0.5, 3.5, 25))
+    expected = so3.multiply(so3.exp(np.array([0.3, 0.2, 0.1])), truth)
+    assert np.linalg.norm(so3.log(so3.multiply(so3.inverse(expected), found)), axis=1).max() < 1e-6
