@@ -315,13 +315,13 @@ def _divided(measured: Array, added: Mapping[str, Array], lengths: Mapping[str, 
     Directions to which no family has added count with the longest.
     """
     longest = max(lengths.values())
-    floor = _ROUNDING * max((float(np.trace(each)) for each in added.values()), default=1.0) * np.eye(len(measured))
-    whole, parts = floor.copy(), floor / longest
+    least = _ROUNDING * max((float(np.trace(each)) for each in added.values()), default=1.0)
+    whole, parts = least * np.eye(len(measured)), least / longest * np.eye(len(measured))
     for family, each in added.items():
         whole += each
         parts += each / lengths.get(family, 1.0)
     values, vectors = np.linalg.eigh(whole)
-    inverse_root = (vectors / np.sqrt(values)) @ vectors.T
+    inverse_root = (vectors / np.sqrt(np.maximum(values, least))) @ vectors.T  # below it is rounding
     values, vectors = np.linalg.eigh(measured)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return np.asarray(root @ inverse_root @ parts @ inverse_root @ root)
