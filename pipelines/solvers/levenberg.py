@@ -113,8 +113,8 @@ class Engine(Protocol):
         """The engine with other measurements at the same variables."""
 
 
-# Decrease of the cost over the one predicted above which a step is lengthened: along it the cost is no parabola, and
-# falls on, as it does about a saddle, where the ratio is 2.
+# Decrease of the cost over the one predicted above which a step is doubled: along it the cost is no parabola, and falls
+# on, as it does about a saddle, where the ratio is 2.
 _DOUBLE = 1.5
 # Damping of a correction over that of the step.
 _FIRMER = 100.0
@@ -127,7 +127,8 @@ class LevenbergConfig:
     Attributes:
         max_iterations: linear systems solved.
         cost_tolerance: stop when the predicted decrease is below it (squared sigmas): no number is off its minimum by
-            more than the root of it, in its own sigmas, and by far less once the step is taken.
+            more than the root of it, in its own sigmas, and by far less once the step is taken. Sigmas are as large as
+            the residuals where these are larger than stated.
         prediction_tolerance: error of the predicted decrease of an undamped step below which that step is the last.
         curved_tolerance: predicted decrease of an undamped step, corrected, below which it may raise the cost at a
             minimum: what the data hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
@@ -202,15 +203,16 @@ def minimize(
 
     if not np.isfinite(here.cost):
         return solution(False, "the residuals at the start are not finite")
+    rows = sum(len(group.model.time) * group.model.rows for group in engine.groups if group.is_measurement)
     while iteration < config.max_iterations:
-        iteration += 1
+        iteration, enough = iteration + 1, _enough(config, here, rows)
         step, predicted = _step(here.system, damping)
         if step is not None:
-            there, corrections = _reached(engine, here, step, predicted, damping, config)
+            there, corrections = _reached(engine, here, step, max(predicted, enough), damping, config)
             iteration += corrections
             decrease = here.cost - there.cost
-            is_minimum = _is_minimum(config, here.cost, damping, predicted, decrease)
-            if decrease > 0.0:
+            is_minimum = _is_minimum(config, enough, damping, predicted, decrease)
+            if decrease > 0.0 or (is_minimum and decrease > -enough):
                 here = there
             if is_minimum:
                 return solution(True, f"converged after {iteration} iterations")
@@ -218,10 +220,9 @@ def minimize(
                 served = damping or served
                 ratio = decrease / predicted if predicted > 0.0 else 1.0
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-                damping, growth = (
-                    (0.0 if damping < config.min_damping or predicted < config.determined_tolerance else damping),
-                    2.0,
-                )
+                growth = 2.0
+                if damping < config.min_damping or predicted < config.determined_tolerance:
+                    damping = 0.0
                 continue
         damping, growth = (damping * growth if damping > 0.0 else served), 2.0 * growth
         if damping > config.max_damping:
@@ -229,9 +230,8 @@ def minimize(
     return solution(False, f"not converged after {iteration} iterations")
 
 
-def _is_minimum(config: LevenbergConfig, cost: float, damping: float, predicted: float, decrease: float) -> bool:
+def _is_minimum(config: LevenbergConfig, enough: float, damping: float, predicted: float, decrease: float) -> bool:
     """Whether a step, by its damping and the decrease of the cost, shows that where it ends is a minimum."""
-    enough = _enough(config, cost)
     if damping > 0.0:
         determined = damping <= config.initial_damping and predicted < config.determined_tolerance
         return determined and (decrease <= 0.0 or damping == config.initial_damping)
@@ -242,10 +242,9 @@ def _is_minimum(config: LevenbergConfig, cost: float, damping: float, predicted:
 def _reached(
     engine: Engine, here: _Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
 ) -> tuple[_Point, int]:
-    """Where a step leads, lengthened or corrected, and the number of corrections."""
+    """Where a step leads, its length or its end corrected, and the number of corrections."""
     there = _Point.of(engine, engine.layout.retract(here.values, step))
-    enough = _enough(config, here.cost)
-    if here.cost - there.cost > _DOUBLE * predicted > _DOUBLE * enough:
+    if here.cost - there.cost > _DOUBLE * predicted:
         return _lengthened(engine, here.values, step, there.cost), 0
     if there.cost < here.cost or config.corrections == 0:
         return there, 0
@@ -275,18 +274,16 @@ def _lengthened(engine: Engine, values: Values, step: Tangent, cost: float) -> _
     length = 1.0
 
     def ahead(length: float) -> Values:
-        return engine.layout.retract(
-            values, Tangent(*(length * part for part in (step.states, step.nodes, step.shared)))
-        )
+        return engine.layout.retract(values, step.times(length))
 
     while (further := engine.cost(ahead(2.0 * length))) < cost:
         length, cost = 2.0 * length, further
     return _Point.of(engine, ahead(length))
 
 
-def _enough(config: LevenbergConfig, cost: float) -> float:
-    """A decrease that is none: the tolerance, and rounding of the cost."""
-    return config.cost_tolerance + 1e-13 * cost
+def _enough(config: LevenbergConfig, point: _Point, rows: int) -> float:
+    """A decrease that is none: the tolerance, in squared sigmas as large as residuals of so many rows, and rounding."""
+    return config.cost_tolerance * max(1.0, point.system.squares / max(rows, 1)) + 1e-13 * point.cost
 
 
 def _step(system: System, damping: float) -> tuple[Tangent | None, float]:

@@ -405,8 +405,9 @@ def sqrt_information(
     reported = Reported.of(problem, layout, values, current_keys)
     c, J = layout.sizes[3], reported.jacobian
     inverse = np.linalg.pinv(J)[c:]
-    named = np.array([reported.names[i] in device for i in reported.free], dtype=bool)
-    groups, prior_R, prior_d = [], [np.empty((0, len(named)))], [np.empty(0)]
+    named = np.array([name in device for name in reported.names], dtype=bool)
+    scales = np.array([q.prior_scale for q in problem.quantities])
+    groups, prior_R, prior_d = [], [np.empty((0, len(reported.free)))], [np.empty(0)]
     for group in engine.groups:
         if group.target == "shared" and group.family == "prior":
             rows, _ = group.rows(values, layout.sizes[4] + 1)
@@ -414,7 +415,7 @@ def sqrt_information(
             # The first node of a bias that walks has a prior, and is not what is reported.
             off = np.abs(whole @ J - np.pad(rows[..., :-1], ((0, 0), (0, 0), (c, 0)))).max(axis=2)
             about = whole[..., reported.free]
-            of_device = _about_alone((about * reported.scale).reshape(-1, len(named)), named).reshape(rows.shape[:2])
+            of_device = _about_alone((whole * scales).reshape(-1, len(named)), named).reshape(rows.shape[:2])
             of_device &= off <= UNSEEN**0.5 * np.abs(rows[..., :-1]).max(axis=2)
             prior_R.append(about[of_device])
             prior_d.append(rows[of_device, -1])

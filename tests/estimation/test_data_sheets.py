@@ -18,7 +18,7 @@ from alidade.pipelines.methods.indexer.parameters import ASSUMPTIONS as INDEXER
 from alidade.pipelines.methods.los.parameters import ASSUMPTIONS as LOS
 from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.methods.tumble import turning
-from alidade.pipelines.methods.tumble.recording import SLOPES
+from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
 from alidade.pipelines.settings import Sensors
 from docs._site.tables import SHEETS, default_sigmas
 from tests.install.walk import steps
@@ -29,7 +29,7 @@ ASSUMED: dict[str, Sequence[Assumption]] = {
     "head": HEAD,
     "indexer": INDEXER,
     "cube": (*CUBE, FIELD),
-    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD),
+    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD, ACCEL_SQUARE),
 }
 DEFAULTS = {
     (method, f"{each.sheet}.{each.figure}"): each.sigma for method, assumed in ASSUMED.items() for each in assumed

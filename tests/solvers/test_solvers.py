@@ -211,7 +211,7 @@ def test_fixed_quantities_cost_the_others_no_digits() -> None:
 def test_where_measurements_do_not_fit_steps_get_the_right_length(pictures_hz: float) -> None:
     """A gyro warms up and nobody says so: residuals are tens of sigmas, and bend the error as much as Jacobians do.
 
-    With full steps alone 49 and 54 iterations, most of them for the same share of what is left.
+    With full steps alone 49 and 58 iterations, most of them for the same share of what is left.
     """
     scenario = LosScenario.model_validate(
         {"duration_s": 30.0, "image_rate_hz": pictures_hz, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
