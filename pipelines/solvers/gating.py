@@ -30,6 +30,8 @@ MAX_REJECTED_IN_A_ROW = 10
 FALSE_ALARM = 1e-3
 # Outliers are a minority of every family of measurements.
 MAX_OUTLIER_SHARE = 0.5
+# Variance, in units of the priors', of which the inverse less the priors' still has four digits of these.
+_LEAST_VARIANCE = 1e-12
 # Information in units of that of the priors below which it is rounding.
 _ROUNDING = 1e-9
 
@@ -300,12 +302,15 @@ def correlation_inflation(
     own = problem.prior_covariance([problem.quantities[i].name for i in free], scale) / np.outer(scale, scale)
     known = np.array([problem.quantities[i].prior_sigma is not None for i in free], dtype=float)
     prior = np.linalg.inv(own) * np.outer(known, known)
-    measured = (vectors / np.maximum(variance, _ROUNDING**2)) @ vectors.T - prior
+    measured = (vectors / np.maximum(variance, _LEAST_VARIANCE)) @ vectors.T - prior
     unit = to_tangents[:, free] * scale
     added = {family: unit.T @ each @ unit for family, each in gate.information.items()}
-    information, vectors = np.linalg.eigh(prior + _divided(measured, added, lengths))
+    # With C the covariance and L what is lost of its information, (C^-1 - L)^-1 is C^1/2 (1 - C^1/2 L C^1/2)^-1 C^1/2.
+    root = vectors * np.sqrt(np.maximum(variance, 0.0))
+    left, axes = np.linalg.eigh(np.eye(len(root)) - root.T @ (measured - _divided(measured, added, lengths)) @ root)
+    root = root @ (axes / np.sqrt(np.maximum(left, 1.0 / max(lengths.values()))))
     grown = covariance.copy()
-    grown[block] = (vectors / information) @ vectors.T * np.outer(scale, scale) + np.diag(extra**2)
+    grown[block] = root @ root.T * np.outer(scale, scale) + np.diag(extra**2)
     return grown, lengths
 
 
