@@ -433,7 +433,7 @@ class IncrementalSolver:
         posterior = self._posterior()
         unknown = np.zeros(len(posterior.covariance), dtype=bool)
         if self.initialising and not decided:
-            unknown = self._beyond[posterior.reported.free] | self.gate.too_few_to_decide()
+            unknown = self._beyond[posterior.reported.free] | self.gate.too_few_to_decide() | bool(self.trouble)
         return posterior.at_prior(np.hstack([np.eye(len(unknown))[:, unknown], posterior.weak(unknown)]))
 
     def _posterior(self) -> _Posterior:

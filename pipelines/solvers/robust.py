@@ -68,7 +68,14 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
     # Inside the gate the truncated loss is no other than plain least squares.
     same = start is found.values and truncated.cost(start) == found.cost
     final = solve_truncated(engine, start, loss, config, (found.system, found.cost) if same else None)
-    return replace(final, iterations=iterations + more + final.iterations)
+    iterations += more + final.iterations
+    if any(group.is_measurement and group.loss is None for group in final.engine.groups):
+        # Among few measurements outliers may lead astray, to where most are rejected; the first guess is near.
+        near = minimize(truncated, values, config.minimizer)
+        iterations += near.iterations
+        if near.cost < truncated.cost(final.values) and not _mostly_rejected(truncated, near.values, config.max_chance):
+            final = near
+    return replace(final, iterations=iterations)
 
 
 def solve_truncated(
