@@ -274,17 +274,16 @@ def compare(
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
         opened = OpenOptions(method, config, strict, auto_topics, prior=prior).read(session)
         calibrations = opened.calibrations(["published", "batch", "incremental"], kept)
-    if as_json:
-        terminal.show_json(calibrations)
-    else:
-        terminal.print_calibrations(calibrations)
-    if out is not None:
-        with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
+        if as_json:
+            terminal.show_json(calibrations)
+        else:
+            terminal.print_calibrations(calibrations)
+        if out is not None:
             with progress.doing("solving parts of the recording"):
                 tested = opened.cross_validate()
             written = write_compare(out, calibrations, *tested)
-        if not as_json:
-            terminal.say(f"Comparison in {written}")
+            if not as_json:
+                terminal.say(f"Comparison in {written}")
 
 
 @app.command()

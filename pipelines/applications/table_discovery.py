@@ -363,12 +363,5 @@ def _flow(value: object) -> str:
 
 def _word(text: str) -> str:
     """Quoted where YAML would take it for something else."""
-    plain = re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_/. ^-]*", text) and text.lower() not in (
-        "y",
-        "n",
-        "yes",
-        "no",
-        "on",
-        "off",
-    )
+    plain = re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_/. ^-]*", text) and text.lower() not in _YAML_WORDS
     return text if plain else '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

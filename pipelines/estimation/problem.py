@@ -278,7 +278,6 @@ class Problem:
             smoother, many in batch, where fewer and larger factors are faster). Steps of many end where some of one do.
         loss: shared by all measurements that may be outliers; the batch solver anneals it. None: no outliers expected.
         attitudes: the trajectory at some keyframes, given values that hold them; None when the method has none.
-        attitude_name: what the trajectory is, e.g. "bRv".
         at_gyro_rate: the trajectory at each sample of the gyro, from an estimate's and its values by name. None: the
             method has no such.
         advice: what to do about a weak direction, given its weights by parameter name.
@@ -308,7 +307,6 @@ class Problem:
     steps: Callable[[int], Iterator[Step]]
     loss: TruncatedLoss | None = None
     attitudes: Callable[[Sequence[int], gtsam.Values], Attitudes] | None = None
-    attitude_name: str = ""
     at_gyro_rate: Callable[[Attitudes, Mapping[str, float]], Attitudes] | None = None
     advice: Callable[[Mapping[str, float]], Motion] | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)

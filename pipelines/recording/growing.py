@@ -65,8 +65,12 @@ class GrowingMcap(McapFile):
         self._walk(stream, self.size, is_growing=True)
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
-        """Messages of each channel in one block, however small the recorder's chunks are, but for large messages."""
+        """Messages of each channel in one block, however small the recorder's chunks are.
+
+        From its first large message on those of a channel come chunk by chunk, in their order.
+        """
         found: dict[int, list[MessageBlock]] = {}
+        large: set[int] = set()
         with self._open() as stream:
             for block in self._view:
                 wanted = channels & block.counts.keys()
@@ -75,16 +79,27 @@ class GrowingMcap(McapFile):
                     kept = {}
                 for messages in self._messages(stream, block, wanted - kept.keys()):
                     if messages.size.max(initial=0) > MAX_KEPT_BYTES:
+                        large.add(messages.channel)
+                        yield from _joined(found.pop(messages.channel, []))
                         yield messages
                     else:
                         kept[messages.channel] = _compact(messages)
                 self._kept[block.start] = block.end, kept
                 for number in wanted & kept.keys():
-                    found.setdefault(number, []).append(kept[number])
-        for number, parts in found.items():
-            size, log_ns = (np.concatenate(each) for each in zip(*((p.size, p.log_ns) for p in parts), strict=True))
-            buffer = np.concatenate([part.buffer for part in parts])
-            yield MessageBlock(number, buffer, np.cumsum(size) - size, size, log_ns)
+                    if number in large:
+                        yield kept[number]
+                    else:
+                        found.setdefault(number, []).append(kept[number])
+        for parts in found.values():
+            yield from _joined(parts)
+
+
+def _joined(parts: Sequence[MessageBlock]) -> Iterator[MessageBlock]:
+    """Compact blocks of one channel as one; none of none."""
+    if parts:
+        size, log_ns = (np.concatenate(each) for each in zip(*((p.size, p.log_ns) for p in parts), strict=True))
+        buffer = np.concatenate([part.buffer for part in parts])
+        yield MessageBlock(parts[0].channel, buffer, np.cumsum(size) - size, size, log_ns)
 
 
 class GrowingFiles:

@@ -177,7 +177,9 @@ class McapFile(Container):
                 raise InputError(
                     f"{self.path}: the attachment {name} is damaged ({damaged}); a config can be given with --config"
                 ) from damaged
-            self.losses.append(DataLoss("attachment", at, length, reason=name))
+            loss = DataLoss("attachment", at, length, reason=name)
+            if loss not in self.losses:
+                self.losses.append(loss)
             return None
 
     def _open(self) -> BinaryIO:

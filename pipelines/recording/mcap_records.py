@@ -164,7 +164,7 @@ def index_is_complete(buffer: NDArray[np.uint8], index: Mapping[int, NDArray[np.
     """
     offsets = np.concatenate([*index.values(), np.empty(0, np.int64)])
     numbers = np.repeat(list(index), [len(one) for one in index.values()])
-    if len(offsets) and not (offsets.min() >= 0 and offsets.max() + MESSAGE_HEAD.itemsize <= len(buffer)):
+    if len(offsets) and not (offsets.min() >= 0 and offsets.max() <= len(buffer) - MESSAGE_HEAD.itemsize):
         return False
     heads = byte_windows(buffer, MESSAGE_HEAD.itemsize)[offsets].view(MESSAGE_HEAD)
     length = heads["length"]

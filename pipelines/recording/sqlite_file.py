@@ -64,7 +64,7 @@ class SqliteFile(Container):
             cursor = iter(database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"))
             while True:
                 try:
-                    row = next(cursor, None)
+                    row = next(cursor, None) if any(left.values()) else None
                 except (sqlite3.Error, OverflowError, MemoryError) as error:
                     row, reason = None, str(error)
                 if row is not None:

@@ -301,6 +301,7 @@ class _Described(ArrayContainer):
 
     def __init__(self, table: CsvFile, topics: Mapping[str, series.Topic]) -> None:
         super().__init__(table.path, topics, data=table.data)
+        self.temporary, self.incomplete = table.temporary, table.incomplete
         self._video_paths = [video.path for video in _videos(topics)]
 
     def sha256(self) -> str:

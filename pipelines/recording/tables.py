@@ -89,7 +89,7 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
     """
     form = table_form(path, data)
     if not form.width:
-        raise _unknown(path, ": no line of numbers in it")
+        raise InputError(f"{path}: no line of numbers in it")
     if _is_trajectory(path, data, form):
         return ArrayContainer(path, {"/trajectory": _trajectory(path, data, form)})
     columns = ", ".join(form.names[:40])

@@ -53,7 +53,9 @@ def comparison_report(
         title=f"{first.method.title} comparison ({first.recording})",
         heading=f"{first.method.title}: solvers compared",
         about=f"{first.recording}: {', '.join(f'{c.estimate.solver} {c.status}' for c in calibrations)}",
-        summary=replace(_split_half_test(halves, predicted), notes=(stopped.removesuffix("."),) if stopped else ()),
+        summary=replace(
+            _split_half_test(halves, predicted, bool(stopped)), notes=(stopped.removesuffix("."),) if stopped else ()
+        ),
         sections=(
             Section("Solvers", (_comparison_table(calibrations, quantities),)),
             Section("First and second half", _halves(first, quantities, halves)),
@@ -158,11 +160,14 @@ def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], n
     return (own.value - reference.value) / reference.sigma
 
 
-def _split_half_test(halves: Mapping[str, SplitHalf], predicted: Mapping[str, float]) -> Summary:
+def _split_half_test(halves: Mapping[str, SplitHalf], predicted: Mapping[str, float], stopped: bool) -> Summary:
     """Whether the estimates from both halves agree."""
     question = "Do both halves of the recording agree?"
     held_out = ", ".join(f"{size:.2f} ({family})" for family, size in predicted.items())
     said = f" Held-out measurements are predicted to {held_out} of their sigmas; 1 is expected." if held_out else ""
+    if not halves and stopped:
+        text = "The time limit ended the test."
+        return Summary(question, "cannot say", "fixed", text + said, (), ("Give a longer `--time-limit`.",))
     if not halves:
         text = "Neither half determines a parameter by itself: they cannot be compared."
         return Summary(question, "cannot say", "fixed", text + said, (), ("Record about twice as long.",))

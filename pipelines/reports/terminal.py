@@ -16,7 +16,7 @@ from rich.text import Text as RichText
 
 from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import printable
-from alidade.pipelines.reports.report import Block, Bullets, Card, Code, Report, Tables
+from alidade.pipelines.reports.report import Block, Bullets, Code, Report, Tables
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.discovery import Suggestion
@@ -72,8 +72,8 @@ def print_report(report: Report) -> None:
 
 def _print_blocks(title: str, blocks: Sequence[Block]) -> None:
     """Print those that a terminal can show, under their heading."""
-    shown = [block for block in blocks if isinstance(block, (Table, Tables, Bullets, Card))]
-    if title and any(not isinstance(block, Card) for block in shown):
+    shown = [block for block in blocks if isinstance(block, (Table, Tables, Bullets))]
+    if title and shown:
         say(title)
     for block in shown:
         match block:

@@ -242,15 +242,6 @@ class ChainFactorization:
         """Sum of squares of the rows at the solution."""
         return float(self.root[-1, -1] ** 2)
 
-    @property
-    def log_determinant(self) -> float:
-        """Of the information A'A."""
-        parts = [each.rows for each in self._levels if each is not None] + [
-            R[None] for R in (*self._ends.rows, self.root[:-1])
-        ]
-        pivots = np.abs(np.concatenate([np.diagonal(R, axis1=1, axis2=2).ravel() for R in parts]))
-        return 2.0 * float(np.log(pivots[pivots > 0.0]).sum())  # rows of the segments' last states are empty
-
     def solve(self) -> tuple[Array, Array, Array]:
         """States (N, d), nodes (J, c) and shared unknowns (s,) of the least squares."""
         last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)

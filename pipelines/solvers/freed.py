@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Estimate, Problem, Told
+from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine
@@ -44,7 +45,7 @@ def freed_information(freed: Problem, estimate: Estimate) -> Told | None:
             found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
             engine = _without_rejected(apply_levels(compiled.engine, found.levels), used)
         return sqrt_information(compiled.problem, engine, values, compiled.current_keys, ())
-    except np.linalg.LinAlgError:
+    except (IndeterminateStateError, np.linalg.LinAlgError):
         return None
 
 

@@ -239,12 +239,6 @@ class GtsamFactorization:
         """Sum of squares at the solution."""
         return float(self.root[-1, -1] ** 2)
 
-    @property
-    def log_determinant(self) -> float:
-        """Of the information A'A."""
-        pivots = [np.diagonal(self.root[:-1]), *(np.diagonal(each.R) for each in self._conditionals)]
-        return 2.0 * float(np.log(np.abs(np.concatenate(pivots))).sum())
-
     def solve(self) -> tuple[Array, Array, Array]:
         """States, nodes, shared unknowns of the least squares."""
         last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)

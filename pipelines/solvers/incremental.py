@@ -239,7 +239,8 @@ class IncrementalSolver:
     """
 
     def __init__(self, problem: Problem, window: Window, config: IncrementalConfig = IncrementalConfig()) -> None:
-        self.problem, self.window, self.config = problem, window, config
+        self.problem, self.config = problem, config
+        self.window = window if window is None or isinstance(window, Keyframes) else float(window)
         self.initialising = True
         self.marginal: MarginalState | None = None
         self.steps_since: list[Step] = []
@@ -471,8 +472,9 @@ class IncrementalSolver:
             about.insert(new)
             stamps = self._ages(step.timestamps)
             smoother.update(self._selected(smoother, step, about, new), new, stamps)
-        except (RuntimeError, np.linalg.LinAlgError):
-            # Singular, if only by rounding. The smoother is spoilt, but the marginal and the steps since are not.
+        except (RuntimeError, ValueError, np.linalg.LinAlgError):
+            # Singular, if only by rounding, or a variable that no process determines. The smoother is spoilt, but the
+            # marginal and the steps since are not.
             self._solve_batch()
             return
         values = smoother.estimate()
@@ -580,7 +582,7 @@ class IncrementalSolver:
             compiled = Compiled.of(problem, steps=self._finite(steps, compiled.layout.to_gtsam(compiled.initial)))
         try:
             solved = solve(compiled, levels=None if self.marginal is None else self.levels)
-        except np.linalg.LinAlgError as error:
+        except (IndeterminateError, np.linalg.LinAlgError) as error:
             raise IndeterminateError(f"the first {self.time:.3f} s do not determine the parameters: {error}") from error
         self.levels = solved.levels
         found = solved.solution

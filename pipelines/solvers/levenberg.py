@@ -44,10 +44,6 @@ class Factorization(Protocol):
     def minimum(self) -> float:
         """Sum of squares at the solution."""
 
-    @property
-    def log_determinant(self) -> float:
-        """Of the information A'A."""
-
     def solve(self) -> tuple[Array, Array, Array]:
         """States, nodes, shared unknowns of the least squares."""
 

@@ -245,18 +245,30 @@ def _square(information: Array, x: Array) -> Array:
 
 
 def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
-    """Steps of one of `Problem.may_step` that explain a recording best, the most significant first."""
+    """Steps of one of `Problem.may_step` that explain a recording best, the most significant first.
+
+    None where the recording determines too little for the tests.
+    """
     engine = compiled.engine
     if not isinstance(engine, Linearization) or not isinstance(solution.engine, Linearization):
         return ()
+    try:
+        return _largest_steps(compiled, engine, levels, solution.engine, solution.values)
+    except (IndeterminateStateError, np.linalg.LinAlgError):
+        return ()
+
+
+def _largest_steps(
+    compiled: Compiled, engine: Linearization, levels: Sequence[Level], solved: Linearization, values: Values
+) -> tuple[StepEstimate, ...]:
     parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.may_step]
-    base = _Fit.of(engine, solution.values, levels)
+    base = _Fit.of(engine, values, levels)
     scans = [(p, found) for p in parameters if (found := base.scanned(p)) is not None]
     steps = [_scanned(base, p, found) for p, found in scans if found.fall.max() < NOTHING]
     scans = [(p, found) for p, found in scans if found.fall.max() >= NOTHING]
     if scans:
-        outliers = rejected(solution.engine, solution.values)
-        without = _maximised(engine, solution.values, levels, outliers)
+        outliers = rejected(solved, values)
+        without = _maximised(engine, values, levels, outliers)
         tried = [_solved_again(without, base, outliers, p, found, i) for p, found in scans for i in found.best()]
         steps += [step for step in tried if step is not None]
     return tuple(sorted(steps, key=lambda step: (-step.statistic, -step.fall)))

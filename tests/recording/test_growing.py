@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.summary import Summary
+from mcap.writer import Writer
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.growing import GrowingFiles
@@ -92,3 +93,26 @@ def get_summary(stream: BinaryIO) -> Summary:
     summary = make_reader(stream).get_summary()
     assert summary is not None
     return summary
+
+
+def test_pictures_about_the_size_that_is_kept_come_in_their_order(tmp_path: Path) -> None:
+    """Chunks of large messages are read one by one, those of small ones together; a topic has both."""
+    with (tmp_path / "s.mcap").open("wb") as stream:
+        writer = Writer(stream, chunk_size=60_000)
+        writer.start()
+        schema = writer.register_schema("Raw", "jsonschema", b"{}")
+        channel = writer.register_channel("/pictures", "json", schema)
+        for i in range(90):
+            data = bytes(20_000 if i // 15 % 2 else 12_000)
+            writer.add_message(channel, log_time=i * 10**7, data=data, publish_time=0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    container = GrowingFiles().refresh([tmp_path / "s.mcap"], None)
+    log_ns = np.concatenate([block.log_ns for block in container.blocks({channel})])
+    np.testing.assert_array_equal(log_ns, np.arange(90) * 10**7)
+
+
+def test_a_table_that_has_only_begun_may_still_become_a_recording(tmp_path: Path) -> None:
+    (tmp_path / "s.csv").write_text("t,gx,gy,gz\n")
+    with pytest.raises(InputError, match="no line of numbers") as caught:
+        GrowingFiles().refresh([tmp_path / "s.csv"], None)
+    assert type(caught.value) is InputError

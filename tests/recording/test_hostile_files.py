@@ -21,7 +21,7 @@ from alidade.pipelines.applications.session import resolve_method, session_facts
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError, printable
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.mcap_records import HEAD, MAGIC
+from alidade.pipelines.recording.mcap_records import HEAD, MAGIC, index_is_complete
 from alidade.pipelines.recording.recording import open_recording
 from tests.support.raw_messages import STORE, T0, random_message
 
@@ -241,3 +241,8 @@ def test_a_hostile_config_is_refused_in_one_line(case: str) -> None:
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 3000
     assert time.process_time() - start < 10.0
+
+
+def test_an_index_with_an_offset_beyond_all_bounds_is_incomplete() -> None:
+    buffer = np.zeros(100, dtype=np.uint8)
+    assert not index_is_complete(buffer, {1: np.array([2**63 - 5], dtype=np.int64)})

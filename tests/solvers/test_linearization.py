@@ -76,7 +76,6 @@ def test_gtsam_engine_gives_what_the_chain_gives(name: str) -> None:
     scale = np.append(sigma, 1.0 / np.sqrt(information[-1, -1]))
     assert theirs.minimum == pytest.approx(found.minimum, rel=1e-9)
     assert np.abs((theirs.root.T @ theirs.root - information) * np.outer(scale, scale)).max() < 1e-7
-    assert theirs.log_determinant == pytest.approx(found.log_determinant, rel=1e-9)
     flat, other_flat = (layout.tangents(Tangent(*each.solve())) for each in (found, theirs))
     draws = layout.tangents(Tangent(*found.sample(50, np.random.default_rng(0)))).std(axis=1)
     assert (np.abs(flat - other_flat) <= 1e-7 * draws).all()

@@ -64,7 +64,6 @@ def problem(data: CubeData, config: Config) -> Problem:
         steps=partial(_steps, model),
         loss=model.loss,
         attitudes=partial(_trajectory, model),
-        attitude_name="nRb",
         advice=advice,
         dropped=model.dropped,
         premises=(_NO_FIELD,) if model.poses.mag is not None and model.field is None else (),

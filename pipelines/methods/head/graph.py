@@ -90,7 +90,6 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         steps_after=partial(_steps, model, 1),
         loss=model.loss,
         attitudes=partial(_attitudes, model),
-        attitude_name="bRv",
         at_gyro_rate=partial(at_gyro_rate, data),
         advice=_advice,
         dropped=data.dropped,

@@ -98,7 +98,6 @@ def problem(data: IndexerData, config: Config) -> Problem:
         parameters=model.parameters,
         steps=partial(_steps, model),
         attitudes=partial(_attitudes, model) if len(model.frames) else None,
-        attitude_name="nRb",
         advice=_advice,
         dropped=dropped,
         noises=model.noises,

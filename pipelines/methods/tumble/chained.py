@@ -63,7 +63,6 @@ def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variab
         steps=partial(_steps, graph),
         loss=graph.loss,
         attitudes=partial(_trajectory, graph),
-        attitude_name="nRb",
         advice=advice,
         dropped=model.dropped,
         premises=model.premises,
