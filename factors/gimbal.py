@@ -85,7 +85,9 @@ class LocalMotion:
         cls, at: Array, gyro_t: Array, gyro: Array, gimbal: GimbalPath, drivers: Array | None = None
     ) -> LocalMotion:
         """From polynomials of degree DEGREE over about FITTED s to either side, of the rest of degree 3 over SLOW s."""
-        commands, commanded = _commanded(gyro_t, gyro, gimbal)
+        commands = command(gyro, gimbal.at(gyro_t))
+        commanded = np.zeros((len(gyro_t), 2))
+        np.cumsum(0.5 * np.diff(gyro_t)[:, None] * (commands[1:] + commands[:-1]), axis=0, out=commanded[1:])
         (on_the_way, driven), (reached, driving_at) = (
             [np.stack([np.interp(t, gyro_t, each) for each in of.T], axis=1) for of in (commanded, commands)]
             for t in (gimbal.t, at)
@@ -130,28 +132,21 @@ def command(rate: Array, angles: Array) -> Array:
     return np.stack([np.tan(angles[:, 1]) * (c * wy - s * wx) - wz, -c * wx - s * wy], axis=1)
 
 
-def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> tuple[Array, Array]:
-    """Commands (n, 2), rad/s, at the gyro's samples, and the angles through which they have gone since the first."""
-    commands, angles = np.empty((len(t), 2)), np.zeros((len(t), 2))
-    for i in range(0, len(t), _BLOCK):
-        commands[i : i + _BLOCK] = command(rate[i : i + _BLOCK], gimbal.at(t[i : i + _BLOCK]))
-    for i in range(0, len(t) - 1, _BLOCK):
-        rates, steps = commands[i : i + _BLOCK + 1], np.diff(t[i : i + _BLOCK + 1])[:, None]
-        angles[i + 1 : i + _BLOCK + 1] = angles[i] + np.cumsum(0.5 * steps * (rates[1:] + rates[:-1]), axis=0)
-    return commands, angles
-
-
 def _shares(causes: Array, left: Array) -> Array:
     """(4, 2) shares of causes (n, 4), angles and rates of two commands, in what is left (n, 2) of the angles.
 
     Where motion is slow nothing of the causes is left, and of shares only what is usual is known: SHARE and DELAY.
     """
+    noise = np.maximum(left.std(axis=0), 1e-12)
     usual = np.repeat([SHARE, DELAY], 2)
     scaled = causes * usual
-    squares, found = scaled.T @ scaled, np.empty((4, 2))
-    for axis, y in enumerate(left.T):
-        found[:, axis] = usual * np.linalg.solve(squares + max(y.var(), 1e-24) * np.eye(4), scaled.T @ y)
-    return found
+    return np.stack(
+        [
+            usual * np.linalg.solve(scaled.T @ scaled + s**2 * np.eye(4), scaled.T @ y)
+            for y, s in zip(left.T, noise, strict=True)
+        ],
+        axis=1,
+    )
 
 
 def _local_polynomials(at: Array, t: Array, within: float, degree: int, *values: Array) -> Array:
