@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.gimbal import GimbalPath, LocalMotion, integral, polynomial
+from alidade.factors.gimbal import GimbalPath, LocalMotion
 from alidade.factors.gyro import rate_error
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 
@@ -183,14 +183,15 @@ class LosDirectionFactor(Model):
         The errors (n, 4) are s and c of each encoder; angle + s sin(angle) + c cos(angle) = reading is solved by a step
         of fixed-point iteration and one of Newton's, which leaves s^4.
         """
-        read = self.gimbal + integral(move.gimbal_rate, late)
+        late = late[:, None]
+        read = self.gimbal + (move.gimbal_rate + 0.5 * move.gimbal_acceleration * late) * late
         s, c = encoder[:, ::2], encoder[:, 1::2]
         angle = read - s * np.sin(read) - c * np.cos(read)
         sine, cosine = np.sin(angle), np.cos(angle)
         angle = angle - (angle + s * sine + c * cosine - read) / (1.0 + s * cosine - c * sine)
         sine, cosine = np.sin(angle), np.cos(angle)
         gain = 1.0 / (1.0 + s * cosine - c * sine)
-        rate = gain * polynomial(move.gimbal_rate, late)
+        rate = gain * (move.gimbal_rate + move.gimbal_acceleration * late)
         return angle, rate, -np.stack([gain * sine, gain * cosine], axis=2)
 
     def camera(self, angles: Array) -> Array:
@@ -259,10 +260,10 @@ def _carried(motion: LocalMotion, late: Array, bias: Array, errors: Array | None
     Returns:
         The turns, and their derivatives by `late` (n, 3, 1) and by bias and errors.
     """
-    excess, by_excess = rate_error(bias, errors, motion.rate[:, 0], motion.drivers)
-    rate = polynomial(motion.rate, late) - excess
     late = late[:, None]
-    arc = integral(motion.rate, late[:, 0]) - excess * late
+    excess, by_excess = rate_error(bias, errors, motion.rate, motion.drivers)
+    rate = motion.rate + motion.acceleration * late - excess
+    arc = (motion.rate + 0.5 * motion.acceleration * late - excess) * late
     to_end = so3.right_jacobian(arc)
     by_gyro = [-late[..., None] * (to_end @ each) for each in by_excess()]
     return so3.exp(arc), to_end @ rate[..., None], by_gyro

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from alidade.factors.gimbal import SLOW
+from alidade.factors.gimbal import SMOOTHING
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.units import rounded
@@ -36,7 +36,7 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     estimate = calibration.estimate
     values = calibration.problem.numbers(estimate)
     sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
-    margin = SLOW if OFFSET in values else 0.0
+    margin = SMOOTHING if OFFSET in values else 0.0
     rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), margin)
     time, measured = data.image_t[rows], data.error[rows]
     chains = np.split(np.arange(len(rows)), np.flatnonzero(starts)[1:])

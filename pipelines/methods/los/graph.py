@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.chi_square import gate
-from alidade.factors.gimbal import SLOW, GimbalPath, LocalMotion
+from alidade.factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
 from alidade.factors.los import LosDirectionFactor, Surroundings
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
@@ -90,7 +90,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         dropped=dropped,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
         onward=partial(_onward, config, model) if data.error_cov is None else None,
-        unsettled=max(_SETTLED if model.around is None else SLOW, temperature.unsettled(data.temperature)),
+        unsettled=max(_SETTLED if model.around is None else SMOOTHING, temperature.unsettled(data.temperature)),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference),
         keyframes=None if model.parameters.sight is None else Keyframes(model.clock, _NEAR),
@@ -140,7 +140,7 @@ def _prepare(
     driving = acting(parameters.gyro, drivers)
     noises = _noises(data, config) if before is None else before.noises
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
-    used, dropped = _Used.of(data, config, gimbal, SLOW if parameters.sight else 0.0, start)
+    used, dropped = _Used.of(data, config, gimbal, SMOOTHING if parameters.sight else 0.0, start)
     chains, time, measured = used.chains, used.time, used.measured
     if before is None:
         known = parameters.angles, parameters.bias

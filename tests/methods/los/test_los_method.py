@@ -362,29 +362,3 @@ def test_a_walk_stated_too_loose_does_not_drive_the_time_offset_away() -> None:
     assert estimate.converged
     at = estimate.names.index("time_offset")
     assert abs(estimate.values[at] - truth["time_offset"]) < 3.0 * estimate.sigmas[at]
-
-
-@pytest.mark.parametrize(
-    ("seed", "amplitude_deg", "lowest_hz", "highest_hz"),
-    [
-        (4, 0.35, 2.0, 5.0),
-        pytest.param(5, 0.35, 2.0, 5.0, marks=pytest.mark.slow),
-        pytest.param(3, 4.0, 1.0, 2.4, marks=pytest.mark.slow),
-        pytest.param(4, 4.0, 1.0, 2.4, marks=pytest.mark.slow),
-    ],
-)
-def test_encoders_read_late_while_the_carrier_swings_fast(
-    seed: int, amplitude_deg: float, lowest_hz: float, highest_hz: float
-) -> None:
-    """Of motion smoothed over .4 s the delay was 33 to 46 sigmas off, and a bias 15."""
-    frequencies = np.random.default_rng(seed).uniform(lowest_hz, highest_hz, 3)
-    swings = [[Swing(amplitude_deg=amplitude_deg, frequency_hz=float(f))] for f in frequencies]
-    carrier = EulerMotion(**dict(zip(("roll", "pitch", "yaw"), swings, strict=True)))
-    late = {"encoder_delay": 1e-3, "time_offset": 8e-3}
-    scenario = LosScenario(duration_s=30.0, carrier=carrier, sensors=Sensors(), effects=late)
-    data, truth = simulate_los(scenario, seed)
-    estimate = solve_batch(problem(data, _config(scenario)))
-    assert estimate.converged
-    z = dict(zip(estimate.names, _errors(estimate, truth | late) / estimate.sigmas, strict=True))
-    assert abs(z["encoder_delay"]) < 3.5
-    assert max(abs(z[f"gyro_bias_{axis}"]) for axis in "xyz") < 3.5
