@@ -89,7 +89,8 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
     """
     form = table_form(path, data)
     if not form.width:
-        raise InputError(f"{path}: no line of numbers in it")
+        # A file that grows may still have one.
+        raise InputError(str(_unknown(path, ": no line of numbers in it")))
     if _is_trajectory(path, data, form):
         return ArrayContainer(path, {"/trajectory": _trajectory(path, data, form)})
     columns = ", ".join(form.names[:40])
