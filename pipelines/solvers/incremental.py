@@ -455,8 +455,9 @@ class IncrementalSolver:
     def _reported(self) -> Reported:
         """The reported numbers now, with their Jacobian by the tangents of the variables that hold them."""
         values, keys = self._current(), self.keys
-        where, dims = slices(keys, values.dims()), sum(values.dims()[key] for key in keys)
-        return Reported.at(self.problem, values, keys, [np.eye(dims)[where[key]] for key in keys])
+        dims = values.dims()  # made anew of all variables at every call
+        where, unit = slices(keys, dims), np.eye(sum(dims[key] for key in keys))
+        return Reported.at(self.problem, values, keys, [unit[where[key]] for key in keys])
 
     # -- step by step
 
@@ -665,8 +666,7 @@ def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[
 def _course_of(solved: Solved) -> Course | None:
     """What was known at moments before a batch solution."""
     compiled, posterior = solved.compiled, solved.posterior
-    engine = without_rejected(solved.engine, solved.solution.values)
-    system, found = engine.at(posterior.values)[0], posterior.factorization
+    engine, system, found = solved.engine, posterior.system, posterior.factorization
     if not (isinstance(engine, Linearization) and isinstance(system, ChainSystem)):
         return None
     assert isinstance(found, ChainFactorization)
