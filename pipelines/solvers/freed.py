@@ -15,7 +15,7 @@ from alidade.pipelines.solvers.levenberg import Engine
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels
 from alidade.pipelines.solvers.noise_estimation import apply_levels
-from alidade.pipelines.solvers.posterior import Reported, sqrt_information
+from alidade.pipelines.solvers.posterior import Reported, followed, sqrt_information
 
 # Steps to the states that are optimal for given parameters; first values are near them.
 _STEPS = 3
@@ -87,6 +87,6 @@ def _with_optimal_states(engine: Engine, values: Values) -> Values:
     """Values with the states optimal for the parameters as they are."""
     *_, c, s = engine.layout.sizes
     for _ in range(_STEPS):
-        states, nodes = engine.at(values)[0].eliminate().given(np.zeros((c + s, 1)))
-        values = engine.layout.retract(values, Tangent(states[..., 0], nodes[..., 0], np.zeros(s)))
+        factorization = engine.at(values)[0].eliminate()
+        values = engine.layout.retract(values, followed(factorization, np.zeros((c + s, 1))))
     return values

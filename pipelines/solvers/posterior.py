@@ -449,9 +449,13 @@ def moved_to(
     du = (wanted - reported.numbers)[reported.free] / reported.scale
     factorization = engine.at(values)[0].eliminate()
     last = reported.root(factorization.root).last(du[:, None])
+    return engine.layout.retract(values, followed(factorization, last))
+
+
+def followed(factorization: Factorization, last: Array) -> Tangent:
+    """Moves of all unknowns that go with moves (c + s, 1) of the last node and the shared ones, the rest optimal."""
     states, nodes = factorization.given(last)
-    move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
-    return engine.layout.retract(values, move)
+    return Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
 
 
 def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:

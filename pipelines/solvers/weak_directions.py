@@ -41,7 +41,7 @@ from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System
-from alidade.pipelines.solvers.posterior import Reported, ReportedRoot
+from alidade.pipelines.solvers.posterior import Reported, ReportedRoot, followed
 
 # Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
 MAX_SIGMA = 0.3
@@ -320,9 +320,7 @@ def _constrained(
 def _moved(engine: Engine, factorization: Factorization, values: Values, found: ReportedRoot, du: Array) -> Values:
     """Values with the reported numbers moved by du (m,), all else where it is optimal then."""
     last = found.last(du[:, None])
-    states, nodes = factorization.given(last)
-    move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
-    return engine.layout.retract(values, move)
+    return engine.layout.retract(values, followed(factorization, last))
 
 
 def moved_roots(
