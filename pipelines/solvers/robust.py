@@ -69,7 +69,8 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
     same = start is found.values and truncated.cost(start) == found.cost
     final = solve_truncated(engine, start, loss, config, (found.system, found.cost) if same else None)
     iterations += more + final.iterations
-    if any(group.is_measurement and group.loss is None for group in final.engine.groups):
+    lost = zip(truncated.groups, final.engine.groups, strict=True)
+    if any(before.loss is not None and after.loss is None for before, after in lost):
         # Among few measurements outliers may lead astray, to where most are rejected; the first guess is near.
         near = minimize(truncated, values, config.minimizer)
         iterations += near.iterations
