@@ -109,7 +109,7 @@ def _runs_twice(times: Stamps) -> tuple[int, float] | None:
 
 
 def _against_log(t_ns: Stamps, log_ns: Stamps) -> Step | None:
-    """A step of the stamps that the log times do not make, and that lasts."""
+    """A lasting step of the clock that stamps a topic, against the log times."""
     ahead = t_ns - log_ns
     if ahead.max() - ahead.min() <= MIN_CLOCK_STEP_S * 1e9:
         return None

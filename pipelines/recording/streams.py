@@ -96,7 +96,7 @@ class StreamReader:
     def clean(
         self, topic: str, t_ns: NDArray[np.int64], values: Array, least: int = 2
     ) -> tuple[Array, NDArray[np.int64]]:
-        """Times, s, and rows of samples that can be used; see checks.clean."""
+        """Times (n,), s from the recording's epoch, and row numbers of the usable samples; see checks.clean."""
         return checks.clean(topic, t_ns, self.epoch_ns, values, self.dropped, least)
 
     def samples(

@@ -99,7 +99,7 @@ def _third(known: Array, missed: Array) -> float:
 
 
 def _roots(solved: Solved) -> tuple[Array, Array]:
-    """Square roots (m, .) of the free numbers' covariance, and of what slopes at half the way miss."""
+    """Square roots (m, .) of two covariances in prior sigmas: of the free numbers, and of what half slopes miss."""
     posterior, compiled = solved.posterior, solved.compiled
     engine = without_rejected(solved.engine, solved.solution.values)
     linear = posterior.directions.again(posterior.reported.root(posterior.factorization.root).R)

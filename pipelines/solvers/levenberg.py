@@ -170,7 +170,7 @@ class Solution:
 
     @cached_property
     def factorization(self) -> Factorization:
-        """Of the system. Raises IndeterminateStateError."""
+        """R of the whitened rows at the values. Raises IndeterminateStateError."""
         return self.system.eliminate()
 
 
