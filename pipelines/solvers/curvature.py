@@ -11,6 +11,7 @@ are known to a tenth by .02; two or three attitudes of a triad whose gains are o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.solvers.batch import Solved
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
 from alidade.pipelines.solvers.levenberg import without_rejected
-from alidade.pipelines.solvers.weak_directions import FOLLOWS, Posterior, WeakDirections, moved_roots
+from alidade.pipelines.solvers.weak_directions import Posterior, WeakDirections, moved_roots, slopes
 
 # Random ways along which slopes at half the way are compared with those at the whole.
 DRAWS = 8
@@ -103,20 +104,13 @@ def _roots(solved: Solved) -> tuple[Array, Array]:
     posterior, compiled = solved.posterior, solved.compiled
     engine = without_rejected(solved.engine, solved.solution.values)
     linear = posterior.directions.again(posterior.reported.root(posterior.factorization.root).R)
-    sigmas = np.concatenate([linear.sigmas, np.sqrt(np.diag(linear.prior_covariance))])
-    axes, k = np.hstack([linear.strong, linear.weak]), len(linear.sigmas)
-    follows = (linear.sigmas[:, None] < FOLLOWS * sigmas) & (linear.sigmas < KNOWN)[:, None]
-
-    def slopes(ways: Array) -> Array:
-        moves = axes @ (sigmas[:, None] * ways)
-        there = moved_roots(compiled.problem, engine, posterior, compiled.current_keys, moves)
-        triangles = [np.asarray(np.linalg.qr(R @ axes, mode="r"), dtype=float)[:k] for R in there]
-        return np.array([np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas for R in triangles])
-
+    follows = linear.followers & (linear.sigmas < KNOWN)[:, None]
     if not follows.any():
-        return axes * sigmas, np.zeros((len(axes), 1))
-    ways = np.random.default_rng(0).standard_normal((len(axes), DRAWS))
-    missed = np.hstack(list(slopes(0.5 * ways) - 0.5 * slopes(ways))) / np.sqrt(DRAWS)
+        return linear.axes * linear.all_sigmas, np.zeros((len(linear.axes), 1))
+    roots = partial(moved_roots, compiled.problem, engine, posterior, compiled.current_keys)
+    ways = np.random.default_rng(0).standard_normal((len(linear.axes), DRAWS))
+    half, whole = (slopes(linear, roots, follows, length * ways) for length in (0.5, 1.0))
+    missed = np.hstack(list(half - 0.5 * whole)) / np.sqrt(DRAWS)
     wide = posterior.directions
     known = np.hstack([wide.strong * wide.sigmas, wide.weak @ np.linalg.cholesky(wide.prior_covariance)])
     return known, linear.strong @ missed

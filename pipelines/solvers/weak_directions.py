@@ -128,6 +128,21 @@ class WeakDirections:
         given = self.strong @ (self.strong.T @ u)
         return np.asarray(-self.prior_covariance @ (self.weak.T @ (self.precision @ given)))
 
+    @property
+    def axes(self) -> Array:
+        """(m, m) columns, the strong directions first."""
+        return np.hstack([self.strong, self.weak])
+
+    @property
+    def all_sigmas(self) -> Array:
+        """(m,) of the axes: posterior sigmas of the strong ones, the weak ones' under the prior alone."""
+        return np.concatenate([self.sigmas, np.sqrt(np.diag(self.prior_covariance))])
+
+    @property
+    def followers(self) -> NDArray[np.bool_]:
+        """(k, m) whether a strong direction is known so much better than an axis that it follows it."""
+        return np.asarray(self.sigmas[:, None] < FOLLOWS * self.all_sigmas)
+
     def covariance(self) -> Array:
         """(m, m) of u: posterior of the strong directions, prior of the weak ones, no correlation between the two."""
         root = self.strong * self.sigmas
@@ -175,6 +190,26 @@ def constrained_step(directions: WeakDirections, R: Array, d: Array, u: Array) -
     return np.asarray(there - u)
 
 
+def slopes(
+    directions: WeakDirections,
+    roots: Callable[[Array], Iterable[Array]],
+    follows: NDArray[np.bool_],
+    ways: Array,
+) -> Array:
+    """Slopes (n, k, m), in sigmas, of the strong directions along the axes, at points moved along ways (m, n).
+
+    Args:
+        directions: of the system at its solution.
+        roots: square-root information (m, m) of u at the points moved by (m, n), all else following.
+        follows: (k, m) which slopes count; others are 0.
+        ways: in sigmas of the axes.
+    """
+    axes, sigmas, k = directions.axes, directions.all_sigmas, len(directions.sigmas)
+    there = roots(axes @ (sigmas[:, None] * ways))
+    triangles = [np.asarray(np.linalg.qr(R @ axes, mode="r"), dtype=float)[:k] for R in there]
+    return np.array([np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas for R in triangles])
+
+
 def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Array]]) -> Array:
     """Covariance (k, k) of second order: how far strong directions follow the less known ones.
 
@@ -189,18 +224,10 @@ def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Arra
     k, m = len(directions.sigmas), len(directions.precision)
     if not k:
         return np.zeros((0, 0))
-    wide = np.sqrt(np.diag(directions.prior_covariance))
-    sigmas, axes = np.concatenate([directions.sigmas, wide]), np.hstack([directions.strong, directions.weak])
-    follows = sigmas[:k, None] < FOLLOWS * sigmas
-
-    def slopes(ways: Array) -> Array:
-        there = roots(axes @ (sigmas[:, None] * ways))
-        triangles = [np.asarray(np.linalg.qr(R @ axes, mode="r"), dtype=float)[:k] for R in there]
-        return np.array([np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas for R in triangles])
-
+    follows = directions.followers
     drawn = np.empty((0, k, m))
     for way in np.random.default_rng(0).standard_normal((DRAWS, m)):
-        drawn = np.concatenate([drawn, slopes(way[:, None])])
+        drawn = np.concatenate([drawn, slopes(directions, roots, follows, way[:, None])])
         spread = np.sqrt(directions.sigmas**2 + np.square(drawn).sum(axis=2).mean(axis=0))
         found = np.sqrt(np.square(drawn / spread[:, None]).sum(axis=(1, 2)))
         if found.max() < STRAIGHT and (0.8 * found).prod() < MISSED:
@@ -209,7 +236,7 @@ def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Arra
     ways = ways[sizes > STRAIGHT * np.sqrt(DRAWS)]
     if not len(ways):
         return np.zeros((k, k))
-    H = slopes(np.sqrt(len(ways)) * ways.T) / np.sqrt(len(ways))
+    H = slopes(directions, roots, follows, np.sqrt(len(ways)) * ways.T) / np.sqrt(len(ways))
     mean = 0.5 * np.einsum("ial,il->a", H, ways)
     return np.asarray(0.5 * np.einsum("ial,ibl->ab", H, H) + np.outer(mean, mean))
 
