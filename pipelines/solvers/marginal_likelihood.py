@@ -38,6 +38,8 @@ Outliers = Mapping[int, NDArray[np.bool_]]
 
 # A measurement is widened to the 99.9 % gate of its innovation, and an outlier beyond so many times that.
 OUTLIER_GATES = 3.0
+# By which the variance of a measurement without a say is multiplied, where it cannot be infinite.
+_NO_SAY = 1e12
 # Keyframes that are enough to tell levels: of a longer recording half of them are the liveliest.
 ENOUGH_KEYFRAMES = 6000
 # Newton steps, none longer than this in the logarithm of a level; one that lowers -2 log L by less is the last: levels
@@ -233,6 +235,17 @@ class LinearChain:
         """Of each kind what does not change with the levels: squares, J'J, J_i'J_j, J'r and J'J_shared."""
         return [_products(rows) for rows in self.rows]
 
+    def moves(self, states: Array, shared: Array) -> list[Array]:
+        """A x, rows (n, m, k) of each kind, of states (N d, k) and shared parameters (p, k)."""
+        n, d = self.size
+        each, out = states.reshape(n, d, -1), []
+        for rows in self.rows:
+            y = rows.shared @ shared
+            for i, J in rows.states:
+                y += J @ each[i]
+            out.append(y)
+        return out
+
     def innovations(
         self, variances: Sequence[Array], limits: Sequence[float], by_shared: bool = False
     ) -> dict[int, Innovations]:
@@ -356,14 +369,8 @@ class _Solution:
 
     def spread(self, states: Array, shared: Array) -> list[Array]:
         """A x, whitened rows (n, m, k) of each kind, of states (N d, k) and shared parameters (p, k)."""
-        n, d = self.chain.size
-        each, out = states.reshape(n, d, -1), []
-        for rows, w in zip(self.chain.rows, self.weights, strict=True):
-            y = rows.shared @ shared
-            for i, J in rows.states:
-                y += J @ each[i]
-            out.append(w[:, None, None] * y)
-        return out
+        moves = self.chain.moves(states, shared)
+        return [w[:, None, None] * move for w, move in zip(self.weights, moves, strict=True)]
 
     def residuals(self) -> list[Array]:
         """Whitened (n, m) of each kind."""
@@ -490,17 +497,29 @@ def widened(
 ) -> tuple[dict[int, Array], dict[int, NDArray[np.bool_]]]:
     """By group, by how much its measurements are widened at some levels (n,), and which are outliers (n,).
 
-    An outlier is what was rejected and still lies beyond `OUTLIER_GATES` gates.
+    An outlier is what was rejected and, without any say of its own, lies beyond `OUTLIER_GATES` gates of the solution:
+    an innovation would not tell, for the first measurements of all nothing is known before.
+
+    Raises:
+        IndeterminateStateError: states or parameters are not determined without what was rejected.
     """
-    before = [np.asarray(each, dtype=bool) for each in _by_row(chain, rejected, 0.0)]
+    variances = chain.variances(levels)
+    before = [out > 0.0 for out in _by_row(chain, rejected, 0.0)]
+    kept = [np.where(out, _NO_SAY * v, v) for out, v in zip(before, variances, strict=True)]
+    solution = chain.solved(kept)
+    if solution is None:
+        raise IndeterminateStateError(UNDETERMINED)
+    moves = chain.moves(solution.states[:, None], solution.shared[:, None])
     limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
     wide: dict[int, Array] = {}
     outlying: dict[int, NDArray[np.bool_]] = {}
-    for kind, each in chain.innovations(chain.variances(levels), limits).items():
-        squares = each.squares
-        out = before[kind] & (squares > OUTLIER_GATES**2 * limits[kind])
-        by = np.where(out, 1.0, np.sqrt(np.maximum(squares / limits[kind], 1.0)))
-        wide[chain.rows[kind].group], outlying[chain.rows[kind].group] = by, out
+    for kind, each in chain.innovations(kept, limits).items():
+        rows = chain.rows[kind]
+        left = ((rows.residuals + moves[kind][..., 0]) ** 2).sum(axis=1) / variances[kind]
+        out = before[kind] & (left > OUTLIER_GATES**2 * limits[kind])
+        squares = np.where(before[kind], left, each.squares)
+        wide[rows.group] = np.where(out, 1.0, np.sqrt(np.maximum(squares / limits[kind], 1.0)))
+        outlying[rows.group] = out
     return wide, outlying
 
 
@@ -534,7 +553,7 @@ def sandwich_ratio(
         reported: (r, p) derivatives of the numbers.
     """
     out = _by_row(chain, rejected, 0.0)
-    variances = [np.where(o > 0.0, 1e12 * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
+    variances = [np.where(o > 0.0, _NO_SAY * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
     nominal, robust, blocks = sandwich(chain, variances)
     above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
     ratio = np.sqrt(np.divide(above, below, out=np.ones_like(below), where=below > 0.0))

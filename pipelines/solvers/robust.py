@@ -5,7 +5,8 @@ loss, the first one convex for the largest residual that there is, lead to the t
 the last one leaves is plain least squares on the measurements inside the gate, so its covariance means what it says.
 
 It begins with plain least squares, or at the first guess where that explains more measurements: gross outliers take
-plain least squares, and small effects that priors alone hold, out of all bounds.
+plain least squares, and small effects that priors alone hold, out of all bounds. Where that ends with most measurements
+of a family rejected, it begins again with measurements soft enough that priors hold.
 
 Outliers are a minority. A family of measurements of which more than half are rejected, beyond what chance could make
 of one in which every second is an outlier (binomial in the normal approximation, one sided, p = `max_chance`), has
@@ -39,6 +40,9 @@ class RobustConfig:
         undecided: share of measurements whose weights are neither 0 nor 1 below which the truncated loss follows: what
             they say of anything is less than that share.
         last_mu: of the last surrogate at most; its weights are 0 or 1 but for .1 % about the gate.
+        softness: by which sigmas are multiplied where a family has lost most of its measurements, one after the other
+            while it does: so many that priors hold all, or nearly all.
+        hardening_mu, hardening_iterations: of each of the steps, `mu_step` apart, from there to the true sigmas.
         max_chance: of a family that it loses more than half of its measurements to outliers.
     """
 
@@ -48,6 +52,9 @@ class RobustConfig:
     mu_step: float = 2.5
     undecided: float = 0.01
     last_mu: float = 1e3
+    softness: tuple[float, ...] = (1e4, 1e3)
+    hardening_mu: float = 0.2
+    hardening_iterations: int = 2
     max_chance: float = 1e-3
 
 
@@ -69,14 +76,36 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
     same = start is found.values and truncated.cost(start) == found.cost
     final = solve_truncated(engine, start, loss, config, (found.system, found.cost) if same else None)
     iterations += more + final.iterations
-    lost = zip(truncated.groups, final.engine.groups, strict=True)
-    if any(before.loss is not None and after.loss is None for before, after in lost):
-        # Among few measurements outliers may lead astray, to where most are rejected; the first guess is near.
-        near = minimize(truncated, values, config.minimizer)
-        iterations += near.iterations
-        if near.cost < truncated.cost(final.values) and not _mostly_rejected(truncated, near.values, config.max_chance):
-            final = near
+    for softness in config.softness:
+        lost = zip(truncated.groups, final.engine.groups, strict=True)
+        if not any(before.loss is not None and after.loss is None for before, after in lost):
+            break
+        again = solve_truncated(engine, _hardened(engine, values, softness, loss, config), loss, config)
+        iterations += again.iterations
+        final = min(final, again, key=lambda each: truncated.cost(each.values))
     return replace(final, iterations=iterations)
+
+
+def _hardened(engine: Engine, values: Values, softness: float, loss: TruncatedLoss, config: RobustConfig) -> Values:
+    """Values to which measurements lead whose sigmas are so many times as large first, and then less and less.
+
+    A dozen pictures, three of them outliers, are explained by a gyro scale 200 sigmas from its prior, and every way
+    from there leads past the minimum. While measurements are soft, priors and process models hold.
+    """
+    few = replace(config.minimizer, max_iterations=config.rough_iterations, corrections=0)
+    values = minimize(_soft(engine.under(None), softness), values, few).values
+    few = replace(few, max_iterations=config.hardening_iterations)
+    while softness > 1.0:
+        relaxed = _soft(engine.under(replace(loss, mu=config.hardening_mu)), softness)
+        values = minimize(relaxed, values, few).values
+        softness /= config.mu_step
+    return values
+
+
+def _soft(engine: Engine, softness: float) -> Engine:
+    """The engine with the sigmas of all measurements multiplied."""
+    soft = [replace(g, weights=g.all_weights / softness) if g.is_measurement else g for g in engine.groups]
+    return engine.with_groups(soft)
 
 
 def solve_truncated(

@@ -89,6 +89,18 @@ def test_glitches_are_widened_and_nothing_is_left_out() -> None:
     assert np.abs((estimate.values - right.values)[names] / right.sigmas[names]).max() < 1.0
 
 
+def test_an_outlier_before_all_others_stays_one() -> None:
+    """Judged by what is known before it, it was none, then all others were, and the level found was 6 times as large."""
+    short = SCENARIO.model_copy(update={"duration_s": 3.0})
+    data, _ = simulate_head(short, 2)
+    wxyz = data.vision_wxyz.copy()
+    wxyz[[0, 20, 40]] = so3.multiply(wxyz[[0, 20, 40]], so3.exp(np.full(3, 0.2)))
+    estimate = solve_batch(made(replace(data, vision_wxyz=wxyz)))
+    assert np.flatnonzero(~estimate.residuals["vision"].used).tolist() == [0, 20, 40]
+    (vision,) = (level for level in estimate.levels if level.noise.name == "vision_attitude")
+    assert 0.7 < vision.scale < 1.4
+
+
 def test_few_rows_of_clean_noise_are_widened() -> None:
     linear, levels = chain()
     wide, out = widened(linear, levels, {})
