@@ -90,7 +90,7 @@ def test_glitches_are_widened_and_nothing_is_left_out() -> None:
 
 
 def test_an_outlier_before_all_others_stays_one() -> None:
-    """Judged by what is known before it, it was none, then all others were, and the level found was 6 times as large."""
+    """Judged by what is known before it, it was none, then all others were, and the level 6 times as large."""
     short = SCENARIO.model_copy(update={"duration_s": 3.0})
     data, _ = simulate_head(short, 2)
     wxyz = data.vision_wxyz.copy()
