@@ -263,20 +263,22 @@ def _with_priors_as_found(
 ) -> tuple[Array, Array]:
     """The course (k, n), (k, n, n) as it is when no parameter lies far beyond its prior.
 
-    Widening one prior changes the information by a number on the diagonal (Sherman, Morrison 1950). A variance above
-    the prior's, as terms of second order may make it, counts as the prior's.
+    Widening priors changes the information by numbers on the diagonal (Woodbury 1950), of all of them at once.
+    Variances above the priors', as terms of second order may make them, count as the priors'.
     """
-    for i, q in enumerate(quantities):
-        prior = q.prior_sigma or 0.0
-        inflation = float(estimate.inflations[i])
-        size = pull(q, float(estimate.values[i]), float(estimate.sigmas[i]), inflation)
-        if size is None or abs(size) < _BEYOND:
-            continue
-        added = 1.0 / (size * prior) ** 2 - 1.0 / prior**2
-        column = P[:, :, i] / np.maximum(1.0 + added * P[:, i, i], size**-2)[:, None]
-        values = values - added * (values[:, i] - q.prior_mean)[:, None] * column
-        P = P - added * column[:, :, None] * P[:, i, None, :]
-    return values, P
+    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.inflations, strict=True)
+    size = np.array([pull(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated])
+    wide = np.flatnonzero(np.abs(size) >= _BEYOND)
+    if not len(wide):
+        return values, P
+    priors = np.array([(q.prior_mean, q.prior_sigma or 0.0) for q in quantities])[wide]
+    taken = np.sqrt(1.0 - size[wide] ** -2) / priors[:, 1]
+    columns = P[:, :, wide] * taken
+    left, axes = np.linalg.eigh(np.eye(len(wide)) - columns[:, wide] * taken[:, None])
+    axes = axes / np.sqrt(np.maximum(left, (size[wide] ** -2).min()))[:, None]
+    gains = columns @ axes
+    off = ((values[:, wide] - priors[:, 0]) * taken)[:, None] @ axes
+    return values + (gains @ np.swapaxes(off, 1, 2))[..., 0], P + gains @ np.swapaxes(gains, 1, 2)
 
 
 def _whitening(P: Array, last: Array) -> Array:

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
     SLOW_ERROR,
@@ -132,7 +133,7 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
     solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config.robust)
     if levels is None and problem.marginal_likelihood and isinstance(engine, Linearization):
         # Noise far from what was stated may be why there is no minimum yet.
-        if np.isfinite(solution.cost) and any(level.noise.estimated for level in start):
+        if np.isfinite(solution.cost) and any(level.noise.estimated for level in start) and not deadline.passed():
             with suppress(*(() if solution.converged else (IndeterminateStateError,))):
                 compiled, solution, start = solve_likelihood(compiled, solution, start, config.robust.minimizer)
                 problem = compiled.problem
@@ -189,6 +190,8 @@ def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[
         return solution, None
     engine, found = solution.engine, [solution]
     for other in problem.elsewhere(layout.to_gtsam(solution.values)):
+        if deadline.passed("the search for other solutions"):
+            break
         values = layout.from_gtsam(other)
         if engine.cost(values) - solution.cost < config.followed:
             minimum = minimize(engine, values, config.robust.minimizer)

@@ -24,6 +24,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines import deadline
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError, Index
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.linearization import Group
@@ -201,6 +202,8 @@ def minimize(
         return solution(False, "the residuals at the start are not finite")
     rows = sum(len(group.model.time) * group.model.rows for group in engine.groups if group.is_measurement)
     while iteration < config.max_iterations:
+        if deadline.passed():
+            return solution(False, f"not converged: {deadline.sentence()}")
         iteration, enough = iteration + 1, _enough(config, here, rows)
         step, predicted = _step(here.system, damping)
         if step is not None:

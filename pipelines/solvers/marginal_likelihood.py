@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors.chi_square import gate
+from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
@@ -472,6 +473,8 @@ def _maximum(
         raise IndeterminateStateError(UNDETERMINED)
     information = np.diag(known**-2.0)
     for _ in range(_MOST_STEPS):
+        if deadline.passed():
+            break
         gradient, information = solution.score([_parts(chain, tried, i) for i in free], signs)
         gradient, information = gradient + u / known**2, information + np.diag(known**-2.0)
         move = -np.linalg.solve(information, gradient)
@@ -735,6 +738,8 @@ def maximise_likelihood(
     found = tuple(levels)
     _, _, nodes, c, _ = linearization.layout.sizes
     for number in range(rounds):
+        if deadline.passed():
+            break
         chain = LinearChain.of(linearization, values)
         before, found = found, estimate_levels(chain, found, wide, outliers).levels
         if number < _WIDENING_ROUNDS:

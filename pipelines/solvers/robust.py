@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines import deadline
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, System, minimize
@@ -136,7 +137,7 @@ def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: Robu
     if largest <= loss.gate:
         return values, 0
     mu, iterations = loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300), 0
-    while mu < config.last_mu:
+    while mu < config.last_mu and not deadline.passed():
         relaxed = engine.under(replace(loss, mu=mu))
         if _undecided(relaxed, values) < config.undecided:
             break

@@ -21,6 +21,7 @@ from alidade.pipelines.methods import simulate
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 
 
@@ -102,6 +103,16 @@ def test_where_nothing_fits_there_is_a_result_in_time(
     assert calibration.estimate.converged or calibration.status == "inconsistent"
     told = (calibration.headline, *calibration.notes)
     assert calibration.status == "calibrated" or any("time limit of 0.5 s" in text for text in told)
+
+
+def test_minimisations_end_with_the_time(recording: Path, clock: list[float]) -> None:
+    problem = _outliers(Session.read(open_recording(recording), "los", None)).problem()
+    with deadline.within(1.0):
+        clock[0] += 2.0
+        estimate = solve_batch(problem)
+    assert estimate.message == "not converged: stopped by the time limit of 1 s"
+    assert not estimate.converged
+    assert np.isfinite(estimate.values).all()
 
 
 def test_a_result_is_written_when_the_time_is_over(alidade: Command, recording: Path, tmp_path: Path) -> None:

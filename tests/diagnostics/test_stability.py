@@ -10,10 +10,12 @@ import pytest
 import alidade
 from alidade.factors import so3
 from alidade.pipelines.applications.follow.guidance import View, Watch
+from alidade.pipelines.diagnostics import change_test
 from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
+from alidade.pipelines.estimation.assumptions import pull
 from alidade.pipelines.estimation.finding import Severity
-from alidade.pipelines.estimation.problem import Course, Estimate, History, Quantity, Told
+from alidade.pipelines.estimation.problem import Array, Course, Estimate, History, Quantity, Told
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
@@ -119,6 +121,29 @@ def test_minutes_at_which_nothing_changes_raise_no_alarm(seed: int) -> None:
     found = alidade.open(alidade.simulate("los", rates, seed)).calibrate().stability
     assert found is not None
     assert not found.changed
+
+
+@pytest.mark.parametrize(("departure", "excess"), [(30.0, 0.0), (1e6, 3.0)])
+def test_numbers_far_beyond_their_priors_have_wider_ones(departure: float, excess: float) -> None:
+    """Exactly where variances are below the priors', and finite where second order has them above."""
+    n, rng = 12, np.random.default_rng(0)
+    root = rng.standard_normal((n, n))
+    P: Array = np.linalg.inv(root @ root.T + np.eye(n))
+    values, steady = departure + rng.standard_normal((3, n)), np.ones(n, dtype=bool)
+    course = Course(np.arange(3.0), values, np.tile((1.0 + excess) * P, (3, 1, 1)), steady)
+    quantities = tuple(Quantity(f"q{i}", "rad", 1.0, 1.0, 1.0) for i in range(n))
+    names = tuple(q.name for q in quantities)
+    estimate = Estimate("batch", names, course.values[-1], P, True, "", course=course)
+    values, covariance = change_test._with_priors_as_found(estimate, quantities, course.values, course.covariance)
+    assert np.isfinite(values).all()
+    assert (np.linalg.eigvalsh(covariance) > 0.0).all()
+    assert (np.diagonal(covariance, axis1=1, axis2=2) <= 4.0 * departure**2 * (1.0 + excess)).all()
+    if not excess:
+        sizes = [pull(q, v, s) for q, v, s in zip(quantities, estimate.values, estimate.sigmas, strict=True)]
+        information = np.linalg.inv(P) - np.diag(1.0 - np.array(sizes, dtype=float) ** -2)
+        np.testing.assert_allclose(covariance[-1], np.linalg.inv(information), rtol=1e-6)
+        gradient = np.linalg.inv(P) @ course.values[-1]
+        np.testing.assert_allclose(values[-1], np.linalg.solve(information, gradient), rtol=1e-6)
 
 
 def test_what_walks_or_is_fixed_may_change() -> None:
