@@ -101,6 +101,8 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
         raise InputError("arrays do not say which method they are for: open(..., method=...)")
     chosen = methods.method(name)
     data = _placed(_checked(chosen, _data(chosen, source)), settings)
+    with _of_arrays():
+        chosen.check(data)
     return Session(chosen, data, settings, Arrays(chosen, data))
 
 
@@ -325,6 +327,10 @@ def _checked(method: Method, data: Any) -> Any:
             values = arrays[name]
             if len(values) != len(t):
                 raise InputError(f"arrays: {name} has {len(values)} rows for the {len(t)} stamps of {stamps}")
+            if missing := rows[name].placeholders(values):
+                arrays[name] = values = values.copy()
+                values[:, missing] = np.nan
+                dropped[f"{name}: column {missing[0]} reads one value throughout, as if it was not measured"] = len(t)
             lost = rows[name].lost(values)
             if len(lost):
                 more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""

@@ -109,6 +109,9 @@ class Method(ABC):
     def read(self, recording: Recording, config: Config) -> Any:
         """The method's data. Raises InputError when the recording cannot be used."""
 
+    def check(self, data: Any) -> None:  # noqa: B027
+        """Raise InputError where the sensors of arrays contradict one another, as `read` does of a recording."""
+
     def proposed(self, recording: Recording, config: Config) -> Sequence[str]:  # noqa: ARG002
         """Keys of the config that a recording it can read suggests, each with the reason; nothing takes them."""
         return ()

@@ -23,6 +23,9 @@ from alidade.pipelines.errors import InputError
 
 Array = NDArray[np.float64]
 
+# From so many rows on a component that never changes was not measured.
+_MEASURED = 20
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -63,6 +66,14 @@ class Rows:
         for axis in range(1, values.ndim) if self.unmeasured else ():
             values = np.delete(values, self.unmeasured, axis)
         return np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
+
+    def placeholders(self, values: Array) -> list[int]:
+        """Components of the rows (N, n) that need not be measured and were not: they read one value throughout.
+
+        A driver that measures two angles leaves the third as it is.
+        """
+        own = self.unmeasured if values.ndim == 2 and len(values) >= _MEASURED else ()
+        return [i for i in own if np.ptp(values[:, i]) == 0.0]
 
 
 Numbers = Annotated[Array, Rows(())]

@@ -78,6 +78,11 @@ class Los(Method):
 
         return read_los(recording, config)
 
+    def check(self, data: LosData) -> None:
+        from alidade.pipelines.methods.los.recording import check
+
+        check(data, "gyro", "gimbal")
+
     def problem(self, data: LosData, config: Config) -> Problem:
         from alidade.pipelines.methods.los.graph import problem
 

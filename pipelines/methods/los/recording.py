@@ -38,10 +38,35 @@ _STUCK = 0.9
 _STRETCH, _MOVED = 2.0, 0.01
 # Pictures this far apart, s, and at least so many, tell the signs of the gyro's axes.
 _STRIDE, _FEWEST = 0.2, 20
+# Another reading is told where it leaves this part of the misfit; those of deg/s and of the gimbal only where the
+# carrier's turn about any axis is this part of the largest: a mount off by 30 deg leaks half of one axis into another.
+_FAR_BETTER, _LEAST_SPREAD = 0.3, 0.3
+# What may be wrong -> weights (2, 3) of the gyro's x, y, z in the turn of the picture about the camera's z and x.
+_Weights = tuple[tuple[float, ...], ...]
+_ALL, _NONE = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+_SIGNS: dict[str, _Weights] = {
+    f"the gyro's {' and '.join(axis for axis, sign in zip('xyz', signs, strict=True) if sign < 0)} has the opposite "
+    "sign; the carrier's axes are x right, y ahead, z up: turn the gyro's axes, or the encoders', the right way": (
+        signs,
+    )
+    for signs in product((1.0, -1.0), repeat=3)
+    if min(signs) < 0.0
+}
+_IN_DEGREES: dict[str, _Weights] = {
+    "the gyro is in deg/s; angular_velocity has to be in rad/s": ((np.pi / 180.0,) * 3,)
+}
+_GIMBAL = "not follow the carrier: measured against the earth, or standing still; angles against the carrier are needed"
+_OF_GIMBAL: dict[str, _Weights] = {
+    f"its azimuth does {_GIMBAL}": ((1.0, 1.0, 0.0), _ALL),  # against the earth, about the vertical alone
+    f"its azimuth does {_GIMBAL}.": (_NONE, _ALL),
+    f"its elevation does {_GIMBAL}": (_ALL, _NONE),
+    f"it does {_GIMBAL}": (_NONE, _NONE),
+}
 # Samples of the gyro looked at together.
 _BLOCK = 100_000
 # Of an LOS error, what trackers may not measure.
 _ROLL = (2,)
+_ERRORS = Rows((3,), unmeasured=_ROLL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +87,7 @@ class LosData:
     gimbal_t: Numbers
     gimbal: Pairs
     image_t: Numbers
-    error: Annotated[Array, Rows((3,), unmeasured=_ROLL)]
+    error: Annotated[Array, _ERRORS]
     error_cov: Annotated[Array, Rows((3, 3), unmeasured=_ROLL)] | None = None
     gyro_density: float | None = None
     force: Vectors | None = None
@@ -75,8 +100,8 @@ def read_los(recording: Recording, config: Config) -> LosData:
     """Read and check a los session; without LOS errors they are taken from the pictures.
 
     Raises InputError when a topic is missing or unusable (see alidade.pipelines.recording.checks), when the topics have
-    no time in common, when the target was never found, and when sizes say that an encoder is in degrees, an encoder
-    stands still, a gyro axis has the opposite sign, the elevation is beyond 80 deg, or the LOS error is not in radians.
+    no time in common, when the target was never found, when an encoder is in degrees, the elevation beyond 80 deg or
+    the LOS error not in radians, and where gimbal, gyro and pictures contradict one another (`check`).
     """
     gyro_name, gimbal_name, error_name = map(config.topic, (IMU, GIMBAL, LOS_ERROR))
     reader = StreamReader(recording, {gyro_name: (), gimbal_name: JOINTS, error_name: ()})
@@ -106,9 +131,14 @@ def read_los(recording: Recording, config: Config) -> LosData:
         stamp_sigma,
         temperature.read(reader, config, (parameters.TEMPERATURE,), imu.t),
     )
-    check_gimbal(gimbal_name, data)
-    check_signs(gyro_name, data)
+    check(data, gyro_name, gimbal_name)
     return data
+
+
+def check(data: LosData, gyro: str, gimbal: str) -> None:
+    """Raise InputError where gimbal, gyro and pictures contradict one another, by the topics named."""
+    check_gimbal(gimbal, data)
+    check_motion(gyro, gimbal, data)
 
 
 def write_los(
@@ -166,14 +196,37 @@ def check_gimbal(topic: str, data: LosData) -> None:
             )
 
 
-def check_signs(topic: str, data: LosData) -> None:
-    """Raise InputError if with opposite signs of gyro axes the gimbal holds the picture far better than as they are."""
+def check_motion(gyro: str, gimbal: str, data: LosData) -> None:
+    """Raise InputError if the gimbal holds the picture far better with gyro or gimbal read another way.
+
+    That is: gyro axes of the opposite sign, a gyro in deg/s, gimbal angles that do not follow the carrier.
+    """
+    at, held, turned = _between_pictures(data)
+    if len(at) < _FEWEST:
+        return
+    readings = _SIGNS
+    spread = np.linalg.eigvalsh(np.cov(np.add.reduceat(data.gyro, np.searchsorted(data.gyro_t, at)).T))
+    if spread[0] > _LEAST_SPREAD**2 * spread[2]:
+        readings = {**_SIGNS, **_IN_DEGREES, **_OF_GIMBAL}
+
+    def miss(weights: _Weights) -> float:
+        return float(np.median(np.linalg.norm(held + (turned * np.array(weights)).sum(axis=2), axis=1)))
+
+    misses = {said: miss(weights) for said, weights in readings.items()}
+    best = min(misses, key=misses.__getitem__)
+    if misses[best] < _FAR_BETTER * miss((_ALL,)):
+        raise InputError(f"topic {gimbal if best in _OF_GIMBAL else gyro}: gimbal and pictures show that {best}")
+
+
+def _between_pictures(data: LosData) -> tuple[Array, Array, Array]:
+    """Times (n,) s of pictures apart, and about the camera's z and x between them, rad: (n - 1, 2), (n - 1, 2, 3).
+
+    The first is the gimbal's own turn less what the picture shows of it, the second the carrier's by its gyro's axes.
+    """
     t = data.image_t
     inside = (t >= max(data.gyro_t[0], data.gimbal_t[0])) & (t <= min(data.gyro_t[-1], data.gimbal_t[-1]))
     stride = max(1, round(_STRIDE / float(np.median(np.diff(t)))))
     at, error = t[inside][::stride], data.error[inside][::stride, [1, 0]]
-    if len(at) < _FEWEST:
-        return
     gimbal = np.stack([np.interp(at, data.gimbal_t, data.gimbal[:, k]) for k in range(2)], axis=1)
     turned = np.empty((len(at), 2, 3))
     for some, by_axes in _turned_by_carrier(data):
@@ -181,20 +234,9 @@ def check_signs(topic: str, data: LosData) -> None:
         mine = slice(np.searchsorted(at, t[0]), np.searchsorted(at, t[-1], side="right"))
         columns = by_axes.reshape(len(t), 6).T
         turned[mine] = np.stack([np.interp(at[mine], t, column) for column in columns], axis=1).reshape(-1, 2, 3)
-    # The gimbal's own turn about the camera's z and x, less what the picture shows of it.
     middle = 0.5 * (gimbal[1:, 1] + gimbal[:-1, 1])
-    held = np.diff(gimbal, axis=0) * np.stack([np.cos(middle), np.ones_like(middle)], axis=1) - np.diff(error, axis=0)
-    miss = {
-        signs: float(np.median(np.linalg.norm(held + np.diff(turned, axis=0) @ np.array(signs), axis=1)))
-        for signs in product((1, -1), repeat=3)
-    }
-    best = min(miss, key=miss.__getitem__)
-    if miss[best] < 0.3 * miss[1, 1, 1]:
-        axes = " and ".join(axis for axis, sign in zip("xyz", best, strict=True) if sign < 0)
-        raise InputError(
-            f"topic {topic}: gimbal and pictures show that the gyro's {axes} has the opposite sign; the "
-            "carrier's axes are x right, y ahead, z up: turn the gyro's axes, or the encoders', the right way"
-        )
+    own = np.diff(gimbal, axis=0) * np.stack([np.cos(middle), np.ones_like(middle)], axis=1)
+    return at, own - np.diff(error, axis=0), np.diff(turned, axis=0)
 
 
 def _turned_by_carrier(data: LosData) -> Iterator[tuple[slice, Array]]:
@@ -255,9 +297,8 @@ def _error(reader: StreamReader, topic: str) -> tuple[Array, Array]:
         )
     t, keep = reader.clean(topic, errors.t_ns, offset)
     error = errors.vector[keep][:, [0, 2, 1]]
-    if len(error) >= _FEWEST and np.isfinite(error[:, 2]).all() and np.ptp(error[:, 2]) == 0.0:
-        # What never changes was not measured: a driver that measures two angles leaves the third as it is.
-        error[:, 2] = np.nan
+    if missing := _ERRORS.placeholders(error):
+        error[:, missing] = np.nan
         reader.recording.remark(f"topic {topic}: y, the roll, reads one value in all messages: it was not measured")
     size = np.abs(error[:, :2]).max(axis=1)
     if np.median(size) > _WIDEST_ERROR:

@@ -51,6 +51,10 @@ _LEFT_HANDED = (
     "Beside the accelerometer the magnetometer's axes are left-handed: an axis of one of them has the wrong sign, or "
     "the accelerometer shows gravity down where it has to show up; K of the magnetometer mends the first."
 )
+_LEFT_HANDED_ACCEL = (
+    "Beside gyro and magnetometer the accelerometer's axes are left-handed: one of them has the wrong sign, or two are "
+    "swapped; K of the accelerometer mends it."
+)
 _GRAVITY_DOWN = (
     "The accelerometer shows gravity down where it has to show the force that holds it, up: all its three signs are "
     "inverted, which its K mends (about -1); the magnetometer keeps its signs."
@@ -246,16 +250,20 @@ def _chained(
     if beside:
         accel = beside[0]
         rows = np.clip(np.searchsorted(mag.time, accel.time), 0, len(mag.time) - 1)
-        sine = -float(np.mean((accel.directions * found.directions[rows]).sum(axis=1)))
+        rotation, sine, _ = _mounting(accel.directions, found.directions[rows])
         if model is not None and _contradicts(sine, model[0]):
             sine = -sine
-            if _is_mounted_straight(found.turned):
-                beside = [_inverted(accel)]
-                premises.append(_GRAVITY_DOWN)
-            else:
+            if not _is_mounted_straight(found.turned):
                 gyro = gyro.mirrored
                 found = _of_guess(mag, gyro)
                 premises.append(_LEFT_HANDED)
+            elif _is_mounted_straight(rotation):
+                accel = _inverted(accel)
+                premises.append(_GRAVITY_DOWN)
+            else:
+                rotation = -rotation
+                premises.append(_LEFT_HANDED_ACCEL)
+        beside = [accel if _is_mounted_straight(rotation) else _turned(accel, rotation.T)]
     elif model is None:
         model = 0.0, 0.0
     dip = Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model)
@@ -303,12 +311,12 @@ def _inverted(accel: Sensor) -> Sensor:
     return replace(accel, start=-accel.start, turned=-accel.turned)
 
 
-def _turned(mag: Sensor, rotation: Array) -> Sensor:
-    """A magnetometer whose start is symmetric, turned by an orthogonal matrix."""
-    numbers = mag.start @ entries(mag.symmetric).T
+def _turned(sensor: Sensor, rotation: Array) -> Sensor:
+    """A sensor whose start is symmetric, turned by an orthogonal matrix."""
+    numbers = sensor.start @ entries(sensor.symmetric).T
     K = rotation @ numbers[:9].reshape(3, 3)
     start = np.concatenate([K.ravel(), rotation @ numbers[9:]])
-    return replace(mag, symmetric=False, start=start, turned=rotation)
+    return replace(sensor, symmetric=False, start=start, turned=rotation)
 
 
 def _rests(data: TumbleData, config: Config) -> Array | None:
@@ -485,11 +493,9 @@ def _together(
     up = accel.directions[rows]
     vectors = nominal_of(readings / mag.radius, mag.start)
     seen = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    rotation, sine, clear = _rotation(up, seen)
+    rotation, sine, clear = _mounting(up, seen)
     premises = []
-    if not clear:
-        rotation, sine = np.eye(3), -float(np.mean((up * seen).sum(axis=1)))
-    elif model is not None and _contradicts(sine, model[0]):
+    if clear and model is not None and _contradicts(sine, model[0]):
         sine = -sine
         if _is_mounted_straight(rotation):
             accel = _inverted(accel)
@@ -523,22 +529,23 @@ def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[ND
     return rows, at[rows], readings, np.ones(len(rows))
 
 
-def _rotation(up: Array, field: Array) -> tuple[Array, float, bool]:
-    """R (3, 3), proper, and s with up . R field = -s for unit vectors (n, 3), and whether they tell.
+def _mounting(up: Array, field: Array) -> tuple[Array, float, bool]:
+    """R (3, 3), proper, and s with up . R field = -s for unit vectors (n, 3), and whether they tell; else no rotation.
 
     Linear in the nine entries of R and in s, with one solution up to a factor, whose sign is R's determinant.
     """
+    straight = np.eye(3), -float(np.mean((up * field).sum(axis=1))), False
     if len(up) < FEWEST:
-        return np.eye(3), 0.0, False
+        return straight
     design = np.column_stack([np.einsum("ni,nj->nij", up, field).reshape(-1, 9), np.ones(len(up))])
     _, sizes, axes = np.linalg.svd(design, full_matrices=False)
     M, s = axes[-1, :9].reshape(3, 3), float(axes[-1, 9])
     sign = 1.0 if np.linalg.det(M) > 0.0 else -1.0
     size = float(np.linalg.norm(M)) / np.sqrt(3.0)
     u, _, vt = np.linalg.svd(sign * M)
-    clear = bool(sizes[-2] > _CLEAR * sizes[-1]) and size > 1e-6
-    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return R, sign * s / max(size, 1e-12), clear
+    if sizes[-2] <= _CLEAR * sizes[-1] or size < 1e-6:
+        return straight
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, sign * s / size, True
 
 
 def nearest_axes(rotation: Array) -> Array:

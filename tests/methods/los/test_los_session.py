@@ -97,6 +97,19 @@ def _one_axis(data: LosData) -> LosData:
     return replace(data, error=data.error * [1.0, 0.0, 1.0])
 
 
+def _against_earth(data: LosData, angle: int, axis: int) -> LosData:
+    """A gimbal angle with the carrier's own turn about an axis in it."""
+    turned = np.interp(data.gimbal_t, data.gyro_t, np.cumsum(data.gyro[:, axis]) * np.gradient(data.gyro_t))
+    return replace(data, gimbal=data.gimbal + turned[:, None] * np.eye(2)[angle])
+
+
+def _noisy(data: LosData, angle: int) -> LosData:
+    """A gimbal angle that shows nothing but noise."""
+    gimbal = data.gimbal.copy()
+    gimbal[:, angle] = gimbal[0, angle] + 1e-5 * np.random.default_rng(0).standard_normal(len(gimbal))
+    return replace(data, gimbal=gimbal)
+
+
 def _held(data: LosData, share: float) -> LosData:
     """For such a share of every hundred messages the tracker gives the error of the first."""
     error = data.error.copy()
@@ -112,6 +125,9 @@ def _held(data: LosData, share: float) -> LosData:
         (_steep, r"elevation of 82.00 deg .* beyond 80 deg .* cannot stabilise"),
         (_frozen, r"elevation stands still from .* the encoder is frozen"),
         (_other_sign, r"/imu: gimbal and pictures show that the gyro's y has the opposite sign"),
+        (lambda data: replace(data, gyro=np.rad2deg(data.gyro)), r"/imu: gimbal and pictures show that .* in deg/s"),
+        (lambda data: _against_earth(data, 0, 2), r"states: gimbal and pictures show that its azimuth does not follow"),
+        (lambda data: _noisy(data, 1), r"states: gimbal and pictures show that its elevation does not follow"),
         (_pixels, r"/los/error: LOS errors of .* are they in pixels\?"),
         (_never_found, r"/los/error: the target was never found, none of the 600 messages"),
         (

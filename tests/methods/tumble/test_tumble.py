@@ -298,6 +298,28 @@ def test_a_gyro_in_degrees_is_not_used_and_that_is_told(tmp_path: Path) -> None:
     assert "is it in deg/s, or in counts?" in " ".join(session.problem().premises)
 
 
+@pytest.mark.parametrize(
+    ("axes", "told"),
+    [
+        ([[1, 0, 0], [0, -1, 0], [0, 0, 1]], True),
+        pytest.param([[0, 1, 0], [1, 0, 0], [0, 0, 1]], True, marks=pytest.mark.slow),
+        pytest.param([[-1, 0, 0], [0, -1, 0], [0, 0, 1]], False, marks=pytest.mark.slow),
+    ],
+)
+def test_an_accelerometer_of_other_axes_is_calibrated_beside_a_gyro(axes: list[list[int]], told: bool) -> None:
+    """One axis inverted, two swapped: left-handed, and told; turned by half a turn: right-handed."""
+    simulated, P = _simulated(TURNING, 2), np.array(axes, dtype=float)
+    assert simulated.data.accel is not None
+    data = replace(simulated.data, accel=simulated.data.accel @ P.T)
+    calibration = Session.of(TUMBLE, replace(simulated, data=data)).calibrate()
+    names = [f"accel_k{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+    K = np.array([simulated.truth[name] for name in names]).reshape(3, 3) @ P.T
+    at = [calibration.estimate.names.index(name) for name in names]
+    error = calibration.estimate.values[at] - K.ravel()
+    assert np.abs(error / calibration.estimate.sigmas[at]).max() < 4.0
+    assert ("the accelerometer's axes are left-handed" in " ".join(calibration.notes)) == told
+
+
 def test_left_handed_axes_are_told_beside_a_gyro() -> None:
     simulated = _simulated(replace_scenario(TURNING, rest_s=1.5), 2)
     assert simulated.data.mag is not None
