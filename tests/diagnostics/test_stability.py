@@ -128,7 +128,7 @@ def test_numbers_far_beyond_their_priors_have_wider_ones(departure: float, exces
     """Exactly where variances are below the priors', and finite where second order has them above."""
     n, rng = 12, np.random.default_rng(0)
     root = rng.standard_normal((n, n))
-    P: Array = np.linalg.inv(root @ root.T + np.eye(n))
+    P: Array = np.asarray(np.linalg.inv(root @ root.T + np.eye(n)), dtype=float)
     values, steady = departure + rng.standard_normal((3, n)), np.ones(n, dtype=bool)
     course = Course(np.arange(3.0), values, np.tile((1.0 + excess) * P, (3, 1, 1)), steady)
     quantities = tuple(Quantity(f"q{i}", "rad", 1.0, 1.0, 1.0) for i in range(n))
