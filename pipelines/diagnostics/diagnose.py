@@ -18,7 +18,9 @@ from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate
 from alidade.pipelines.estimation.robust import robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
-_CORNERS = "corner_px"
+# Measured noises whose default is no guess, and how many times it is none any more: blurred and distant tags scatter by
+# two or three times it; attitudes by 3.5 deg, seven times it, serve nobody.
+_NO_NOISE = {"corner_px": 5.0, "vision_attitude": 7.0}
 # Kinds about the residuals, as opposed to priors and requirements.
 _RESIDUAL = ("not_converged", "misfit", "noise", "correlation", "rejection")
 
@@ -34,7 +36,6 @@ class Thresholds:
     min_few: int = 4
     noise_factor: float = 4.0  # a larger estimate over statement, by `noise_sigmas` of the estimate, is no noise
     noise_sigmas: float = 3.0
-    corner_factor: float = 5.0  # corners over their default: blurred and distant tags scatter by two or three times it
     noise_note: float = 2.0
     noise_suspect: float = 1.5  # with correlated residuals
     process_dof: float = 100.0  # processes with fewer are not tested
@@ -162,12 +163,12 @@ def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
         least = -np.inf if level.sigma is None else (level.found or 0.0) - limits.noise_sigmas * level.sigma
         no_noise = bool(level.noise.families) and least > limits.noise_factor
         differs = level.contradicted or not 1.0 / limits.noise_note < level.scale < limits.noise_note
-        # Of corners the default is no guess: what scatters by many times it does not fit the camera or the layout.
-        corners = level.noise.name == _CORNERS and level.scale > limits.corner_factor
-        if corners or (level.noise.source != "default" and (no_noise or (differs and level.scale != 1.0))):
+        is_default = level.noise.source == "default"
+        misfit = is_default and level.scale > _NO_NOISE.get(level.noise.name, np.inf)
+        if misfit or (not is_default and (no_noise or (differs and level.scale != 1.0))):
             numbers = {"used": level.used, "factor": level.scale, "estimated_factor": level.found}
             evidence = {"noise": level.noise.name, "unit": level.noise.unit, "source": level.noise.source, **numbers}
-            yield Finding("noise", INCONSISTENT if no_noise or corners else NOTE, evidence)
+            yield Finding("noise", INCONSISTENT if no_noise or misfit else NOTE, evidence)
 
 
 def _correlations(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:

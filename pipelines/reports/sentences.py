@@ -35,7 +35,10 @@ _NEXT = {
     "inconsistent": ("Do not apply it before the cause is found: see Goodness of fit below.",),
 }
 _WALK = "Calibrate the recordings after the last change together, or let the parameter walk: `share` in the config."
-_CHECK = {"corner_px": "camera_info (lens, size and rectification of the pictures) and the layout of the tags"}
+_CHECK = {
+    "corner_px": "camera_info (lens, size and rectification of the pictures) and the layout of the tags",
+    "vision_attitude": "that gyro and vision are of one device and time, and the meaning of the quaternions",
+}
 _FAR = "check the orientation and the axis order of the sensor, or widen the prior"
 
 

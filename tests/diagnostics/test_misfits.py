@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.diagnostics import hypothesis_tests
-from alidade.pipelines.diagnostics.diagnose import diagnose
+from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
 from alidade.pipelines.diagnostics.trial_fit import TrialFit
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level, Noise
@@ -16,13 +16,18 @@ from alidade.pipelines.estimation.problem import ChiSquare, Residuals
 from tests.support.builders import make_calibration
 
 
-@pytest.mark.parametrize(("scale", "told"), [(4.0, False), (6.0, True)])
-def test_corners_beyond_five_times_their_default_do_not_fit(scale: float, told: bool) -> None:
+@pytest.mark.parametrize(
+    ("noise", "scale", "told"),
+    [("corner_px", 4.0, 0), ("corner_px", 6.0, 1), ("vision_attitude", 6.0, 0), ("vision_attitude", 8.0, 1)],
+)
+def test_what_scatters_by_many_times_its_default_does_not_fit(noise: str, scale: float, told: int) -> None:
     calibration = make_calibration()
-    level = Level(Noise("corner_px", 0.3, "default", 1.0, ("tags",)), scale, scale, 0.1)
+    level = Level(Noise(noise, 0.3, "default", 1.0, ("tags",)), scale, scale, 0.1)
     estimate = replace(calibration.estimate, levels=(level,))
-    found = [each for each in diagnose(estimate, calibration.problem.quantities) if each.kind == "noise"]
-    assert [(each.severity, each.evidence["noise"]) for each in found] == told * [(Severity.INCONSISTENT, "corner_px")]
+    findings = diagnose(estimate, calibration.problem.quantities)
+    found = [each for each in findings if each.kind == "noise"]
+    assert [(each.severity, each.evidence["noise"]) for each in found] == told * [(Severity.INCONSISTENT, noise)]
+    assert is_suspect(estimate, findings) is bool(told)
 
 
 @pytest.mark.parametrize(("count", "rejected", "told"), [(6, 4, True), (6, 3, False), (3, 3, False), (20, 4, False)])

@@ -105,7 +105,8 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         INCONSISTENT,
         {"noise": "vision_attitude", "unit": "rad", "source": "config", "used": 0.078}
         | {"factor": 9.0, "estimated_factor": 9.02},
-        "Noise vision_attitude: estimated 9 times the config's value; not white noise: check the model or the unit.",
+        "Noise vision_attitude: estimated 9 times the config's value; not white noise: check that gyro and vision are "
+        "of one device and time, and the meaning of the quaternions.",
     ),
     (
         "noise",
