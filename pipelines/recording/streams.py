@@ -107,6 +107,7 @@ class StreamReader:
         least: int = 2,
         slowest_s: float = SLOWEST_S,
         may_be_constant: bool = False,
+        may_be_held: bool = False,
     ) -> Samples[AnySeries]:
         """Samples of a series in which all of the quantities (attributes of it) are finite and without faults.
 
@@ -117,15 +118,19 @@ class StreamReader:
             least: samples needed.
             slowest_s: longest usual step that such a sensor may have, s.
             may_be_constant: whether all axes may read the same throughout.
+            may_be_held: whether a driver may repeat a reading until there is a new one; it is used once.
         """
         self.count(topic, "stamped by log time (kept)", found.stamped_by_log)
         values = np.concatenate([getattr(found, name).reshape(len(found), -1) for name in quantities], axis=1)
         t, rows = checks.clean(topic, found.t_ns, self.epoch_ns, values, self.dropped, least, slowest_s)
         samples = Samples(t, _rows(found, rows))
-        sound = np.arange(len(t))
+        if may_be_held:  # a reading that is repeated is not one at the end of the range
+            values = np.concatenate([getattr(samples.series, name) for name in quantities], axis=1)
+            samples = samples.rows(plausibility.measured_once(topic, values, self.dropped))
+        sound = np.arange(len(samples.t))
         for name in [each for each in quantities if each in _UNITS]:
             own = getattr(samples.series, name)
-            kept = drop_faults(topic, t, own, self.dropped, _UNITS[name], may_be_constant)
+            kept = drop_faults(topic, samples.t, own, self.dropped, _UNITS[name], may_be_constant)
             sound = np.intersect1d(sound, kept, assume_unique=True)
         return samples.rows(sound)
 
@@ -160,8 +165,7 @@ class StreamReader:
 
     def magnetic_field(self, topic: str) -> Samples[MagneticSeries]:
         """Samples of a MagneticField topic, T; a reading that the driver repeats is used once."""
-        samples = self.samples(topic, self.recording.magnetic(topic), "field")
-        return samples.rows(plausibility.measured_once(topic, samples.series.field, self.dropped))
+        return self.samples(topic, self.recording.magnetic(topic), "field", may_be_held=True)
 
     def density(self, topic: str, kind: str, samples: Samples[AnySeries]) -> float | None:
         """Noise density, per sqrt(Hz), that the covariances of samples state; None if they state none.

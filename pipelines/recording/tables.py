@@ -32,6 +32,8 @@ _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 _LONGEST_LINE, _MOST_COLUMNS = 1 << 16, 1000
 # How a table is written is looked for in so much of its beginning, B, and so many of its lines.
 _HEAD, _SAMPLE = 1 << 18, 200
+# Numbers of a row that begins with a word, at least: a vector.
+_LEAST_LABELLED = 3
 # Rows cut short, as by a logger that lost power, are dropped up to this share of all.
 _MOST_CUT = 0.01
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -131,7 +133,8 @@ def table_form(path: Path, data: Path) -> TableForm:
     cells = [_cells(line, delimiter) for line in lines]
     if max(map(len, cells)) > _MOST_COLUMNS:
         raise _unknown(path)
-    first = next((i for i, row in enumerate(cells) if _is_row(row) and not _is_comment(lines[i])), len(lines))
+    usual = Counter(map(len, cells[-_SAMPLE:])).most_common(1)[0][0]
+    first = next((i for i, row in enumerate(cells) if _is_row(row, usual) and not _is_comment(lines[i])), len(lines))
     width = len(cells[first]) if first < len(lines) else 0
     header, units = _header(lines[:first], delimiter, width)
     if not width and header is None:
@@ -304,10 +307,17 @@ def _uncommented(line: str) -> str:
     return line.lstrip().lstrip("#/%").strip() if _is_comment(line) else line
 
 
-def _is_row(cells: Sequence[str]) -> bool:
-    """Whether these are cells of a row: numbers or times, or nothing, in most of them and the first."""
+def _is_row(cells: Sequence[str], usual: int) -> bool:
+    """Whether these are cells of a row: numbers or times, or nothing, in most of them.
+
+    What begins with a word is one if it has as many cells as rows usually have, three numbers or more among them: a
+    label, and no line of a preamble.
+    """
     filled = [cell for cell in cells if cell.lower() not in _ABSENT]
-    return bool(filled) and _is_value(filled[0]) and 2 * sum(map(_is_value, filled)) >= len(filled)
+    values = sum(map(_is_value, filled))
+    if not filled or 2 * values < len(filled):
+        return False
+    return _is_value(filled[0]) or (values >= _LEAST_LABELLED and len(cells) == usual)
 
 
 def _is_value(cell: str) -> bool:

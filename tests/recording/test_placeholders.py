@@ -11,6 +11,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import clean, tracked
 from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.plausibility import (
     GRAVITY_REMOVED,
     density,
@@ -20,6 +21,7 @@ from alidade.pipelines.recording.plausibility import (
     plausible_covariance,
 )
 from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.recording.streams import StreamReader
 from tests.support import forms
 
 RNG = np.random.default_rng(3)
@@ -70,6 +72,15 @@ def test_a_held_reading_is_used_once() -> None:
     coarse = np.round(0.4 * RNG.normal(size=(1000, 3)))
     assert len(measured_once("/mag", np.ones((1000, 3)), {})) == 1000, "a coarse sensor at rest has one value"
     assert len(measured_once("/mag", coarse, {})) == 1000, "a coarse sensor repeats itself, but not each value alike"
+
+
+def test_a_held_reading_is_not_one_at_the_end_of_the_range(tmp_path: Path) -> None:
+    turn = np.linspace(0.0, 20.0, 125)[:, None] + [0.0, 1.0, 2.0]
+    held = np.repeat(3e-5 * np.sin(turn) + 1e-7 * RNG.normal(size=(125, 3)), 8, axis=0)
+    write_session(tmp_path / "s.mcap", {"/mag": series.MagneticSeries(T_NS, held)}, {})
+    reader = StreamReader(open_recording(tmp_path / "s.mcap"), {})
+    np.testing.assert_array_equal(reader.magnetic_field("/mag").series.field, held[::8])
+    assert reader.dropped == {"/mag: repeats the reading before, used once": 875}
 
 
 def test_quaternions_of_zeros_are_a_body_that_was_not_seen() -> None:

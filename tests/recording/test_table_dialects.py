@@ -48,6 +48,10 @@ def wrapped(i: int) -> str:
 
 
 DIALECTS: dict[str, tuple[bytes, str]] = {
+    "a word ahead of the numbers": (
+        "\n".join(["Fs,50.00", "name," + HEADER, *(f"rest {i % 3},{line}" for i, line in enumerate(rows()))]).encode(),
+        "x.csv",
+    ),
     "comma": ("\n".join([HEADER, *rows()]).encode(), "x.csv"),
     "byte order mark": ("\n".join([HEADER, *rows()]).encode("utf-8-sig"), "x.csv"),
     "UTF-16": ("\n".join([HEADER, *rows()]).encode("utf-16"), "x.csv"),
