@@ -24,8 +24,9 @@ _JUMP, _SPIKE = 10.0, 10.0
 _CLIPPED, _QUANTA = 3, 20.0
 # The end of a range may wander, as a gyro's from 7.2346 to 7.2653 rad/s: readings this near to the largest, as a share,
 # for no longer than so many s (rests and steady turns are longer) are a plateau if readings fall by so many times its
-# height within its length before and after. Off a smooth top they fall by 8 times.
-_NEAR_END, _BRIEFLY, _FALL = 0.02, 1.0, 24.0
+# height within its length before and after. Off a smooth top they fall by 8 times, and off three samples of a noisy one
+# by more: the longest plateau has so many.
+_NEAR_END, _BRIEFLY, _FALL, _PLATEAU = 0.02, 1.0, 24.0, 6
 # Readings of two devices in turn: one differs from the next by so many times what it does from the next but one. Of
 # noise both are alike, of motion the second is larger.
 _ALTERNATE, _ALTERNATE_SAMPLES = 3.0, 100
@@ -164,7 +165,7 @@ def _clipped(t: Array, x: Array) -> Mask:
 
 def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
     """Plateaus near the largest reading, entered and left steeply for how flat they are; none where one is known."""
-    out = np.zeros(len(x), dtype=bool)
+    out, longest = np.zeros(len(x), dtype=bool), 0
     above = x - np.nanmedian(x)
     edges = np.diff(np.concatenate([[False], above > (1.0 - _NEAR_END) * np.nanmax(above), [False]]).astype(int))
     for first, stop in np.flatnonzero(edges).reshape(-1, 2).tolist():
@@ -183,7 +184,8 @@ def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
         fall = above[flat].min() - np.fmax(above[first - count], above[stop - 1 + count])
         if fall > _FALL * np.ptp(above[flat]) and fall > 0.0:
             out[flat] = True
-    return out
+            longest = max(longest, len(flat))
+    return out & (longest >= _PLATEAU)
 
 
 def _at_end(x: Array) -> Mask:
