@@ -27,8 +27,9 @@ from alidade.pipelines.methods.tumble.turning import DELAY_KEY, FieldGuess, Rows
 from alidade.pipelines.settings import Config
 
 FAMILIES = {"accel": "accelerometer", "mag": "magnetometer"}
-# As good as none, rad: of the first attitude, of which nothing tells the turn about the field or about up.
-_ANY_ATTITUDE = np.pi
+# Prior sigma of the first attitude, rad: as good as none. A magnetometer alone at an unknown place leaves its rotation
+# about the field undetermined, whatever it is, and the start fixes it to this.
+_ANY_ATTITUDE, _FIXED = np.pi, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,10 @@ def _begin(graph: _Graph, step: Step) -> None:
         step.initial.insert(parameter.key, zeros)
         step.factors.append(vector_prior(parameter, zeros))
     chain = turned.chain
-    step.factors.append(rotation_about(chain.state(0), chain.initial[0], np.eye(3) / _ANY_ATTITUDE))
+    about_field = _FIXED if turned.earth is None and "accel" not in graph.sensors else _ANY_ATTITUDE
+    sigmas = np.array([_ANY_ATTITUDE, about_field, _ANY_ATTITUDE])  # about the axes of a: the field has no dip there
+    R = so3.matrix(chain.initial[0]) / sigmas[:, None]
+    step.factors.append(rotation_about(chain.state(0), chain.initial[0], R))
 
 
 def _field(graph: _Graph, keyframes: range) -> list[Factor]:

@@ -35,8 +35,8 @@ from alidade.pipelines.settings import Config
 Index = NDArray[np.intp]
 
 BIAS = tuple(f"gyro_bias_{axis}" for axis in "xyz")
-# The usual grade of consumer gyros, one sigma; and how far from their stamps readings of a magnetometer
-# are taken that is read by itself.
+# The usual grade of consumer gyros, one sigma; and how far from their stamps readings of a magnetometer are taken that
+# is read by itself, beside a gyro whose samples are means over an interval that may end at their stamps.
 SCALE = scale_assumptions("gyro", "gyro", 1e-2)
 SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-4)
 DELAY = Assumption(("mag_delay",), "s", "mag", "delay", 1e-2)
@@ -275,6 +275,7 @@ def turning(
         walk=walk.used,
         errors=errors,
     )
+    delay = replace(DELAY, sigma=float(np.hypot(DELAY.sigma, 0.5 * np.median(np.diff(data.gyro_t)))))
     known = tuple(
         Quantity(name, "rad/s", config.prior(name, _BIAS_PRIOR), _BIAS_PRIOR, config.require.get(name, _BIAS_REQUIRE))
         for name in BIAS
@@ -285,7 +286,7 @@ def turning(
         mag=Rows(inside, np.repeat(np.arange(len(time)), np.diff(begins))),
         accel=rested or Rows(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)),
         bias=Parameter(FIRST, known),
-        delay=Parameter(DELAY_KEY, quantities(DELAY, config)),
+        delay=Parameter(DELAY_KEY, quantities(delay, config)),
         arm=_arm(config) if accel is not None and accel.swung else None,
         earth_rate=_earth_rate(config) if data.latitude is None else None,
         levels=(density, walk),
