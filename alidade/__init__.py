@@ -18,7 +18,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alidade.pipelines.applications.api import Config, calibrate, follow, load, open, plan, simulate
+    from alidade.pipelines.applications.api import (
+        Config,
+        calibrate,
+        certificate,
+        compare,
+        export,
+        fleet,
+        follow,
+        load,
+        noise,
+        open,
+        plan,
+        simulate,
+        validate,
+    )
+    from alidade.pipelines.applications.one_liners import hand_eye, imu_static, magcal
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.errors import InputError
     from alidade.pipelines.methods import Method
@@ -37,29 +52,33 @@ __all__ = [
     "Simulated",
     "__version__",
     "calibrate",
+    "certificate",
+    "compare",
+    "export",
+    "fleet",
     "follow",
+    "hand_eye",
+    "imu_static",
     "load",
+    "magcal",
     "methods",
+    "noise",
     "open",
     "plan",
     "simulate",
+    "validate",
 ]
 
 _MODULES = {
     "Calibration": "alidade.pipelines.reports.result",
-    "Config": "alidade.pipelines.applications.api",
     "IndeterminateError": "alidade.pipelines.solvers.chain",
     "InputError": "alidade.pipelines.errors",
     "Method": "alidade.pipelines.methods",
     "Session": "alidade.pipelines.applications.session",
     "Simulated": "alidade.pipelines.simulation.simulated",
-    "calibrate": "alidade.pipelines.applications.api",
-    "follow": "alidade.pipelines.applications.api",
-    "load": "alidade.pipelines.applications.api",
-    "open": "alidade.pipelines.applications.api",
-    "plan": "alidade.pipelines.applications.api",
-    "simulate": "alidade.pipelines.applications.api",
+    **dict.fromkeys(("hand_eye", "imu_static", "magcal"), "alidade.pipelines.applications.one_liners"),
 }
+_API = "alidade.pipelines.applications.api"
 
 
 def __getattr__(name: str) -> Any:
@@ -69,9 +88,9 @@ def __getattr__(name: str) -> Any:
         return version("alidade")
     if name == "methods":
         return import_module("alidade.pipelines.methods").names
-    if name not in _MODULES:
+    if name not in __all__:
         raise AttributeError(f"module 'alidade' has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+    return getattr(import_module(_MODULES.get(name, _API)), name)
 
 
 def __dir__() -> list[str]:

@@ -45,17 +45,22 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     try:
         config = model().model_validate(_merge(base, more))
     except ValidationError as error:
-        # An unknown key explains more than what follows from it.
-        first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
-        path = tuple(part for part in first["loc"] if not str(part).startswith("["))
-        said = path[:-1] if first["type"] == "missing" else path
+        said, text = first_error(error)
         where = str(override) if _has(more, said) else f"attachment {ATTACHMENT}"
-        raise InputError(f"{where}: {_explain(path, first)}") from error
+        raise InputError(f"{where}: {text}") from error
     known = {topic.key for name in methods.names() for topic in methods.method(name).topics}
     for key in config.topics.keys() - known:
         where = str(override) if _has(more, ("topics", key)) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
     return config if belief is None else config.believing(belief)
+
+
+def first_error(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
+    """Where a config is wrong, and a sentence about it."""
+    # An unknown key explains more than what follows from it.
+    first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
+    path = tuple(part for part in first["loc"] if not str(part).startswith("["))
+    return path[:-1] if first["type"] == "missing" else path, _explain(path, first)
 
 
 @cache

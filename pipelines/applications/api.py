@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Arrays, Session
-from alidade.pipelines.config import load_config
+from alidade.pipelines.config import first_error, load_config
 from alidade.pipelines.config import model as _config_model
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import AttitudeRate, EngineName
@@ -38,19 +38,46 @@ from alidade.pipelines.settings import Config as _BaseConfig
 from alidade.pipelines.simulation.simulated import Simulated
 
 if TYPE_CHECKING:
+    from alidade.pipelines.applications.comparison import Comparison
+    from alidade.pipelines.applications.fleet.write import FleetResult
     from alidade.pipelines.applications.follow.guidance import View
+    from alidade.pipelines.applications.noise import NoiseStudy
     from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.applications.validate import Validated
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration
 
-    Config = _BaseConfig
+    _Model = _BaseConfig
 else:
-    Config = _config_model()
+    _Model = _config_model()
+
+
+class Config(_Model):
+    """A config: keys of the YAML file, as a mapping or by name.
+
+        alidade.Config({"noise": {"gyro_density": 1e-4}}, latitude_deg=48.1)
+
+    Raises:
+        InputError: the first key or value that cannot be used, in one line.
+    """
+
+    def __init__(self, keys: Mapping[str, Any] | None = None, /, **more: Any) -> None:
+        try:
+            super().__init__(**{**(keys or {}), **more})
+        except ValidationError as error:
+            raise InputError(f"config: {first_error(error)[1]}") from error
+
+    def __repr__(self) -> str:
+        """What was set."""
+        return f"Config({self.model_dump(exclude_unset=True)})"
+
+    __str__ = __repr__
+
 
 # What can be opened: a recording, its files, simulated data, a method's own data or its fields by name.
 Source = str | Path | list[str | Path] | Simulated | Mapping[str, Any] | Any
-# Settings that override the recording's own: an alidade.Config or a YAML file.
-Settings = _BaseConfig | str | Path | None
+# Settings that override the recording's own: an alidade.Config, its keys, or a YAML file.
+Settings = _BaseConfig | Mapping[str, Any] | str | Path | None
 
 # No session takes longer, s; stamps in ns, and in us after ten seconds, look as if one had.
 _LONGEST = 1e7
@@ -112,8 +139,15 @@ def _override(config: object) -> Path | _BaseConfig | None:
         return config
     if isinstance(config, str):
         return Path(config)
-    kind = type(config).__name__
-    raise InputError(f"config: a file or an alidade.Config is needed, not {kind}; alidade.Config(**keys) makes one")
+    if isinstance(config, Mapping):
+        return Config(config)
+    raise InputError(f"config: a file, an alidade.Config or its keys are needed, not {type(config).__name__}")
+
+
+def load_settings(config: Settings, more: Mapping[str, Any]) -> _BaseConfig:
+    """A config with these keys where it does not have them itself. Raises InputError."""
+    given = load_config(None, _override(config)).model_dump(exclude_unset=True)
+    return Config({**more, **given})
 
 
 def _files(source: str | Path | Sequence[Any]) -> Where:
@@ -180,8 +214,12 @@ def load(path: str | Path, config: Settings = None) -> SavedCalibration:
         InputError: file or config cannot be used.
     """
     from alidade.pipelines.reports.calibration import load_calibration
+    from alidade.pipelines.reports.known import load_known, with_covariance
 
-    return load_calibration(Path(path), load_config(None, _override(config)))
+    saved = load_calibration(Path(path), load_config(None, _override(config)))
+    known = load_known(Path(path))
+    joint = with_covariance(known, Path(path))
+    return saved if joint is known else saved.knowing(joint.belief)
 
 
 def simulate(
@@ -251,6 +289,110 @@ def follow(
     settings = Following(method, _override(config), window, patience, prior=earlier)
     with source_of(str(path), say=lambda _: None) as source:
         return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
+
+
+def compare(
+    source: Source, *, method: str | None = None, config: Settings = None, window: float | None = 1.0
+) -> Comparison:
+    """Solve a recording by the published, batch and incremental solver, and its halves: `.answer`, `.calibrations`.
+
+    Raises as `calibrate` does.
+    """
+    from alidade.pipelines.applications.comparison import compared
+
+    return compared(open(source, method, config), window)
+
+
+def validate(
+    recording: str | Path,
+    calibration: str | Path | Calibration,
+    *,
+    method: str | None = None,
+    config: Settings = None,
+    strict: bool = False,
+) -> Validated:
+    """Test a calibration on another recording: `.verdict`, `.sentence`, `.held.steps`.
+
+    `calibration` is a result.json, a calibration.yaml, or what `calibrate` returns.
+
+    Raises:
+        InputError: recording, config or calibration cannot be used, or the calibration is another method's.
+    """
+    from alidade.pipelines.applications.validate import validate as run
+
+    given = Path(calibration) if isinstance(calibration, str | Path) else calibration
+    return run(Path(recording), given, method, _override(config), strict)
+
+
+def noise(
+    recording: str | Path, *, config: Settings = None, strict: bool = False, auto_columns: bool = False
+) -> NoiseStudy:
+    """Allan deviation of the sensors of a recording at rest: `.sensors`, and `.config`, what a Config takes of it.
+
+    Raises:
+        InputError: the recording cannot be used, or nothing in it is at rest.
+    """
+    from alidade.pipelines.applications.noise import noise_of
+
+    return noise_of(Path(recording), strict, _override(config), auto_columns)
+
+
+def fleet(
+    recordings: Sequence[str | Path],
+    out: str | Path,
+    *,
+    method: str | None = None,
+    config: str | Path | None = None,
+    solver: str = "batch",
+    window: float | None = 1.0,
+    names: str | None = None,
+    prior: str | None = None,
+    jobs: int | None = None,
+) -> FleetResult:
+    """Calibrate recordings of many units (paths or patterns); writes fleet.html and tables to `out` and resumes there.
+
+    Raises:
+        InputError: a pattern matches nothing, or a setting cannot be used.
+    """
+    from alidade.pipelines.applications.fleet.fleet import Settings as FleetSettings
+    from alidade.pipelines.applications.fleet.write import run_fleet
+
+    settings = FleetSettings.of(method, None if config is None else Path(config), solver, window, prior)
+    return run_fleet([str(each) for each in recordings], settings, Path(out), None, jobs, names)
+
+
+def export(calibration: str | Path | Calibration | SavedCalibration, form: str) -> str:
+    """The text of a calibration for px4, ardupilot, ros2, kalibr, openvins (sensors), tf or urdf (mounts).
+
+    Raises:
+        InputError: the calibration cannot be used, or has no such format.
+    """
+    from alidade.pipelines.reports.calibration import saved
+    from alidade.pipelines.reports.export_formats import exported
+    from alidade.pipelines.reports.result import Calibration as Made
+
+    if isinstance(calibration, str | Path):
+        calibration = load(calibration)
+    return exported(saved(calibration) if isinstance(calibration, Made) else calibration, form)
+
+
+def certificate(
+    results: str | Path,
+    fields: str | Path | None = None,
+    *,
+    before: str | Path | None = None,
+    out: str | Path | None = None,
+    pdf: bool = False,
+) -> tuple[tuple[Path, ...], list[str]]:
+    """Write a calibration certificate from a result; returns its files and the fields that are not stated.
+
+    Raises:
+        InputError: a file cannot be used, or the result is none to certify.
+    """
+    from alidade.pipelines.reports.certificate import write_certificate
+
+    stated, earlier, folder = (None if each is None else Path(each) for each in (fields, before, out))
+    return write_certificate(Path(results), stated, earlier, folder, pdf)
 
 
 def _check_seed(seed: object) -> None:

@@ -62,7 +62,7 @@ class SensorNoise:
         return self.samples / self.rate_hz
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class NoiseStudy:
     """Noise of all sensors of a recording; notes are sentences about what is lost of it or could not be used."""
 
@@ -72,6 +72,17 @@ class NoiseStudy:
     sensors: tuple[SensorNoise, ...]
     notes: tuple[str, ...]
 
+    @property
+    def config(self) -> dict[str, dict[str, float]]:
+        """The section `noise` of a config."""
+        from alidade.pipelines.reports.noise_report import section
+
+        return {"noise": section(self)[0]}
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<NoiseStudy of {self.recording}: {', '.join(f'{s.topic} {s.kind}' for s in self.sensors)}>"
+
 
 class _Device(NamedTuple):
     """What one topic measured: stamps, and the samples (N, 3) of each sensor by its kind."""
@@ -80,7 +91,9 @@ class _Device(NamedTuple):
     sensors: dict[str, Array]
 
 
-def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_columns: bool = False) -> NoiseStudy:
+def noise_of(
+    path: Path, strict: bool = False, config: Path | Config | None = None, auto_columns: bool = False
+) -> NoiseStudy:
     """The noise of every gyro, accelerometer and magnetometer of a recording.
 
     Args:

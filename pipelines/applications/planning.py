@@ -103,13 +103,17 @@ class Step:
     prediction: Prediction
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Plan:
     """A planned motion and the changes that would make it determine more, the most informative first."""
 
     method: str
     now: Prediction
     steps: tuple[Step, ...]
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Plan {self.method}: {self.now.status}, with {len(self.steps)} changes {self.best.status}>"
 
     @property
     def best(self) -> Prediction:

@@ -176,7 +176,7 @@ class Arrays:
         return None if self.known is None else dict(self.known)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Session:
     """Data as their method takes them, the config in force, and where both come from.
 
@@ -248,6 +248,10 @@ class Session:
         """A simulated recording that was never written."""
         config = load_config(simulated.config.encode(), config_file)
         return cls(method, simulated.data, config, Arrays(method, simulated.data, simulated.truth))
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Session {self.method.name} of {self.origin.name}>"
 
     def problem(self) -> Problem:
         """The graph. Raises InputError when the data are too few, or the config says what the method has no use for."""

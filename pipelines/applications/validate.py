@@ -15,11 +15,13 @@ from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdi
 from alidade.pipelines.display.units import format_estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.reports.calibration import SavedCalibration
-from alidade.pipelines.reports.known import Known, load_known, saved_of, with_covariance
+from alidade.pipelines.reports.calibration import SavedCalibration, saved
+from alidade.pipelines.reports.known import Known, known_of, load_known, saved_of, with_covariance
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import Config
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Validated:
     """A calibration tested on a recording.
 
@@ -42,6 +44,10 @@ class Validated:
     held: CalibrationCheck | None = None
     device: Sequence[Validation] = ()
     best: Sequence[Validation] = ()
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Validated {self.calibration.method} on {self.recording}: {self.verdict}>"
 
     @property
     def verdict(self) -> Verdict:
@@ -82,16 +88,16 @@ class Validated:
 
 def validate(
     path: Path,
-    calibration_file: Path,
+    calibration_file: Path | Calibration,
     method_name: str | None = None,
-    config_file: Path | None = None,
+    config_file: Path | Config | None = None,
     strict: bool = False,
 ) -> Validated:
     """The errors of a recording before and after compensation.
 
     Args:
         path: the recording.
-        calibration_file: calibration.yaml.
+        calibration_file: calibration.yaml, result.json, or a calibration that was just made.
         method_name: overrides the config's.
         config_file: overrides the recording's own config key by key.
         strict: refuse a recording of which anything is lost.
@@ -99,8 +105,11 @@ def validate(
     Raises:
         InputError: recording, config or calibration cannot be used, or the calibration is another method's.
     """
-    known = load_known(calibration_file)
-    calibration = saved_of(known, calibration_file)
+    if isinstance(calibration_file, Path):
+        known = load_known(calibration_file)
+        calibration, known = saved_of(known, calibration_file), with_covariance(known, calibration_file)
+    else:
+        known, calibration = known_of(calibration_file), saved(calibration_file)
     recording, config = configured(open_recording(path, strict), config_file)
     name = resolve_method(method_name or calibration.method, recording, config)
     known.of_method(name)
@@ -112,7 +121,7 @@ def validate(
         return Validated(calibration, path.name, validations, True, recording.notes)
     session = Session(chosen, data, config, Recorded(recording))
     with session.usual_time():
-        held, own = _held(session, with_covariance(known, calibration_file))
+        held, own = _held(session, known)
         lost = (*recording.notes, *filter(None, [deadline.stopped()]))
     if held is None:
         return Validated(calibration, path.name, validations, False, lost)

@@ -12,10 +12,13 @@ from typing import Any
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.gyro import symmetric
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula
 
 TRIADS = ("accel", "gyro", "mag")
+# Of S of a gyro, in the order that `symmetric` takes.
+_ELEMENTS = ("x", "y", "z", "xy", "xz", "yz")
 # Sensor -> what comes out, and what formulas call it.
 _RESULTS = {
     "accel": ("specific force along the {body} axes, {unit}", "f_b", "m/s^2"),
@@ -41,6 +44,20 @@ def triad_of(name: str, values: Mapping[str, float]) -> tuple[Array, Array]:
     """K (3, 3) and b (3,) of a triad from parameters by name."""
     K = np.array([[values[entry] for entry in row] for row in gain_names(name, values)])
     return K, np.array([values[f"{name}_b{i}"] for i in "123"])
+
+
+def sensor_model(name: str, values: Mapping[str, float]) -> tuple[Array, Array]:
+    """K (3, 3) and bias (3,) of a sensor: nominal = K (raw - bias).
+
+    From the rows of K and b of nominal = K raw + b, bias = -K^-1 b, or of a gyro from its bias, scale and skew, (I + S)
+    rate + bias = raw; what is not among the values is 0. Raises KeyError when they have neither.
+    """
+    if f"{name}_k11" in values:
+        K, b = triad_of(name, values)
+        return K, -np.linalg.solve(K, b)
+    bias = np.array([values[f"{name}_bias_{axis}"] for axis in "xyz"])
+    s = [values.get(f"{name}_{'scale' if len(axes) == 1 else 'skew'}_{axes}", 0.0) for axes in _ELEMENTS]
+    return np.linalg.inv(np.eye(3) + symmetric(np.array(s))), bias
 
 
 def triad_formula(

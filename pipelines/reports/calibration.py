@@ -7,7 +7,7 @@ saved.value("gyro_bias_x"), saved.rotations["helmet_mount"]
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from alidade.factors import so3
+from alidade.pipelines.belief import Belief
 from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
@@ -24,6 +25,7 @@ from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import invalid
+from alidade.pipelines.reports.values import SensorValues
 from alidade.pipelines.settings import Config
 
 _HEAD = """\
@@ -50,6 +52,9 @@ class SavedParameter(_Record):
     sigma: float
     unit: str
     verdict: Verdict | None
+
+    def __repr__(self) -> str:
+        return f"<{self.value:.6g} ± {self.sigma:.2g} {self.unit}, {self.verdict}>"
 
 
 class SavedRotation(_Record):
@@ -79,7 +84,7 @@ class SavedRecording(_Record):
     start: str
 
 
-class SavedCalibration(_Record):
+class SavedCalibration(_Record, SensorValues):
     """calibration.yaml."""
 
     schema_name: Annotated[Literal["alidade.calibration/1"], Field(alias="schema")] = "alidade.calibration/1"
@@ -97,11 +102,33 @@ class SavedCalibration(_Record):
     formulas: list[str] = []
     constants: dict[str, float] = {}
     _config: Config = PrivateAttr(default_factory=Config)
+    _belief: Belief | None = PrivateAttr(default=None)
+
+    def knowing(self, belief: Belief) -> SavedCalibration:
+        """The same with the joint distribution that result.json beside the file has."""
+        known = self.model_copy()
+        known._belief = belief
+        return known
 
     @property
     def values(self) -> dict[str, float]:
         """What formulas are computed with: parameters and constants by name."""
         return {**self.constants, **{name: parameter.value for name, parameter in self.parameters.items()}}
+
+    def _joint(self) -> tuple[Sequence[str], Array]:
+        if self._belief is None:
+            raise InputError(
+                "calibration.yaml has no joint covariance: result.json is not beside it, or of another one"
+            )
+        return self._belief.names, self._belief.covariance
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of calibration.yaml."""
+        return self.model_dump(by_alias=True, mode="json")
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<SavedCalibration {self.method}, {self.solver}, of {self.recording.file}: {self.status}>"
 
     def value(self, name: str) -> float:
         """Value of a parameter. Raises InputError if the calibration has none of that name."""
@@ -176,7 +203,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         status=calibration.status,
         recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=calibration.start),
         parameters=parameters,
-        rotations=_rotations(calibration),
+        rotations=rotations_of(calibration),
         transforms=_transforms(calibration),
         findings={name: [_plain(row) for row in rows] for name, rows in calibration.tables.items()},
         formulas=[formula.text for formula in calibration.formulas],
@@ -197,7 +224,7 @@ def load_calibration(path: Path, config: Config | None = None) -> SavedCalibrati
         raise invalid(path, "a calibration.yaml", error) from error
 
 
-def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
+def rotations_of(calibration: Calibration) -> dict[str, SavedRotation]:
     """The parameters that are rotation vectors, as quaternions."""
     values: Mapping[str, float] = {name: p.value for name, p in calibration.parameters.items()}
     known = calibration.method.rotations

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from statistics import NormalDist
 
 import numpy as np
 
+from alidade.pipelines.applications.comparison import MAX_DIFFERENCE, SIGNIFICANCE, Comparison
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.display.figure import COLORS, Dash, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
@@ -16,14 +15,14 @@ from alidade.pipelines.display.units import human_unit, signed, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.html import render_html
-from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary
+from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import TruthResult, truth_errors
 from alidade.pipelines.reports.whole import write_page
 
 FILE = "compare.html"
-# Probability of a false alarm of the split-half test, all parameters together.
-_SIGNIFICANCE = 1e-3
+# Difference of the published solver from batch that is counted, in sigmas of batch.
+_FAR = 3.0
 # Lines of the solvers, the exact ones over the published.
 _STYLES: dict[str, tuple[str, Dash]] = {
     "published": (COLORS[1], "dotted"),
@@ -32,20 +31,9 @@ _STYLES: dict[str, tuple[str, Dash]] = {
 }
 
 
-def comparison_report(
-    calibrations: Sequence[Calibration],
-    halves: Mapping[str, SplitHalf],
-    predicted: Mapping[str, float],
-    stopped: str = "",
-) -> Report:
-    """The report of a comparison.
-
-    Args:
-        calibrations: of one recording, by different solvers.
-        halves: of the recording, see alidade.pipelines.diagnostics.cross_validation.
-        predicted: family -> size of the errors of held-out measurements, sigmas.
-        stopped: a sentence about what the time limit stopped.
-    """
+def comparison_report(comparison: Comparison) -> Report:
+    """The report of a comparison of solvers on one recording."""
+    calibrations, halves = comparison.calibrations, comparison.halves
     first = calibrations[0]
     quantities = [q for q in first.problem.quantities if q.prior_sigma != 0.0]
     plots = (*_differences(calibrations, quantities), *_convergence(calibrations, quantities))
@@ -53,9 +41,7 @@ def comparison_report(
         title=f"{first.method.title} comparison ({first.recording})",
         heading=f"{first.method.title}: solvers compared",
         about=f"{first.recording}: {', '.join(f'{c.estimate.solver} {c.status}' for c in calibrations)}",
-        summary=replace(
-            _split_half_test(halves, predicted, bool(stopped)), notes=(stopped.removesuffix("."),) if stopped else ()
-        ),
+        summary=comparison_summary(comparison),
         sections=(
             Section("Solvers", (_comparison_table(calibrations, quantities),)),
             Section("First and second half", _halves(first, quantities, halves)),
@@ -65,15 +51,9 @@ def comparison_report(
     )
 
 
-def write_compare(
-    out_dir: Path,
-    calibrations: Sequence[Calibration],
-    halves: Mapping[str, SplitHalf],
-    predicted: Mapping[str, float],
-    stopped: str = "",
-) -> Path:
+def write_compare(out_dir: Path, comparison: Comparison) -> Path:
     """Write compare.html; returns its path. Raises InputError when it cannot be written."""
-    return write_page(out_dir, FILE, render_html(comparison_report(calibrations, halves, predicted, stopped)))
+    return write_page(out_dir, FILE, render_html(comparison_report(comparison)))
 
 
 def solver_table(calibrations: Sequence[Calibration]) -> Table:
@@ -160,34 +140,60 @@ def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], n
     return (own.value - reference.value) / reference.sigma
 
 
-def _split_half_test(halves: Mapping[str, SplitHalf], predicted: Mapping[str, float], stopped: bool) -> Summary:
-    """Whether the estimates from both halves agree."""
-    question = "Do both halves of the recording agree?"
-    held_out = ", ".join(f"{size:.2f} ({family})" for family, size in predicted.items())
-    said = f" Held-out measurements are predicted to {held_out} of their sigmas; 1 is expected." if held_out else ""
-    if not halves and stopped:
-        text = "The time limit ended the test."
-        return Summary(question, "cannot say", "fixed", text + said, (), ("Give a longer `--time-limit`.",))
-    if not halves:
-        text = "Neither half determines a parameter by itself: they cannot be compared."
-        return Summary(question, "cannot say", "fixed", text + said, (), ("Record about twice as long.",))
-    limit = NormalDist().inv_cdf(1.0 - 0.5 * _SIGNIFICANCE / len(halves))
-    far = {name: half.z for name, half in halves.items() if abs(half.z) > limit}
-    if not far:
-        most = max(abs(half.z) for half in halves.values())
-        text = (
-            f"Its two halves, each solved by itself, agree in all {len(halves)} parameters that both determine: they "
-            f"differ by {most:.1f} sigma at most, threshold {limit:.1f} sigma (p = {_SIGNIFICANCE:g})."
+def comparison_summary(comparison: Comparison) -> Summary:
+    """Whether batch and incremental agree, and both halves of the recording."""
+    tone: Tone = {"yes": "good", "no": "bad", "cannot say": "fixed"}[comparison.answer]  # type: ignore[assignment]
+    text = " ".join(filter(None, [_solvers_agree(comparison), *_halves_agree(comparison)]))
+    steps = {
+        "yes": ("Go by the batch solver's result, and apply it.",),
+        "cannot say": ("Record about twice as long.",) if comparison.tested and not comparison.stopped else (),
+        "no": (
+            "Ask what happened between the halves: a knock, a cable, warming up; a gyro's bias walks, and may differ "
+            "for that."
+            if comparison.far
+            else "Go by batch; give incremental a longer `--window`.",
+        ),
+    }[comparison.answer]
+    notes = (comparison.stopped.removesuffix("."),) if comparison.stopped else ()
+    return Summary("Do the solvers and both halves agree?", comparison.answer, tone, text, notes, steps)
+
+
+def _solvers_agree(comparison: Comparison) -> str:
+    online = comparison.difference("incremental")
+    if online is None:
+        said = "Batch and incremental cannot be compared"
+    elif abs(online.z) <= MAX_DIFFERENCE:
+        said = f"Batch and incremental agree within {abs(online.z):.1f} sigma"
+    else:
+        said = f"Batch and incremental differ by {abs(online.z):.1f} sigma ({online.parameter})"
+    published, batch = comparison.of("published"), comparison.of("batch")
+    if published is None or batch is None:
+        return f"{said}."
+    common = [name for name in published.parameters if batch.values.keys() >= {name}]
+    far = [name for name in common if abs(_from_batch(published, comparison.calibrations, name) or 0.0) > _FAR]
+    return f"{said}; published differs by more than {_FAR:g} sigma in {len(far)} of {len(common)} parameters."
+
+
+def _halves_agree(comparison: Comparison) -> Iterator[str]:
+    halves, far = comparison.halves, comparison.far
+    if far:
+        yield (
+            f"The halves of the recording differ by more than {comparison.limit:.1f} sigma (p = {SIGNIFICANCE:g}): "
+            f"{', '.join(f'{name} ({signed(z)})' for name, z in far.items())}."
         )
-        return Summary(question, "yes", "good", text + said, (), ("Go by the batch solver's result, and apply it.",))
-    named = ", ".join(f"{name} ({signed(z)})" for name, z in sorted(far.items(), key=lambda item: -abs(item[1])))
-    text = f"Its two halves differ by more than {limit:.1f} sigma (p = {_SIGNIFICANCE:g}): {named}."
-    steps = (
-        "Ask what happened in between: a knock, a cable, warming up; a gyro's bias walks, and may differ for that.",
-        "If something moved, calibrate the two parts each by itself; if nothing did, look at the residuals in the "
-        "report of `alidade calibrate`, which tests hypotheses.",
-    )
-    return Summary(question, "no", "bad", text + said, (), steps)
+    elif halves:
+        most = max(abs(half.z) for half in halves.values())
+        yield (
+            f"Both halves agree in all {len(halves)} parameters: {most:.1f} sigma at most, threshold "
+            f"{comparison.limit:.1f} sigma (p = {SIGNIFICANCE:g})."
+        )
+    elif comparison.tested and comparison.stopped:
+        yield "The time limit ended the test of the halves."
+    elif comparison.tested:
+        yield "Neither half determines a parameter by itself."
+    if comparison.predicted:
+        held_out = ", ".join(f"{size:.2f} ({family})" for family, size in comparison.predicted.items())
+        yield f"Held-out measurements are predicted to {held_out} of their sigmas; 1 is expected."
 
 
 def _with_sigma(value: float, sigma: float) -> str:

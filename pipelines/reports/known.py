@@ -16,7 +16,8 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.files import MAX_RESULT_BYTES, read_bytes
 from alidade.pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
-from alidade.pipelines.reports.result_json import read_result
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import read_result, result_json
 
 # A covariance is symmetric, and none of its eigenvalues negative, to this share.
 _ROUNDING = 1e-6
@@ -92,6 +93,11 @@ def load_known(path: Path) -> Known:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: neither a result.json nor a calibration.yaml: it is no text") from error
     return _of_result(path, text) if text.lstrip().startswith("{") else _of_calibration(path)
+
+
+def known_of(calibration: Calibration) -> Known:
+    """A calibration that was just made."""
+    return _of_result(Path(calibration.recording), result_json(calibration))
 
 
 def _of_result(path: Path, text: str) -> Known:

@@ -6,6 +6,7 @@ calibration = Calibration(problem, estimate, diagnose(...), session_facts(...), 
 from __future__ import annotations
 
 import datetime
+import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,17 +35,19 @@ from alidade.pipelines.reports.result_json import (
     PartResult,
     SensitivityResult,
 )
+from alidade.pipelines.reports.values import SensorValues
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
     from alidade.pipelines.methods import Method
     from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.reports.calibration import SavedRotation
 
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 
 
 @dataclass(frozen=True, repr=False)
-class Calibration:
+class Calibration(SensorValues):
     """A calibration with its findings and provenance.
 
     Attributes:
@@ -114,6 +117,28 @@ class Calibration:
             )
             for q, value, sigma, inflation in rows
         }
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter -> value, SI."""
+        return dict(zip(self.estimate.names, self.estimate.values.tolist(), strict=True))
+
+    @property
+    def rotations(self) -> dict[str, SavedRotation]:
+        """Parameters that are rotation vectors, without _x, _y, _z -> name in formulas and quaternion w, x, y, z."""
+        from alidade.pipelines.reports.calibration import rotations_of
+
+        return rotations_of(self)
+
+    def _joint(self) -> tuple[Sequence[str], Array]:
+        return self.estimate.names, self.covariance
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of result.json."""
+        from alidade.pipelines.reports.result_json import result_json
+
+        content: dict[str, Any] = json.loads(result_json(self))
+        return content
 
     @property
     def noises(self) -> list[NoiseResult]:

@@ -59,6 +59,10 @@ class ParameterResult(_Record):
     pull: float | None = None  # z-score of a nuisance parameter: distance from its prior over the expected spread
     inflation: float = 1.0  # of sigma, by noise that is correlated in time
 
+    def __repr__(self) -> str:
+        verdict = self.observability or self.group or "no requirement"
+        return f"<{self.name} {self.value:.6g} ± {self.sigma:.2g} {self.unit}, {verdict}>".replace(" ,", ",")
+
     @model_serializer(mode="wrap")
     def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
         """What is calibrated belongs to no group and has no pull; a prior about 0 has no mean."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Simulated:
     """A simulated recording.
 
@@ -26,3 +26,7 @@ class Simulated:
     def __iter__(self) -> Iterator[Any]:
         """Data and truth: `data, truth = simulate(...)`."""
         return iter((self.data, self.truth))
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Simulated {type(self.data).__name__}, {len(self.truth)} true parameters>"

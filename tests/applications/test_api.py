@@ -247,9 +247,11 @@ def test_a_window_that_is_none_is_refused(simulated: alidade.Simulated, window: 
         alidade.follow(tmp_path / "none.mcap", window=window, patience=0.0)
 
 
-def test_keys_are_no_config_and_a_seed_is_no_negative_number(simulated: alidade.Simulated) -> None:
-    config: Any = {"noise": {"gyro_density": 1e-4}}
-    with pytest.raises(alidade.InputError, match=r"^config: a file or an alidade.Config is needed, not dict; alidade"):
+def test_a_number_is_no_config_and_a_seed_is_no_negative_number(simulated: alidade.Simulated) -> None:
+    config: Any = 1e-4
+    with pytest.raises(
+        alidade.InputError, match=r"^config: a file, an alidade.Config or its keys are needed, not floa"
+    ):
         alidade.open(simulated, config=config)
     nothing: Any = 3
     with pytest.raises(alidade.InputError, match="takes a recording, simulated data or arrays by name, not int"):
@@ -328,3 +330,134 @@ def test_dates_are_times_and_rows_are_sorted_by_them(simulated: alidade.Simulate
     np.testing.assert_array_equal(again.head_t, data.head_t)
     np.testing.assert_array_equal(again.head_gyro, data.head_gyro)
     assert sum(again.dropped.values()) == 2
+
+
+def test_sensors_of_a_calibration_come_as_matrix_bias_rotation_and_covariance(
+    simulated: alidade.Simulated, calibration: alidade.Calibration, tmp_path: Path
+) -> None:
+    p, data = calibration.parameters, simulated.data
+    K, bias = calibration.matrix("gyro"), calibration.bias("gyro")
+    np.testing.assert_array_equal(bias, [p[f"gyro_bias_{axis}"].value for axis in "xyz"])
+    S = np.linalg.inv(K) - np.eye(3)
+    assert S[0, 1] == pytest.approx(p["gyro_skew_xy"].value)
+    assert S[2, 2] == pytest.approx(p["gyro_scale_z"].value)
+    assert data.head_gyro.shape == ((data.head_gyro - bias) @ K.T).shape
+    assert calibration.rotations["helmet_mount"].name == "vRh"
+    P = calibration.covariance_of(["time_offset", "gyro_bias_x"])
+    np.testing.assert_allclose(np.sqrt(np.diag(P)), [p["time_offset"].sigma, p["gyro_bias_x"].sigma])
+    assert calibration.to_dict()["schema"] == "alidade.result/1"
+    calibration.write(tmp_path)
+    saved = alidade.load(tmp_path / "calibration.yaml")
+    np.testing.assert_allclose(saved.matrix("gyro"), K, atol=1e-11)
+    np.testing.assert_allclose(saved.covariance_of(["time_offset", "gyro_bias_x"]), P, rtol=1e-9)
+    assert saved.to_dict()["method"] == "head"
+    (tmp_path / "result.json").unlink()
+    with pytest.raises(alidade.InputError, match="no joint covariance"):
+        alidade.load(tmp_path / "calibration.yaml").covariance_of(["time_offset"])
+    refused: list[tuple[Callable[[], object], str]] = [
+        (lambda: calibration.matrix("mag"), "the calibration has no sensor 'mag'; it has gyro"),
+        (lambda: calibration.covariance_of(["time_ofset"]), "no parameter time_ofset; the nearest known key is time_o"),
+    ]
+    for failing, message in refused:
+        with pytest.raises(alidade.InputError, match=message):
+            failing()
+
+
+def test_what_is_shown_at_a_prompt_is_one_short_line(
+    simulated: alidade.Simulated, calibration: alidade.Calibration, tmp_path: Path
+) -> None:
+    calibration.write(tmp_path)
+    saved = alidade.load(tmp_path / "calibration.yaml")
+    shown = (simulated, alidade.open(simulated), calibration, saved, calibration.parameters["time_offset"])
+    for each in (*shown, saved.parameters["time_offset"], alidade.Config({"latitude_deg": 48.0})):
+        assert len(repr(each)) < 100
+        assert "\n" not in repr(each)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (
+            {"noise": {"gyro_densty": 1e-4}},
+            "config: unknown key noise.gyro_densty; the nearest known key is gyro_density",
+        ),
+        ({"noise": {"gyro_density": "low"}}, "config: noise.gyro_density: must be a valid number, not 'low'"),
+    ],
+)
+def test_a_config_from_a_dict_is_refused_in_one_line(
+    simulated: alidade.Simulated, keys: dict[str, Any], message: str
+) -> None:
+    for make in (
+        lambda: alidade.Config(keys),
+        lambda: alidade.Config(**keys),
+        lambda: alidade.open(simulated, config=keys),
+    ):
+        with pytest.raises(alidade.InputError) as error:
+            make()
+        assert str(error.value) == message
+
+
+def test_a_magnetometer_is_calibrated_in_one_line() -> None:
+    """In the unit of the readings, as MATLAB's function of the same name has it."""
+    rng = np.random.default_rng(0)
+    directions = rng.standard_normal((300, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    soft = np.array([[1.1, 0.02, 0.01], [0.02, 0.95, -0.03], [0.01, -0.03, 1.02]])
+    hard = np.array([20.0, -10.0, 5.0])
+    m = 48.0 * directions @ np.linalg.inv(soft) + hard + 0.05 * rng.standard_normal((300, 3))
+    found = alidade.magcal(m)
+    A, b, field = found
+    size = np.linalg.det(soft) ** (1.0 / 3.0)
+    np.testing.assert_allclose(A, soft / size, atol=1e-3)
+    np.testing.assert_allclose(b, hard, atol=0.05)
+    assert field == pytest.approx(48.0 / size, rel=1e-3)
+    assert np.linalg.det(A) == pytest.approx(1.0)
+    assert np.std(np.linalg.norm((m - b) @ A, axis=1)) < 0.06
+    assert found.calibration.status == "calibrated"
+
+
+def test_an_imu_in_many_attitudes_is_calibrated_in_one_line() -> None:
+    data, truth = alidade.simulate("cube", {"poses": 20}, seed=1)
+    found = alidade.imu_static(data.accel, data.gyro, data.imu_t, latitude_deg=40.0)
+    K, bias, K_gyro, bias_gyro = found
+    assert found.calibration.status == "calibrated"
+    true = {name: np.array([[truth[f"{name}_k{i}{j}"] for j in "123"] for i in "123"]) for name in ("accel", "gyro")}
+    offsets = {name: np.array([truth[f"{name}_b{i}"] for i in "123"]) for name in ("accel", "gyro")}
+    # Body's axes are the accelerometer's own: lengths do not depend on them.
+    raw = np.linalg.solve(true["accel"], 9.8 * np.eye(3) - offsets["accel"]).T
+    lengths = np.linalg.norm((raw - bias) @ K.T, axis=1)
+    np.testing.assert_allclose(lengths, np.linalg.norm(raw @ true["accel"].T + offsets["accel"], axis=1), rtol=1e-3)
+    np.testing.assert_allclose(bias_gyro, -np.linalg.solve(true["gyro"], offsets["gyro"]), atol=1e-4)
+    np.testing.assert_allclose(K_gyro.T @ K_gyro, true["gyro"].T @ true["gyro"], atol=2e-3)
+
+
+def test_a_gyro_and_a_tracked_body_are_registered_in_one_line() -> None:
+    from alidade.factors import so3
+
+    data, truth = alidade.simulate("head", {"duration_s": 20.0, "helmet_mount_deg": [5.0, 3.0, -4.0]}, seed=1)
+    found = alidade.hand_eye(data.head_gyro, data.head_t, data.vision_wxyz, data.vision_t)
+    R, delay = found
+    mount = so3.matrix(so3.exp(np.array([truth[f"helmet_mount_{axis}"] for axis in "xyz"])))
+    np.testing.assert_allclose(R, mount, atol=4e-3)
+    assert delay == pytest.approx(truth["time_offset"], abs=4.0 * found.calibration.parameters["time_offset"].sigma)
+
+
+def test_all_that_the_command_does_is_there(
+    simulated: alidade.Simulated, calibration: alidade.Calibration, tmp_path: Path
+) -> None:
+    from alidade.pipelines.methods import method
+
+    calibration.write(tmp_path / "out")
+    method("head").write(tmp_path / "later.mcap", alidade.simulate("head", HEAD, seed=4))
+    for given in (tmp_path / "out" / "calibration.yaml", calibration):
+        validated = alidade.validate(tmp_path / "later.mcap", given)
+        assert validated.held is not None
+        assert validated.calibration.method == "head"
+    comparison = alidade.compare(simulated)
+    assert comparison.answer in ("yes", "no")
+    assert comparison.write(tmp_path / "compared").name == "compare.html"
+    assert "static_transform_publisher" in alidade.export(calibration, "tf")
+    assert alidade.export(tmp_path / "out" / "calibration.yaml", "tf") == alidade.export(calibration, "tf")
+    files, missing = alidade.certificate(tmp_path / "out")
+    assert {path.name for path in files} == {"certificate.html", "certificate.json"}
+    assert "serial" in missing

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from alidade.pipelines.applications.comparison import Comparison
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.comparison_report import comparison_report, write_compare
@@ -20,8 +20,8 @@ from tests.support.builders import make_calibration
 from tests.support.pages import Page
 
 
-def page_of(*compared: Any) -> str:
-    return render_html(comparison_report(*compared))
+def page_of(calibrations: list[Calibration], halves: dict[str, SplitHalf], predicted: dict[str, float]) -> str:
+    return render_html(comparison_report(Comparison(tuple(calibrations), halves, predicted, tested=True)))
 
 
 def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:
@@ -38,14 +38,27 @@ def test_differences_are_in_sigmas_of_batch() -> None:
     estimated = [q for q in solvers()[0].problem.quantities if q.prior_sigma != 0.0]
     assert page.text.count("+2.0") == len(estimated)
     assert "error of" not in page.text
-    assert "cannot say Neither half determines a parameter" in page.text
+    assert "no Batch and incremental differ by 2.0 sigma" in page.text
+    assert "Neither half determines a parameter by itself." in page.text
+
+
+def test_answer_is_no_where_incremental_is_more_than_a_sigma_from_batch_or_halves_differ() -> None:
+    batch, off = solvers()
+    same = replace(batch, estimate=replace(batch.estimate, solver="incremental"))
+    close, wide = SplitHalf(0.010, 0.003, 0.020, 0.004), SplitHalf(0.010, 0.003, 0.040, 0.004)
+    assert Comparison((batch, off)).answer == "no"
+    assert Comparison((batch, same)).answer == "yes"
+    assert Comparison((batch, same), {"time_offset": close}, tested=True).answer == "yes"
+    assert Comparison((batch, same), {"time_offset": wide}, tested=True).answer == "no"
+    assert Comparison((batch, same), tested=True).answer == "cannot say"
+    assert Comparison((batch,)).answer == "cannot say"
 
 
 def test_truth_halves_and_held_out_measurements_are_told() -> None:
     halves = {"time_offset": SplitHalf(0.010, 0.003, 0.020, 0.004)}
     page = Page(page_of(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
     assert "error of batch, σ" in page.text
-    assert "Do both halves of the recording agree? yes Its two halves" in page.text
+    assert "Both halves agree in all 1 parameters: 2.0 sigma at most" in page.text
     assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
     assert "predicted to 1.06 (vision) of their sigmas" in page.text
 
@@ -53,7 +66,7 @@ def test_truth_halves_and_held_out_measurements_are_told() -> None:
 def test_halves_that_differ_by_more_than_chance_are_told() -> None:
     halves = {"time_offset": SplitHalf(0.010, 0.003, 0.040, 0.004), "gyro_bias_x": SplitHalf(0.0, 1e-3, 1e-4, 1e-3)}
     page = Page(page_of(solvers(), halves, {}))
-    assert "Do both halves of the recording agree? no" in page.text
+    assert "Do the solvers and both halves agree? no" in page.text
     assert "time_offset (+6.0)" in page.text
 
 
@@ -68,10 +81,10 @@ def test_ellipses_are_drawn_of_correlated_pairs_only() -> None:
 
 
 def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
-    assert write_compare(tmp_path / "new", solvers(), {}, {}).read_text().startswith("<!doctype html>")
+    assert write_compare(tmp_path / "new", Comparison(tuple(solvers()))).read_text().startswith("<!doctype html>")
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="no folder to write results to"):
-        write_compare(tmp_path / "file", solvers(), {}, {})
+        write_compare(tmp_path / "file", Comparison(tuple(solvers())))
 
 
 @needs_browser

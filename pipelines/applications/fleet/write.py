@@ -1,18 +1,66 @@
-"""The files of a study or a fleet."""
+"""A fleet from recordings to files, and the files of a study."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from alidade.pipelines.applications.fleet.analysis import Population, table
-from alidade.pipelines.applications.fleet.fleet import Outcome
-from alidade.pipelines.applications.fleet.histories import History, change_table
+from alidade.pipelines.applications.fleet.analysis import Population, counting, populations, table
+from alidade.pipelines.applications.fleet.attention import sentence, units_of_interest
+from alidade.pipelines.applications.fleet.fleet import Outcome, Settings, calibrate_fleet
+from alidade.pipelines.applications.fleet.histories import History, change_table, histories
 from alidade.pipelines.applications.fleet.montecarlo import Study, run_table, summary_table
 from alidade.pipelines.applications.fleet.pages import fleet_report, study_report
+from alidade.pipelines.applications.fleet.recordings import find
 from alidade.pipelines.applications.fleet.tables import write_csv, write_parquet
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.whole import write_whole
+
+
+@dataclass(frozen=True, repr=False)
+class FleetResult:
+    """A calibrated fleet.
+
+    Attributes:
+        outcome: the results by recording.
+        populations: of each parameter over the units.
+        histories: of each unit over its recordings.
+        written: the files.
+    """
+
+    outcome: Outcome
+    populations: Sequence[Population]
+    histories: Sequence[History]
+    written: tuple[Path, ...]
+
+    @property
+    def summary(self) -> list[str]:
+        """How many recordings with what verdicts, and which units need attention."""
+        units = units_of_interest(self.outcome.results, self.populations, self.histories)
+        return [*self.outcome.summary, sentence(units)]
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<FleetResult: {self.outcome.summary[0]}>"
+
+
+def run_fleet(
+    recordings: Sequence[str],
+    settings: Settings,
+    out: Path,
+    scheduler: str | None = None,
+    jobs: int | None = None,
+    names: str | None = None,
+) -> FleetResult:
+    """Calibrate the recordings of these patterns, compare them, and write what was found.
+
+    Arguments and exceptions as `find` and `calibrate_fleet` have them.
+    """
+    outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
+    several = histories(outcome.results, {name: counting(result) for name, result in outcome.results.items()})
+    found = populations(outcome.results, several)
+    return FleetResult(outcome, found, several, write_fleet(out, outcome, found, several))
 
 
 def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> tuple[Path, ...]:
