@@ -21,6 +21,10 @@ from alidade.pipelines.estimation.problem import Array
 # The first three are Paul Tol's high-contrast scheme: told apart by the colour-blind, and in grey. On dark ground their
 # lighter forms. "rejected" is kept for what was rejected, the last ones for what stands behind.
 PALETTE = {
+    # Axes of frames, as RViz, ROS and Foxglove have them; plots name them too.
+    "x": ("#c62828", "#ff6b6b"),
+    "y": ("#2e7d32", "#63c46a"),
+    "z": ("#1e5fd0", "#6fa3ff"),
     "series0": ("#004488", "#7db4ea"),
     "series1": ("#d9a520", "#f0cc66"),
     "series2": ("#bb5566", "#f28fa1"),
@@ -40,6 +44,7 @@ PALETTE = {
     "paper": ("#ffffff", "#1a2027"),
 }
 COLORS = tuple(name for name in PALETTE if name.startswith("series"))
+AXES = ("x", "y", "z")
 REJECTED, PALE, BEFORE, FAINT = "rejected", "pale", "before", "faint"
 
 Dash = Literal["solid", "dotted", "dashed", "dotdash"]

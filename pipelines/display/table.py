@@ -15,17 +15,33 @@ class Column:
 
     Attributes:
         head: what stands above it.
-        kind: "number" is aligned to the right, "text" to the left, "prose" may be broken into lines.
+        kind: "number" is aligned to the right, "text" to the left, "prose" may be broken into lines, "drawing" is shown
+            by pages alone.
         group: columns of one group stay together where a terminal is too narrow for all.
         wide: cells take the whole width of a phone.
         label: in place of `head`, on a phone.
     """
 
     head: str
-    kind: Literal["number", "text", "prose"] = "number"
+    kind: Literal["number", "text", "prose", "drawing"] = "number"
     group: str = ""
     wide: bool = False
     label: str = ""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A sigma against the one required, drawn as bars of +-2 about the value; one unit for all numbers.
+
+    Attributes:
+        sigma: standard deviation.
+        require: the one required; None: none is.
+        error: value less truth, where that is known.
+    """
+
+    sigma: float
+    require: float | None = None
+    error: float | None = None
 
 
 @dataclass(frozen=True)
@@ -37,12 +53,16 @@ class Cell:
         small: in small print below: the meaning of a name, a number in SI.
         tone: a verdict, or good, warn, bad, which colours the text.
         shares: of a whole, drawn as a bar above the text.
+        hint: what a page says where it is pointed at, and a screen reader in place of the text.
+        interval: drawn in place of the text.
     """
 
     text: str
     small: str = ""
     tone: str = ""
     shares: tuple[float, ...] = ()
+    hint: str = ""
+    interval: Interval | None = None
 
 
 Columns = tuple[Column | str, ...]
@@ -57,7 +77,7 @@ class Table:
         title: heading; empty where that of the section suffices.
         caption: what the table shows, with units.
         columns: a text is a column of numbers with that head; the first column has the names of the rows.
-        rows: cells in the order of the columns.
+        rows: cells in the order of the columns; a single cell is a heading for the rows below it.
         id: of the HTML element.
         style: of style.css: dense, lines, many, columns.
         most_rows: a page folds longer tables; None: never.

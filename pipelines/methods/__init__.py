@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.diagnostics.use import Truth, Use
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.display.table import Table
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
@@ -59,6 +60,8 @@ class Method(ABC):
         meanings: pattern of parameters' names -> what they are, a sentence with {0}, {1} for the pattern's groups; what
             `alidade.pipelines.methods.meanings` says of all methods need not stand there.
         components: family of measurements -> what its residuals are, one by one, where they are not x, y and z.
+        cards: of the report's results: title -> groups of numbers, each with its title, the unit (empty: the usual one)
+            and the parameters; what no card has stands in a last one.
         sketch: picture of the frames, SVG, if there is one; `alidade.pipelines.reports.sketch` says what it may have.
         scenarios: folder with scenarios that come with the method, if it brings its own.
         drawn: whether its simulator draws motions, or sensors far from nominal, from the seed, so that one recording of
@@ -74,6 +77,7 @@ class Method(ABC):
     rotations: ClassVar[Mapping[str, str]] = {}
     meanings: ClassVar[Mapping[str, str]] = {}
     components: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    cards: ClassVar[Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]]] = {}
     sketch: ClassVar[Path | None] = None
     scenarios: ClassVar[Path | None] = None
     drawn: ClassVar[bool] = False
@@ -198,6 +202,16 @@ class Method(ABC):
 
     def figures(self, data: Any, calibration: Calibration) -> Sequence[Plot | Table]:  # noqa: ARG002
         """The method's own figures and tables for the report."""
+        return ()
+
+    def uses(self, true: Truth, config: Config, noise: Mapping[str, float]) -> Sequence[Use]:  # noqa: ARG002
+        """What a result is used for, with the error that it leaves.
+
+        Args:
+            true: the estimate.
+            config: in force.
+            noise: name -> noise used, SI.
+        """
         return ()
 
     @property

@@ -54,10 +54,10 @@ def sensor_model(name: str, values: Mapping[str, float]) -> tuple[Array, Array]:
     """
     if f"{name}_k11" in values:
         K, b = triad_of(name, values)
-        return K, -np.linalg.solve(K, b)
+        return K, np.asarray(-np.linalg.solve(K, b))
     bias = np.array([values[f"{name}_bias_{axis}"] for axis in "xyz"])
     s = [values.get(f"{name}_{'scale' if len(axes) == 1 else 'skew'}_{axes}", 0.0) for axes in _ELEMENTS]
-    return np.linalg.inv(np.eye(3) + symmetric(np.array(s))), bias
+    return np.asarray(np.linalg.inv(np.eye(3) + symmetric(np.array(s)))), bias
 
 
 def triad_formula(

@@ -3,28 +3,35 @@
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Sequence
 from contextlib import suppress
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
-from alidade.pipelines.display.figure import Plot
+from alidade.pipelines.diagnostics.use import UseBands
+from alidade.pipelines.display.figure import Dash, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, noise_unit, rounded, signed, to_digits_of
+from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.meanings import NOISES, meaning
+from alidade.pipelines.methods.triads import TRIADS
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.reports.budget import Limit, limits
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
 from alidade.pipelines.reports.export_formats import ros_parameters
-from alidade.pipelines.reports.html import render_fragment, render_html
+from alidade.pipelines.reports.html import Page, render_fragment, render_html
 from alidade.pipelines.reports.plots import common_plots
 from alidade.pipelines.reports.report import (
+    Badge,
     Block,
     Bullets,
     Card,
     Code,
+    Curves,
     Details,
+    Heading,
     Plots,
     Report,
     Section,
@@ -32,10 +39,21 @@ from alidade.pipelines.reports.report import (
     Svg,
     Tables,
     Text,
+    Tile,
+    Tiles,
     Tone,
 )
 from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.reports.result_json import ParameterResult, truth_errors
+from alidade.pipelines.reports.results_table import (
+    LEGEND,
+    ResultCard,
+    ResultGroup,
+    ResultRow,
+    matrix_texts,
+    result_cards,
+    result_table,
+)
 from alidade.pipelines.reports.sketch import enlarged, rotation_text, sketch_with
 from alidade.pipelines.reports.snippets import c_code, python_code
 
@@ -44,6 +62,16 @@ _MAX_SIGMA_OVER_PRIOR = 10.0
 # Effects of fixed inputs that are named: the smallest, in sigmas of the parameter, and how many.
 _MIN_EFFECT_SIGMAS, _MAX_EFFECTS = 0.1, 6
 _TONES: dict[str, Tone] = {"calibrated": "good", "weak": "warn", "unobservable": "bad", "inconsistent": "bad"}
+_CALL = "found = calibration.apply({})  # by name: everything that the formulas give"
+# Badges: inflation of sigmas, share of a family that is rejected, noise used over stated and its inverse.
+_NOTABLE_INFLATION, _NOTABLE_REJECTION, _NOTABLE_NOISE = 1.1, 0.1, 2.0
+# Ratio from which on two bounds are said to differ.
+_GAIN = 1.2
+# Parameters whose error budget is shown: those nearest to their requirement.
+_MAX_BUDGET = 8
+# Height of the curves of a use, and the dashes of its lines.
+_CURVE_PX = 236
+_DASHES: tuple[Dash, ...] = ("solid", "dashed", "dotdash", "dotted")
 _LANGUAGES = {"Python": python_code, "C": c_code}
 
 
@@ -59,44 +87,221 @@ def notebook_html(calibration: Calibration) -> str:
 
 
 def calibration_report(calibration: Calibration) -> Report:
-    """The report of a calibration."""
+    """The report of a calibration: verdict, results, use; how to apply it; diagnostics; details folded."""
     c, file = calibration, saved(calibration)
-    own = list(c.plots(c)) if c.plots else []
-    plots = (*(each for each in own if isinstance(each, Plot)), *common_plots(c))
-    tables = tuple(each for each in own if isinstance(each, Table))
     start = datetime.datetime.fromtimestamp(c.facts.epoch_ns // 1_000_000_000, datetime.UTC)
     about = [
         c.recording,
         f"{start:%Y-%m-%d %H:%M:%S} UTC",
         f"{c.facts.duration_s:.1f} s",
         f"{c.estimate.solver} solver",
+        f"alidade {c.software.get('alidade', '')}",
     ]
-    steps = sentences.next_steps(c.findings)
-    question = "Is it as accurate as required, and does it fit the recording?"
+    cards = result_cards(c)
     return Report(
         title=f"{c.problem.method}: {c.status} ({c.recording})",
         heading=f"{c.method.title} calibration",
         about=" · ".join(about),
-        summary=Summary(question, c.status, _TONES[c.status], c.headline, c.notes, steps),
+        summary=_summary(c, cards),
         sections=(
+            Section("", (Tiles(tuple(map(_tile, c.uses))),) if c.uses else ()),
+            Section("Results", _results(c, cards)),
+            Section("Uncertainty in use", tuple(_use_card(found) for found in c.uses)),
             Section("Frames", _frames(c, file)),
-            Section("Parameters", (_parameter_table(c),)),
-            Section("Apply", _application(c, file)),
-            Section("Nuisance parameters", _nuisance_parameters(c)),
-            Section("Noise", _noise(c)),
-            Section("Unobservable and weak directions", direction_blocks(c.findings)),
-            Section("Findings", (Tables(tables),) if tables else ()),
-            Section("Error budget", _error_budget(c)),
-            Section("Sensitivity to fixed inputs", _fixed_inputs(c)),
-            Section("Most influential measurements", _influential_measurements(c)),
-            Section("Time to required accuracy", _time_to_accuracy(c)),
-            Section("Goodness of fit", _goodness_of_fit(c)),
-            Section("Stability during the recording", _stability(c)),
-            Section("Plots", (Plots(plots),) if plots else ()),
-            Section("Recording", _recording(c)),
-            Section("Provenance", _provenance(c)),
+            Section("Apply", _application(c, file), narrow_folded=True),
+            Section("Diagnostics", _diagnostics(c), narrow_folded=True),
+            Section("Details", _details(c)),
         ),
     )
+
+
+def plotted(calibration: Calibration, name: str | None) -> Page:
+    """The figures of a report as a page of their own. Raises InputError when there is none of that name."""
+    uses = {found.use.name: found for found in calibration.uses}
+    plots = {plot.title: plot for plot in _plots(calibration)}
+    if name is not None and name not in uses and name not in plots:
+        raise InputError(f"no plot {name!r}; there are {', '.join([*uses, *plots])}")
+    blocks: list[Block] = [_use_card(found) for key, found in uses.items() if name in (None, key)]
+    shown = tuple(plot for title, plot in plots.items() if name in (None, title))
+    blocks += [Plots(shown)] if shown else []
+    about = f"{calibration.recording} · {calibration.status}"
+    page = Report(
+        f"{calibration.method.title}: figures", calibration.method.title, about, (Section("", tuple(blocks)),)
+    )
+    return Page(render_html(page))
+
+
+def _plots(c: Calibration) -> list[Plot]:
+    own = list(c.plots(c)) if c.plots else []
+    return [*(each for each in own if isinstance(each, Plot)), *common_plots(c)]
+
+
+def _summary(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
+    """The verdict in one sentence, what to do in another, and badges."""
+    rows = [(card, group, row) for card in cards for group, row in card.rows if row.require and row.sigma > 0.0]
+    worst = max(rows, key=lambda found: found[2].ratio, default=None)
+    text, action = sentences.short_verdict(c.findings, c.quantities, c.verdicts, worst and _named(*worst))
+    return Summary("", c.status, _TONES[c.status], text, next_steps=(action,) if action else (), badges=_badges(c))
+
+
+def _named(card: ResultCard, group: ResultGroup, row: ResultRow) -> sentences.Worst:
+    """The number nearest to its requirement, in words."""
+    what = f"{group.title[:1].lower()}{group.title[1:]}"
+    name = f"{what} {row.label}, {card.title.lower()}" if len(row.names) > 1 else f"{row.names[0]} ({what})"
+    return sentences.Worst(name, rounded(row.sigma), rounded(row.require or 0.0), group.unit, row.ratio)
+
+
+def _badges(c: Calibration) -> tuple[Badge, ...]:
+    """What matters beside the verdict: inflation, rejections, noise, priors, change, misfit, error if simulated."""
+    found = []
+    inflation = max((p.inflation for p in c.parameters.values()), default=1.0)
+    if inflation > _NOTABLE_INFLATION:
+        found.append(Badge(f"sigmas × {inflation:.1f} for correlated noise", "warn", "included in all sigmas"))
+    for family, residuals in c.residuals.items():
+        share = 1.0 - float(residuals.used.mean()) if len(residuals.used) else 0.0
+        if share > _NOTABLE_REJECTION:
+            found.append(
+                Badge(f"{100.0 * share:.0f} % of {family} rejected", "warn", "measurements that fit no solution")
+            )
+    found += [
+        Badge(f"{n.name} {n.used / n.stated:.2g} × stated", "warn", f"stated by {n.source}")
+        for n in c.noises
+        if n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE
+    ]
+    alone = [name for name, each in c.verdicts.items() if each == "prior"]
+    if alone:
+        more = f" + {len(alone) - 1}" if len(alone) > 1 else ""
+        found.append(
+            Badge(f"prior alone: {alone[0]}{more}", "warn", "within the requirement because the prior says so")
+        )
+    if c.fit is not None:
+        fits = c.fit.low <= c.fit.value <= c.fit.high
+        found.append(
+            Badge("fit as expected" if fits else "misfit", "good" if fits else "warn", "99.9 % interval of chi-square")
+        )
+    if c.stability is not None:
+        changed = c.stability.changed
+        found.append(Badge("changed during the recording" if changed else "stable", "bad" if changed else "good"))
+    errors = [abs(e.error_sigmas) for e in truth_errors(c).values() if e.error_sigmas is not None]
+    if errors:
+        found.append(Badge(f"simulated: largest error {max(errors):.1f} σ of {len(errors)}", "fixed"))
+    return tuple(found)
+
+
+def _tile(found: UseBands) -> Tile:
+    use = found.use
+    gain = found.before / found.after if found.after > 0.0 else math.inf
+    times = f", {rounded(gain)} times less" if gain > _GAIN else ", not improved"
+    figure = ("± " if use.signed else "") + rounded(found.after)
+    note = f"{rounded(found.before, 3)} {use.unit} before{times}"
+    return Tile(use.label, figure, f"{use.unit}, 95 %", note, "" if gain > _GAIN else "warn")
+
+
+def _results(c: Calibration, cards: Sequence[ResultCard]) -> tuple[Block, ...]:
+    """The cards; those of surroundings alone are folded unless something in them is not determined."""
+    known = "; ▾ simulated truth" if truth_errors(c) else ""
+    beside = [card for card in cards if card is not cards[0] and _is_beside(c, card)]
+    shown = tuple(result_table(card) for card in cards if card not in beside)
+    blocks: list[Block] = [Tables(shown, style="cards"), Text(f"{LEGEND}{known}.")]
+    if beside:
+        names = ", ".join(f"{g.title[:1].lower()}{g.title[1:]}" for card in beside for g in card.groups)
+        blocks.append(Details(f"Beside these: {names}", (Tables(tuple(map(result_table, beside)), "cards"),), "fold"))
+    return tuple(blocks)
+
+
+def _is_beside(c: Calibration, card: ResultCard) -> bool:
+    """Whether a card has nuisance parameters of the surroundings only, all of them determined."""
+    names = [name for _, row in card.rows for name in row.names]
+    return all(c.quantities[name].assumed for name in names) and not any(
+        row.verdict in ("weak", "unobservable") for _, row in card.rows
+    )
+
+
+def _use_card(found: UseBands) -> Card:
+    """Error before and after calibration over the operating points, with a sentence and the formula."""
+    use = found.use
+    sign = "± " if use.signed else ""
+    before, after = rounded(found.before, 3), rounded(found.after)
+    parts = [f"Before: 95 % within {sign}{before} {use.unit}. After: within {sign}{after} {use.unit}."]
+    allowed = found.figure(lambda band: band.allowed)
+    if allowed > 0.0:
+        parts.append(f"Parameters just at their requirements would allow {rounded(allowed)} {use.unit}.")
+    alone = found.figure(lambda band: band.uncorrelated) / max(found.figure(lambda band: band.bound), 1e-300)
+    if not 1.0 / _GAIN < alone < _GAIN:
+        parts.append(f"From the sigmas alone, without correlations, the band would be {rounded(alone)} times as wide.")
+    whole = found.figure(lambda band: band.whole)
+    if whole > 0.0 and found.figure(lambda band: band.bound) / whole > _GAIN:
+        parts.append(f"Applying all estimates, undetermined ones too, would leave {sign}{rounded(whole)} {use.unit}.")
+    if found.drawn:
+        parts.append("The error is not linear: bounds are quantiles of 10,000 draws.")
+    plain, applied = (Figure(use.y_title, use.x_title, _CURVE_PX) for _ in range(2))
+    for line, dash in zip(use.lines, _DASHES, strict=False):
+        band, f = found.bands[line.name], use.factor
+        plain.band(use.x, f * band.before_bounds[0], f * band.before_bounds[1], line.color, line.name)
+        plain.line(use.x, f * band.before, line.name, line.color, dash)
+        low, high = (band.after - band.bound, band.after + band.bound) if use.signed else (0.0 * band.bound, band.bound)
+        applied.band(use.x, f * low, f * high, line.color, line.name)
+        applied.line(use.x, f * high, line.name, line.color, dash)
+        if use.signed:
+            applied.line(use.x, f * low, line.name, line.color, dash)
+        if band.actual is not None:
+            applied.line(use.x, f * band.actual, "actual", line.color, "dotted", width=2.0)
+    legend = [(line.name, line.color, dash) for line, dash in zip(use.lines, _DASHES, strict=False)]
+    legend += [("actual error (simulated truth)", "ink", "dotted")] if applied.named("actual") else []
+    spread = "shown is m ± 1.96 √S" if use.signed else "shown is the length of e with the 95 % quantile of |N(m, S)|"
+    formula = (
+        Code(use.formula),
+        Text(f"Band: S = J P Jᵀ + N, P the joint covariance of all parameters, J = ∂e/∂(true parameters); {spread}."),
+    )
+    captions = ("Before calibration", "After calibration: 95 % band" if use.signed else "After calibration: 95 % bound")
+    curves = Curves(tuple(zip(captions, (plain, applied), strict=True)), tuple(legend))
+    condition = Text(f"{use.condition[:1].upper()}{use.condition[1:]}.")
+    return Card(
+        (Text(" ".join(parts), soft=False), curves, condition, Details("Formula", formula)),
+        use.title,
+        f"use-{use.name}",
+    )
+
+
+def _diagnostics(c: Calibration) -> tuple[Block, ...]:
+    """Fit, noise, stability, the error budget of what is nearest to its requirement, and what the method found."""
+    own = tuple(each for each in (c.plots(c) if c.plots else ()) if isinstance(each, Table))
+    fit, *more = _goodness_of_fit(c) or (None,)
+    beside = tuple(table for table in (fit, _noise(c)) if isinstance(table, Table))
+    return (
+        *((Tables(beside, "pair"),) if beside else ()),
+        *more,
+        *_titled("Stability during the recording", _stability(c)),
+        *_titled("Error budget", _error_budget(c)),
+        *((Tables(own, "pair"),) if own else ()),
+    )
+
+
+def _titled(title: str, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
+    return (Heading(title), *blocks) if blocks else ()
+
+
+def _details(c: Calibration) -> tuple[Block, ...]:
+    """Everything else, folded."""
+    said = Bullets(
+        tuple(dict.fromkeys((c.headline, *(f"{note}." for note in c.notes), *sentences.next_steps(c.findings))))
+    )
+    matrices = tuple(Code(text, copied=True) for text in matrix_texts(c))
+    plots = tuple(_plots(c))
+    parts: list[tuple[str, tuple[Block, ...]]] = [
+        ("All findings", (said,)),
+        ("Unobservable and weak directions", direction_blocks(c.findings)),
+        ("Parameters", (_parameter_table(c),)),
+        ("Nuisance parameters", _nuisance_parameters(c)),
+        ("K matrices and offsets b", matrices),
+        ("Sensitivity to fixed inputs", _fixed_inputs(c)),
+        ("Most influential measurements", _influential_measurements(c)),
+        ("Time to required accuracy", _time_to_accuracy(c)),
+        ("Plots", (Plots(plots),) if plots else ()),
+        ("Recording", _recording(c)),
+        ("Provenance", _provenance(c)),
+    ]
+    return tuple(Details(title, blocks, "fold", title.lower().replace(" ", "-")) for title, blocks in parts if blocks)
 
 
 def direction_blocks(findings: Sequence[Finding]) -> tuple[Block, ...]:
@@ -208,6 +413,14 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     needed = " ".join(formula.expression for formula in c.formulas)
     constants = [f"{name} = {value:.6g}" for name, value in c.problem.constants.items() if name in needed]
     formulas = tuple(f"`{line}`" for line in (*(formula.text for formula in c.formulas), *constants))
+    sensors = [name for name in TRIADS if f"{name}_k11" in c.values]
+    used = [f'K, bias = calibration.matrix("{name}"), calibration.bias("{name}")' for name in sensors[-1:]]
+    session = [
+        "import alidade",
+        "",
+        'calibration = alidade.load("calibration.yaml")',
+        *(used or [_CALL.format(_call(c))]),
+    ]
     if not formulas or c.status not in ("calibrated", "weak"):
         return ()
     values = {name: c.parameters[name].value for name in c.applied if name in c.parameters}
@@ -221,38 +434,47 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
         "SI units. calibration.yaml has the numbers, and rotations as quaternions; the same with these numbers in it:"
     )
     snippets = (Details(language, (Code(text, copied=True),), "screen") for language, text in code)
-    return (Card((Bullets(formulas), said, *snippets), id="apply"),)
+    folded = Details("Formulas", (Bullets(formulas),))
+    return (Card((Code("\n".join(session), copied=True), folded, said, *snippets), id="application"),)
 
 
-def _noise(c: Calibration) -> tuple[Block, ...]:
+def _call(c: Calibration) -> str:
+    """What the formulas measure, as arguments."""
+    return ", ".join(f"{name}={name}" for name in dict.fromkeys(n for formula in c.formulas for n in formula.measured))
+
+
+def _noise(c: Calibration) -> Table | None:
+    """Every noise but those that are zero."""
+    inflated = any(n.inflation > 1.0 for n in c.noises)
     columns: Columns = (
         "noise",
         Column("unit", "text"),
-        Column("source", "text", label="stated by"),
-        *("stated", "estimated", "sigma", "used"),
-        Column("used, SI", "text", wide=True),
-        "inflation",
+        "stated",
+        "estimated",
+        "used",
+        *(["inflation"] if inflated else []),
     )
     rows: list[Row] = []
     for n in c.noises:
+        if not (n.stated or n.used):
+            continue
         unit, factor = noise_unit(n.name, n.unit)
-        estimated, sigma = (
-            "" if number is None else rounded(factor * number, digits)
-            for number, digits in ((n.estimated, 3), (n.sigma, 1))
-        )
-        in_si = "" if factor == 1.0 else f"{n.used:.3g} {n.unit}"
-        inflation = f"{n.inflation:.2f}" if n.inflation > 1.0 else ""
-        numbers = (rounded(factor * n.stated, 3), estimated, sigma, rounded(factor * n.used, 3))
-        rows.append((Cell(n.name, NOISES.get(n.name, "")), unit, n.source, *numbers, in_si, inflation))
-    caption = (
-        "Estimated: from residuals or samples. Used: weighted mean of stated and estimated, weights from "
-        "`noise_known`. Inflation: factor of sigma due to time correlation, already included."
-    )
-    return (Table("", caption, columns, tuple(rows), "noise", "dense", None),) if rows else ()
+        estimated = "" if n.estimated is None else to_digits_of(factor * n.estimated, factor * (n.sigma or 0.0))
+        sigma = "" if n.sigma is None else f" ± {rounded(factor * n.sigma)}"
+        name = Cell(n.name, hint=f"{NOISES.get(n.name, n.name)} Stated by {n.source}; {n.used:.3g} {n.unit} used.")
+        inflation = (f"{n.inflation:.2f}" if n.inflation > 1.0 else "",) if inflated else ()
+        numbers = (rounded(factor * n.stated, 3), estimated + sigma, rounded(factor * n.used, 3))
+        rows.append((name, unit, *numbers, *inflation))
+    caption = "Estimated from residuals or samples; used: weighted mean of both, weights from `noise_known`."
+    if inflated:
+        caption += " Inflation: factor of sigma due to time correlation, already included."
+    return Table("Noise", caption, columns, tuple(rows), "noise", "small", None) if rows else None
 
 
 def _error_budget(c: Calibration) -> tuple[Block, ...]:
-    found = limits(c.budget or {}, c.problem.quantities)
+    ratios = {p.name: p.sigma / p.require for p in c.parameters.values() if p.require}
+    found = sorted(limits(c.budget or {}, c.problem.quantities), key=lambda each: -ratios.get(each.name, 0.0))
+    found = found[:_MAX_BUDGET]
     if not found:
         return ()
     rows = tuple(
@@ -265,7 +487,10 @@ def _error_budget(c: Calibration) -> tuple[Block, ...]:
         )
         for limit in found
     )
-    caption = "Contribution of each noise and each prior to the variance; the shares sum to one."
+    caption = (
+        "Contribution of each noise and each prior to the variance of the parameters nearest to their requirement; the "
+        "shares sum to one."
+    )
     table = Table(
         "", caption, ("parameter", Column("shares of its variance", "prose")), rows, "budget", "lines columns"
     )
@@ -340,9 +565,9 @@ def _goodness_of_fit(c: Calibration) -> tuple[Block, ...]:
         return ()
     interval = Column("99.9 % interval", wide=True)
     rows = tuple(_fit_row(family, fit) for family, fit in {**c.family_fits, "whole": c.fit}.items())
-    columns: Columns = ("family", "chi-square", "degrees of freedom", interval, "noise factor")
+    columns: Columns = ("family", "chi-square", Column("dof", label="degrees of freedom"), interval, "noise factor")
     caption = "Noise factor: by what the noise used would have to be multiplied to fit the residuals."
-    blocks: list[Block] = [Table("", caption, columns, rows, style="", most_rows=None)]
+    blocks: list[Block] = [Table("Goodness of fit", caption, columns, rows, style="small", most_rows=None)]
     if c.innovations:
         heads = ("mean NIS", interval, Column("autocorrelation at lag 1", wide=True), "largest of 5 lags", "bound")
         caption = (

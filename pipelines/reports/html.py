@@ -11,7 +11,9 @@ import gzip
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
+from html import escape
 from importlib.metadata import distribution
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from alidade.pipelines.display.figure import PALETTE, Figure, Mark, Plot
+from alidade.pipelines.display.svg import interval_bar, svg
 from alidade.pipelines.display.table import Cell, Column, Table
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.reports.report import Block, Report, plots_of
@@ -41,6 +44,29 @@ def render_html(report: Report) -> str:
     return environment().get_template("page.html").render(report=report, plots=plots, packed=_packed(plots))
 
 
+@dataclass(frozen=True)
+class Page:
+    """A page of its own, which a notebook shows in a frame."""
+
+    html: str
+    height_px: int = 640
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Page of {len(self.html) // 1000} kB; .write(path) saves it>"
+
+    def _repr_html_(self) -> str:
+        frame = 'style="width:100%;border:0" sandbox="allow-scripts"'
+        return f'<iframe {frame} height="{self.height_px}" srcdoc="{escape(self.html, quote=True)}"></iframe>'
+
+    def write(self, path: str | Path) -> Path:
+        """Write it. Raises InputError when it cannot be written."""
+        from alidade.pipelines.reports.whole import write_file
+
+        write_file(Path(path), self.html)
+        return Path(path)
+
+
 def render_fragment(*blocks: Block) -> str:
     """Blocks without plots, as HTML without a style."""
     macros = vars(environment().get_template("page.html").make_module({"report": None, "plots": ()}))
@@ -59,7 +85,14 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"coded": _coded, "kind": lambda block: type(block).__name__, "classes": _classes}
+    made.filters |= {
+        "coded": _coded,
+        "kind": lambda block: type(block).__name__,
+        "classes": _classes,
+        "bar": interval_bar,
+        "curve": svg,
+        "slug": lambda text: text.lower().replace(" ", "-"),
+    }
     # Not a template: Bokeh's formats of dates look like statements.
     made.globals |= {"palette": PALETTE, "drawing": (_TEMPLATES / "figures.js").read_text(encoding="utf-8")}
     return made

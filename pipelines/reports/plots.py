@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import cycle
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot
+from alidade.pipelines.display.figure import AXES, COLORS, PALE, REJECTED, Figure, Plot
 from alidade.pipelines.display.units import human_unit
 from alidade.pipelines.estimation.problem import Array, History, Quantity, Residuals
 from alidade.pipelines.reports.result import Calibration, quantities_of
@@ -57,7 +57,7 @@ def _residuals(family: str, residuals: Residuals, names: Sequence[str], innovati
     what = "innovation" if innovations else "residual"
     out = Figure(f"{what}, sigmas")
     used = residuals.used
-    for i, (name, color) in enumerate(zip(names, cycle(COLORS))):
+    for i, (name, color) in enumerate(zip(names, _colors(names), strict=False)):
         out.points(residuals.time[used], residuals.whitened[used, i], name, color, 3)
     if not used.all():
         low, high = _view(residuals.whitened[used])
@@ -72,6 +72,12 @@ def _residuals(family: str, residuals: Residuals, names: Sequence[str], innovati
         f"{100.0 * share:.2g} % lie beyond 3 (dotted), 0.27 % would be normal.",
         out,
     )
+
+
+def _colors(names: Sequence[str]) -> Iterable[str]:
+    """Those of the axes where names end in x, y, z, else the palette's in turn."""
+    axes = [name.rpartition("_")[2] for name in names]
+    return axes if set(axes) <= set(AXES) and len(set(axes)) == len(axes) else cycle(COLORS)
 
 
 def _view(used: Array) -> tuple[float, float]:
@@ -117,7 +123,7 @@ def _histories(calibration: Calibration, history: History) -> list[Plot]:
         out = Figure(unit)
         settled = history.time >= history.time[0] + _SETTLED * np.ptp(history.time)
         reach, shown = [], set()
-        for q, color in zip(members, cycle(COLORS)):
+        for q, color in zip(members, _colors([q.name for q in members]), strict=False):
             values = factor * history.values[:, column[q.name]]
             sigmas = factor * history.sigmas[:, column[q.name]]
             out.band(history.time, values - sigmas, values + sigmas, color, q.name)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from alidade.pipelines.display.figure import Plot
+from alidade.pipelines.display.figure import Figure, Plot
 from alidade.pipelines.display.table import Table
 
 Tone = Literal["good", "warn", "bad", "fixed"]
@@ -26,6 +26,7 @@ class Summary:
         text: the answer in sentences; `code` stands between backquotes.
         notes: what a reader must know beside it, without full stops.
         next_steps: what to do now, one sentence each.
+        badges: what matters beside it, in a few words each.
     """
 
     question: str
@@ -34,6 +35,23 @@ class Summary:
     text: str
     notes: tuple[str, ...] = ()
     next_steps: tuple[str, ...] = ()
+    badges: tuple[Badge, ...] = ()
+
+
+@dataclass(frozen=True)
+class Badge:
+    """A remark of a few words; `hint` where it is pointed at."""
+
+    text: str
+    tone: Tone
+    hint: str = ""
+
+
+@dataclass(frozen=True)
+class Heading:
+    """The title of what follows within a section."""
+
+    text: str
 
 
 @dataclass(frozen=True)
@@ -95,9 +113,10 @@ class Plots:
 
 @dataclass(frozen=True)
 class Tables:
-    """Tables beside one another on paper."""
+    """Tables beside one another: on paper, or, in the style "cards", wherever there is room."""
 
     tables: tuple[Table, ...]
+    style: Literal["tables", "cards", "pair"] = "tables"
 
 
 @dataclass(frozen=True)
@@ -108,22 +127,51 @@ class Pairs:
 
 
 @dataclass(frozen=True)
+class Tile:
+    """A headline figure: what of, the figure with its unit, and a line below."""
+
+    label: str
+    figure: str
+    unit: str
+    note: str
+    tone: str = ""
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Headline figures beside one another."""
+
+    tiles: tuple[Tile, ...]
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Small figures beside one another, each with its caption, and one legend: name, colour and dash of each line."""
+
+    figures: tuple[tuple[str, Figure], ...]
+    legend: tuple[tuple[str, str, str], ...]
+
+
+@dataclass(frozen=True)
 class Signature:
     """A line to sign, with the name below."""
 
     name: str
 
 
-Block = Pairs | Signature | Text | Bullets | Code | Svg | Details | Card | Plots | Tables | Table
+Block = (
+    Heading | Tiles | Curves | Pairs | Signature | Text | Bullets | Code | Svg | Details | Card | Plots | Tables | Table
+)
 
 
 @dataclass(frozen=True)
 class Section:
-    """Blocks under a heading; those for pages only are not printed in a terminal."""
+    """Blocks under a heading; `page_only`: not in a terminal; `narrow_folded`: folded on a phone."""
 
     title: str
     blocks: tuple[Block, ...]
     page_only: bool = False
+    narrow_folded: bool = False
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import metadata
 from io import StringIO
 from pathlib import Path
@@ -39,9 +40,11 @@ from alidade.pipelines.reports.values import SensorValues
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
+    from alidade.pipelines.diagnostics.use import UseBands
     from alidade.pipelines.methods import Method
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.reports.calibration import SavedRotation
+    from alidade.pipelines.reports.html import Page
 
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 
@@ -132,6 +135,25 @@ class Calibration(SensorValues):
 
     def _joint(self) -> tuple[Sequence[str], Array]:
         return self.estimate.names, self.covariance
+
+    @cached_property
+    def uses(self) -> tuple[UseBands, ...]:
+        """What the calibration is used for, with the error before and after it and the 95 % band."""
+        from alidade.pipelines.reports.uses import uses_of
+
+        return uses_of(self)
+
+    def plot(self, name: str | None = None) -> Page:
+        """The figures of the report, which a notebook shows: all, those of a use, or the plot with a title.
+
+            calibration.plot("heading")
+
+        Raises:
+            InputError: there is no such use or plot.
+        """
+        from alidade.pipelines.reports.calibration_report import plotted
+
+        return plotted(self, name)
 
     def to_dict(self) -> dict[str, Any]:
         """The content of result.json."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
@@ -20,6 +21,8 @@ from alidade.pipelines.estimation.problem import Quantity
 
 Quantities = Mapping[str, Quantity]
 
+# Share of the required parameters from which on a calibration as a whole is not determined.
+_MOST = 0.5
 # Findings of a kind, and parameters or recordings of a finding, that are named.
 _MAX_NAMED = 3
 # Ratio of sandwich to nominal sigma from which on it is a warning.
@@ -60,6 +63,56 @@ def headline(findings: Sequence[Finding], quantities: Quantities, verdicts: Mapp
     by_prior = [name for name, verdict in verdicts.items() if verdict == "prior"]
     but = f", {', '.join(by_prior)} by prior alone" if by_prior else ""
     return f"{estimated} of {estimated} parameters meet the required accuracy{but}."
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The number nearest to its requirement, or farthest beyond: sigma and requirement as text, and their ratio."""
+
+    name: str
+    sigma: str
+    require: str
+    unit: str
+    ratio: float
+
+
+def short_verdict(
+    findings: Sequence[Finding], quantities: Quantities, verdicts: Mapping[str, str], worst: Worst | None
+) -> tuple[str, str]:
+    """One sentence about the result, and one about what to do.
+
+    Args:
+        findings: of a result, the most severe first.
+        quantities: by name.
+        verdicts: parameter -> verdict, of those with a required accuracy.
+        worst: of the required numbers; None: there is none.
+    """
+    advice = [what for _, what in by_advice(findings)]
+    more = f"; {len(advice) - 1} more under Details" if len(advice) > 1 else ""
+    action = f"What to do: {advice[0]}{more}." if advice else ""
+    required = [name for name, verdict in verdicts.items() if verdict != "fixed"]
+    missed = [name for name in required if verdicts[name] in ("weak", "unobservable")]
+    state = status(findings)
+    if state == "inconsistent" or any(finding.kind == "not_converged" for finding in findings):
+        first = next(f for f in findings if f.severity > Severity.NOTE)
+        what = [" ".join(cause(f, quantities) or ()) for f in findings if f.kind in _CAUSES and f is not first][:1]
+        probable = f" {what[0]}." if what and first.kind not in _CAUSES else ""
+        return sentence(first, quantities), f"Do not use the values before the cause is found.{probable}"
+    if state == "calibrated":
+        closest = f"; the closest is {worst.name}, at {100.0 * worst.ratio:.2g} % of the requirement" if worst else ""
+        text = f"All {len(required)} required parameters are within their required accuracy{closest}."
+        return text, _NEXT["calibrated"][1].replace("Later, `", "Apply calibration.yaml; later, `")
+    directions = sum(f.kind == "direction" and f.severity == Severity.UNOBSERVABLE for f in findings)
+    if state == "weak" or not directions:
+        where = f", worst {worst.name}: ± {worst.sigma} {worst.unit} where {worst.require} is required" if worst else ""
+        return f"{len(missed)} of {len(required)} parameters miss their required accuracy{where}.", action
+    if len(missed) > _MOST * len(required):
+        return (
+            f"The recording does not determine this calibration: {len(missed)} of {len(required)} parameters miss "
+            f"their required accuracy, {directions} combinations are not observable.",
+            action,
+        )
+    return f"The recording does not determine {directions} combinations of parameters; the others may be used.", action
 
 
 def notes(findings: Sequence[Finding], quantities: Quantities) -> tuple[str, ...]:

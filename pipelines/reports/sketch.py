@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from alidade.factors import so3
+from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.reports.calibration import SavedTransform
 
@@ -63,8 +64,8 @@ def _axes(transform: SavedTransform, x: float, y: float, directions: str) -> str
     turn = so3.log(np.array(transform.wxyz)) * (_ENLARGED if enlarged(transform) else 1.0)
     ends = _LENGTH * (_DIRECTIONS[directions] @ so3.matrix(so3.exp(turn)))
     lines = "".join(
-        f'<path d="M{x:.0f} {y:.0f}l{dx:.1f} {dy:.1f}" stroke="var(--series{i})" stroke-width="2" '
+        f'<path d="M{x:.0f} {y:.0f}l{dx:.1f} {dy:.1f}" stroke="var(--{axis})" stroke-width="2" '
         'stroke-dasharray="3 3" fill="none"/>'
-        for i, (dx, dy) in enumerate(ends.T)
+        for axis, (dx, dy) in zip(AXES, ends.T, strict=True)
     )
     return f"<g>{lines}</g>"

@@ -30,7 +30,7 @@ _OVERFLOWING = """(() => {
   for (const element of document.querySelectorAll("body *")) {
     const box = element.getBoundingClientRect();
     const scrolls = element.matches(".scroll") && element.scrollWidth > element.clientWidth + 1;
-    if ((box.right <= width + 1 && !scrolls) || box.width == 0 || element.closest("svg")) continue;
+    if ((box.right <= width + 1 && !scrolls) || box.width == 0 || element.closest("svg, nav")) continue;
     const where = `${element.tagName} ${element.className} ${element.textContent.slice(0, 40)}`;
     found.push(`${where}: ${Math.round(box.right)} of ${width}`);
   }
@@ -71,6 +71,8 @@ def look(tab: Tab, path: Path, width: int) -> Look:
     tab.size(width)
     tab.screen()
     tab.open(path.as_uri())
+    tab.wait("document.readyState == 'complete'", _PATIENCE_S)
+    tab.value("for (const fold of document.querySelectorAll('details')) fold.open = true")
     tab.wait("document.readyState == 'complete' && !document.querySelector('.plot:not([data-drawn])')", _PATIENCE_S)
     return _seen(tab)
 

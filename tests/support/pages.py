@@ -17,7 +17,8 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.loaded += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        links = [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        self.loaded += [link for link in links if not link.startswith("#")]
         self._hidden = tag in ("script", "style")
         self.scripts += tag == "script"
 

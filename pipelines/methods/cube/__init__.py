@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.diagnostics.use import Truth, Use
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.display.table import Table
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
@@ -41,6 +42,13 @@ class Cube(Method):
     }
     drawn = True
     of_recording = ("gyro_b?", "accel_b?", "field_?", "reference_*")
+    cards: ClassVar[Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]]] = {
+        "Mounts and field": (
+            ("Camera to reference, correction", "deg", ("camera_mount_x", "camera_mount_y", "camera_mount_z")),
+            ("Reference heading", "deg", ("reference_heading",)),
+            ("Field", "µT", ("field_e", "field_n", "field_u")),
+        ),
+    }
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
         r"camera_mount_([xyz])": "Camera mount about {0}, correction of the config.",
@@ -147,6 +155,11 @@ class Cube(Method):
         from alidade.pipelines.methods.cube.findings import findings
 
         return findings(data, config, estimate)
+
+    def uses(self, true: Truth, config: Config, noise: Mapping[str, float]) -> Sequence[Use]:  # noqa: ARG002
+        from alidade.pipelines.methods.cube.uses import uses
+
+        return uses(true, config)
 
     @property
     def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:

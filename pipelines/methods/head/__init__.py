@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.diagnostics.use import Truth, Use
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.estimation.problem import Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
@@ -37,6 +38,21 @@ class Head(Method):
         "clock": ("skew",),
     }
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "platform_bias_*")
+    cards: ClassVar[Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]]] = {
+        "Mounts": (
+            ("Markers to helmet IMU", "deg", ("helmet_mount_x", "helmet_mount_y", "helmet_mount_z")),
+            ("Platform to camera", "deg", ("camera_mount_x", "camera_mount_y", "camera_mount_z")),
+        ),
+        "Helmet gyro": (
+            ("Bias", "deg/s", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+            ("Scale error", "%", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
+        ),
+        "Timing and camera": (
+            ("Delay of the pictures", "ms", ("time_offset",)),
+            ("Clock skew", "ppm", ("clock_skew",)),
+            ("Scale of vision's angles", "%", ("vision_scale",)),
+        ),
+    }
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
         r"helmet_mount_([xyz])": "Rotation markers to helmet IMU (vRh), {0} of the rotation vector.",
@@ -143,6 +159,11 @@ class Head(Method):
         from alidade.pipelines.methods.head.figures import head_plots
 
         return head_plots(data, calibration)
+
+    def uses(self, true: Truth, config: Config, noise: Mapping[str, float]) -> Sequence[Use]:  # noqa: ARG002
+        from alidade.pipelines.methods.head.uses import uses
+
+        return uses(noise)
 
 
 METHOD = Head()

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.diagnostics.use import Truth, Use
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.estimation.problem import Estimate, Problem
     from alidade.pipelines.methods.formula import Formula
@@ -35,6 +36,13 @@ class Indexer(Method):
         "encoder": ("once_per_turn", "delay"),
     }
     of_recording = ("gyro_bias_*",)
+    cards: ClassVar[Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]]] = {
+        "IMU on the indexer": (("Mounting", "", ("theta_x", "theta_y", "theta_z")),),
+        "Gyro": (
+            ("Bias", "", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+            ("Scale error", "ppm", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
+        ),
+    }
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
         r"theta_([xyz])": "IMU misalignment about {0} of the platform.",
@@ -125,6 +133,11 @@ class Indexer(Method):
         from alidade.pipelines.methods.indexer.figures import indexer_plots
 
         return indexer_plots(data, calibration)
+
+    def uses(self, true: Truth, config: Config, noise: Mapping[str, float]) -> Sequence[Use]:  # noqa: ARG002
+        from alidade.pipelines.methods.indexer.uses import uses
+
+        return uses(noise)
 
 
 METHOD = Indexer()

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.diagnostics.use import Truth, Use
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.estimation.problem import Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
@@ -38,6 +39,22 @@ class Los(Method):
         "target": ("rate",),
     }
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "target_rate_*")
+    cards: ClassVar[Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]]] = {
+        "Mounting": (
+            ("Camera on the gimbal, elevation", "deg", ("delta_px",)),
+            ("IMU on the carrier", "deg", ("delta_gx", "delta_gy", "delta_gz")),
+            ("Azimuth, camera minus IMU", "deg", ("delta_z", "delta_pz")),
+        ),
+        "Gyro and timing": (
+            ("Gyro bias", "deg/h", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+            ("Delay of the pictures", "ms", ("time_offset",)),
+            ("Delay of the encoders", "ms", ("encoder_delay",)),
+        ),
+        "Gimbal geometry": (
+            ("Axes and camera", "deg", ("axis_nonperpendicularity", "collimation", "camera_roll")),
+            ("Scale of the LOS error", "%", ("los_scale",)),
+        ),
+    }
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
         r"delta_px": "Boresight in elevation: added to the elevation encoder.",
@@ -146,6 +163,11 @@ class Los(Method):
         from alidade.pipelines.methods.los.figures import los_plots
 
         return los_plots(data, calibration)
+
+    def uses(self, true: Truth, config: Config, noise: Mapping[str, float]) -> Sequence[Use]:  # noqa: ARG002
+        from alidade.pipelines.methods.los.uses import uses
+
+        return uses(true)
 
 
 METHOD = Los()

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
+    from alidade.pipelines.diagnostics.use import Truth, Use
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.display.table import Table
     from alidade.pipelines.estimation.problem import Estimate, Findings, Problem
@@ -38,6 +39,17 @@ class Tumble(Method):
         "field": ("model_error",),
     }
     of_recording = ("accel_b?", "gyro_bias_*", "gravity", "field_*")
+    cards: ClassVar[Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]]] = {
+        "Gyro": (
+            ("Bias", "deg/s", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+            ("Scale error", "%", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
+        ),
+        "Field": (
+            ("Strength", "", ("field_strength",)),
+            ("Dip", "deg", ("field_dip",)),
+            ("Delay of the magnetometer", "ms", ("mag_delay",)),
+        ),
+    }
     sketch = Path(__file__).with_name("frames.svg")
     drawn = True
     yields = True
@@ -125,6 +137,11 @@ class Tumble(Method):
         from alidade.pipelines.methods.tumble.figures import figures
 
         return figures(data, calibration)
+
+    def uses(self, true: Truth, config: Config, noise: Mapping[str, float]) -> Sequence[Use]:  # noqa: ARG002
+        from alidade.pipelines.methods.tumble.uses import uses
+
+        return uses(true)
 
     @property
     def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:

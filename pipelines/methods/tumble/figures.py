@@ -8,7 +8,7 @@ import numpy as np
 
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, sphere_map
-from alidade.pipelines.display.table import Table
+from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.findings import NAMES, directions
@@ -31,9 +31,8 @@ def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:
 def _words(calibration: Calibration) -> Table:
     kinds = ("offsets", "stretches", "coverage")
     rows = [(NAMES[str(row["sensor"])], str(row["says"])) for kind in kinds for row in calibration.tables[kind]]
-    return Table(
-        "In plain words", "Directions are those of the device's axes.", ("sensor", "what was found"), tuple(rows)
-    )
+    columns = ("sensor", Column("what was found", "prose"))
+    return Table("In plain words", "Directions are those of the device's axes.", columns, tuple(rows))
 
 
 def _lengths(sensor: Sensor, values: Mapping[str, float]) -> Plot:

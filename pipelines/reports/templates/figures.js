@@ -161,9 +161,13 @@
   const near = new IntersectionObserver(seen => seen.forEach(each => each.isIntersecting && draw(each.target)), { rootMargin: "400px" });
   places.forEach(place => near.observe(place));
   const idle = window.requestIdleCallback ?? (job => setTimeout(job, 50));
-  const rest = () => { const next = places.find(place => !drawn.has(place)); if (next) draw(next).then(() => idle(rest)); };
+  const rest = () => { const next = places.find(place => !drawn.has(place) && !place.closest("details:not([open])")); if (next) draw(next).then(() => idle(rest)); };
   addEventListener("load", () => idle(rest));
-  addEventListener("beforeprint", () => places.forEach(draw));
+  document.addEventListener("toggle", () => idle(rest), true);
+  addEventListener("beforeprint", () => {
+    for (const fold of document.querySelectorAll("details")) fold.open = true;
+    places.forEach(draw);
+  });
   dark.addEventListener("change", () => {
     // Not for a print in light colours, which the style sheet turns round.
     if (matchMedia("print").matches) return;

@@ -1,0 +1,284 @@
+"""Uncertainty in use: the error that a calibration leaves when it is applied, with its 95 % band.
+
+A use error is e(u; applied, true): what a reading of a sensor with the parameters `true` becomes when `applied` is used
+on it, less what is right, at the operating point u (heading, rate, direction, gimbal angle, time). With the estimate x,
+its joint covariance P, and x_a, the values that the formulas apply,
+
+    after:   m(u) = e(u; x_a, x),      J(u) = d e(u; x_a, t) / d t at t = x,  S(u) = J P J' + N(u)
+    before:  the same with nominal values applied: K = I, b = 0, mounts and delays 0.
+
+N is noise of the use itself (angle random walk of a dead-reckoned attitude; 0 elsewhere). A scalar error has the band
+m +- 1.96 sqrt(S). Of a vector the length is shown with the 95 % quantile of |N(m, S)|, whose square is matched in mean
+and variance by a scaled chi-square (Patnaik 1949): mean tr S + m'm, variance 2 tr S^2 + 4 m' S m. Derivatives are
+central differences of a tenth of a sigma. Where 2,000 draws of true ~ N(x, P) show that the error is not linear, the
+bound is the quantile of 10,000 draws. Bands are conditional on the posterior: NEES over seeds is the test of P itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from scipy.special import gammaincinv
+
+from alidade.pipelines.estimation.problem import Array
+
+Z95 = 1.959963984540054
+# Draws that test whether the error is linear, the coverage that they may show, and draws that give bounds where not.
+_TEST_DRAWS, _COVERAGE, _BOUND_DRAWS = 2000, (0.93, 0.97), 10_000
+_CHUNK = 250
+# Bounds smaller than this share of the largest are rounding.
+_NOTHING = 1e-9
+# Of a sigma, for derivatives.
+_STEP = 0.1
+
+
+class Truth:
+    """Parameter values (..., n) by name, as many sets as wanted; what is not known is 0."""
+
+    def __init__(self, names: Sequence[str], values: Array) -> None:
+        self.index = {name: i for i, name in enumerate(names)}
+        self.values = values
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.index
+
+    def get(self, name: str, default: float = 0.0) -> Array:
+        """Values (...,) of a parameter."""
+        if name in self.index:
+            return np.asarray(self.values[..., self.index[name]])
+        return np.full(self.values.shape[:-1], default)
+
+    def vector(self, *names: str) -> Array:
+        """Values (..., len(names))."""
+        return np.stack([self.get(name) for name in names], axis=-1)
+
+    def xyz(self, stem: str) -> Array:
+        """Values (..., 3) of stem_x, stem_y, stem_z."""
+        return self.vector(*(f"{stem}_{axis}" for axis in "xyz"))
+
+    def matrix(self, rows: Sequence[Sequence[str]], diagonal: float = 0.0) -> Array:
+        """Values (..., 3, 3); entries on the diagonal that are not known are `diagonal`."""
+        each = [[self.get(n, diagonal * (i == j)) for j, n in enumerate(row)] for i, row in enumerate(rows)]
+        return np.stack([np.stack(row, axis=-1) for row in each], axis=-2)
+
+
+class Applied(Protocol):
+    """The formulas of a calibration with values in them."""
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Parameter -> value that is applied."""
+
+    def __call__(self, **measured: Array) -> Mapping[str, Array]:
+        """What follows from measurements."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A curve: error(applied, true) is (..., U), or (..., U, d) of a vector whose length is shown.
+
+    `noise` is a variance per component, (U,); `color` from the palette, and `dash` as figures have it.
+    """
+
+    name: str
+    error: Callable[[Applied, Truth], Array]
+    color: str = "series0"
+    noise: Array | None = None
+
+
+@dataclass(frozen=True)
+class Use:
+    """What a calibration is used for.
+
+    Attributes:
+        name: for programs.
+        title: for people.
+        x: operating points (U,), and x_title their axis.
+        y_title, unit, factor: of the error, and what its SI number is multiplied by.
+        lines: curves.
+        formula: of the error; condition: under which it is shown.
+        label: of the headline figure.
+        at: operating point of the headline figure; None: the worst.
+        signed: a scalar error.
+    """
+
+    name: str
+    title: str
+    x: Array
+    x_title: str
+    y_title: str
+    unit: str
+    factor: float
+    lines: tuple[Line, ...]
+    formula: str
+    condition: str
+    label: str
+    at: int | None = None
+    signed: bool = False
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """An estimate with what is applied of it.
+
+    Attributes:
+        names, x, P: of the parameters.
+        require: accuracy wanted of each, 0 where none.
+        applied, nominal, whole: the formulas with the values applied, with nominal ones, and with all estimates.
+        truth: values (n,), where known.
+    """
+
+    names: Sequence[str]
+    x: Array
+    P: Array
+    require: Array
+    applied: Applied
+    nominal: Applied
+    whole: Applied
+    truth: Array | None = None
+
+
+@dataclass(frozen=True)
+class Band:
+    """Errors over the operating points, (U,), SI; of a vector its length.
+
+    Attributes:
+        before, before_bounds: nominal values applied: error with its lower and upper bound.
+        after, bound: m, and the half-width about it of a scalar, the 95 % quantile of a vector's length.
+        allowed: bound if the parameters only just met their requirements.
+        uncorrelated: bound from the sigmas alone.
+        whole: bound if all estimates were applied, those of nuisance parameters too.
+        actual: error by the truth, where known.
+    """
+
+    before: Array
+    before_bounds: tuple[Array, Array]
+    after: Array
+    bound: Array
+    allowed: Array
+    uncorrelated: Array
+    whole: Array
+    actual: Array | None
+
+
+@dataclass(frozen=True)
+class UseBands:
+    """A use with the band of each of its lines; `drawn`: bounds are quantiles of draws."""
+
+    use: Use
+    bands: Mapping[str, Band] = field(default_factory=dict)
+    drawn: bool = False
+
+    def figure(self, values: Callable[[Band], Array]) -> float:
+        """The headline figure of a value of the bands, in the use's unit."""
+        at = self.use.at
+        return self.use.factor * max(float(v.max() if at is None else v[at]) for v in map(values, self.bands.values()))
+
+    @property
+    def before(self) -> float:
+        """Largest 95 % bound of the error before calibration."""
+        return self.figure(lambda band: np.maximum(*map(np.abs, band.before_bounds)))
+
+    @property
+    def after(self) -> float:
+        """Largest 95 % bound after calibration."""
+        return self.figure(lambda band: band.bound + np.abs(band.after) * self.use.signed)
+
+
+def use_bands(use: Use, posterior: Posterior) -> UseBands:
+    """Bands of a use, checked by draws."""
+    found = UseBands(use, {line.name: _band(use, line, posterior) for line in use.lines})
+    shares = coverage(found, posterior, _TEST_DRAWS, seed=1)
+    low, high = _COVERAGE
+    if all(low < share < high for each in shares.values() for share in each[np.isfinite(each)]):
+        return found
+    bounds = {name: np.quantile(e, 0.95, axis=0) for name, e in _draws(found, posterior, _BOUND_DRAWS, 2).items()}
+    return replace(found, bands={n: replace(b, bound=bounds[n]) for n, b in found.bands.items()}, drawn=True)
+
+
+def coverage(found: UseBands, posterior: Posterior, draws: int = 10_000, seed: int = 0) -> dict[str, Array]:
+    """Share of exact errors of drawn calibrations within the band, (U,) per line; nan where nothing is uncertain."""
+    shares = {}
+    for name, errors in _draws(found, posterior, draws, seed).items():
+        bound = found.bands[name].bound
+        shares[name] = np.where(bound > _NOTHING * bound.max(), (errors <= bound).mean(axis=0), np.nan)
+    return shares
+
+
+def _draws(found: UseBands, posterior: Posterior, draws: int, seed: int) -> dict[str, Array]:
+    """|e - m| of a scalar, |e| of a vector, (draws, U), of truths drawn from N(x, P), without linearising."""
+    values, vectors = np.linalg.eigh(posterior.P)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    rng = np.random.default_rng(seed)
+    parts: dict[str, list[Array]] = {line.name: [] for line in found.use.lines}
+    for _ in range(0, draws, _CHUNK):
+        true = Truth(posterior.names, posterior.x + rng.standard_normal((_CHUNK, len(posterior.x))) @ root.T)
+        for line in found.use.lines:
+            e = _components(line.error(posterior.applied, true), found.use.signed)
+            if line.noise is not None:
+                e = e + np.sqrt(line.noise)[:, None] * rng.standard_normal(e.shape)
+            center = found.bands[line.name].after[:, None] if found.use.signed else 0.0
+            parts[line.name].append(np.linalg.norm(e - center, axis=-1))
+    return {name: np.concatenate(each) for name, each in parts.items()}
+
+
+def _band(use: Use, line: Line, posterior: Posterior) -> Band:
+    def linear(applied: Applied) -> tuple[Array, Array]:
+        return _linearised(lambda t: _components(line.error(applied, Truth(posterior.names, t)), use.signed), posterior)
+
+    (mean, J), (mean0, J0), (mean_w, J_w) = (linear(a) for a in (posterior.applied, posterior.nominal, posterior.whole))
+    noise = 0.0 if line.noise is None else line.noise[:, None, None] * np.eye(mean.shape[-1])
+    covariances = (posterior.P, np.diag(np.diag(posterior.P)), np.diag(posterior.require**2))
+    S, alone, allowed = (J @ each @ np.swapaxes(J, -1, -2) for each in covariances)
+    S0, S_w = (each @ posterior.P @ np.swapaxes(each, -1, -2) for each in (J0, J_w))
+    length = np.linalg.norm(mean0, axis=-1)
+    along = mean0 / np.maximum(length, 1e-300)[:, None]
+    spread = Z95 * np.sqrt(np.einsum("ui,uij,uj->u", along, S0, along))
+    actual = None
+    if posterior.truth is not None:
+        actual = _components(line.error(posterior.applied, Truth(posterior.names, posterior.truth)), use.signed)
+    if use.signed:
+        flat = None if actual is None else actual[:, 0]
+        half, half_alone, half_allowed, half_w = (
+            Z95 * np.sqrt(each[:, 0, 0]) for each in (S + noise, alone, allowed, S_w)
+        )
+        bounds = mean0[:, 0] - spread, mean0[:, 0] + spread
+        return Band(mean0[:, 0], bounds, mean[:, 0], half, half_allowed, half_alone, half_w, flat)
+    return Band(
+        length,
+        (np.maximum(length - spread, 0.0), length + spread),
+        np.linalg.norm(mean, axis=-1),
+        _length_bound(mean, S + noise),
+        _length_bound(np.zeros_like(mean), allowed),
+        _length_bound(mean, alone + noise),
+        _length_bound(mean_w, S_w + noise),
+        None if actual is None else np.linalg.norm(actual, axis=-1),
+    )
+
+
+def _linearised(error: Callable[[Array], Array], posterior: Posterior) -> tuple[Array, Array]:
+    """Mean (U, d), and its Jacobian (U, d, n) by the true parameters, at the estimate."""
+    x, step = posterior.x, _STEP * np.sqrt(np.diag(posterior.P))
+    free = np.flatnonzero(step > 0.0)
+    mean = error(x)
+    J = np.zeros((*mean.shape, len(x)))
+    if len(free):
+        h = (np.eye(len(x)) * step)[free]
+        differences = error(x + h) - error(x - h)
+        J[..., free] = np.moveaxis(differences / (2.0 * step[free])[:, None, None], 0, -1)
+    return mean, J
+
+
+def _components(error: Array, signed: bool) -> Array:
+    return error[..., None] if signed else error
+
+
+def _length_bound(mean: Array, S: Array) -> Array:
+    """95 % quantile of the length of N(mean (U, d), S (U, d, d))."""
+    first = np.trace(S, axis1=-2, axis2=-1) + (mean**2).sum(-1)
+    second = 2.0 * np.einsum("uij,uji->u", S, S) + 4.0 * np.einsum("ui,uij,uj->u", mean, S, mean)
+    nu = np.clip(2.0 * first**2 / np.maximum(second, 1e-300), 1.0, 1e6)
+    return np.asarray(np.sqrt(first / nu * 2.0 * gammaincinv(0.5 * nu, 0.95)))

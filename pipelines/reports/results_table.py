@@ -1,0 +1,252 @@
+"""Results in engineering units: a table a sensor or mount, each number with sigma, requirement and verdict.
+
+K of a sensor of three axes is shown as scale error, non-orthogonality and misalignment, and its offset as what it reads
+at zero. Sigmas, requirements and priors of these are those of the entries, through the same Jacobian.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alidade.pipelines.diagnostics.observability import Verdict, rejects_many, verdict
+from alidade.pipelines.display.table import Cell, Column, Interval, Row, Table
+from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.methods.triads import TRIADS, parts_of, sensor_model
+from alidade.pipelines.reports.plots import variables
+from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.reports.result_json import truth_errors
+
+_G, _DEG = 9.80665, math.degrees(1.0)
+_SENSORS = {"accel": "Accelerometer", "gyro": "Gyro", "mag": "Magnetometer"}
+_BIAS_UNITS = {"accel": ("mg", 1e3 / _G), "gyro": ("deg/s", _DEG), "mag": ("µT", 1e6)}
+_FACTORS = {"deg": _DEG, "deg/s": _DEG, "deg/h": 3600.0 * _DEG, "ms": 1e3, "%": 100.0, "ppm": 1e6, "µT": 1e6}
+# Scale errors below this are shown in ppm.
+_PPM = 1e-3
+# Share of a sigma that is a step for derivatives.
+_STEP = 0.01
+# A derived number whose sigma is below this share of its requirement is fixed: rounding.
+_NOTHING = 1e-9
+MARKS: dict[str, tuple[str, str]] = {
+    "observable": ("✓", "within the requirement"),
+    "prior": ("◐", "within the requirement by its prior alone"),
+    "weak": ("!", "sigma above the requirement"),
+    "unobservable": ("✕", "not determined by the recording"),
+    "fixed": ("=", "fixed"),
+    "": ("·", "nuisance parameter, no requirement"),
+}
+LEGEND = (
+    "✓ within the requirement · ◐ by its prior alone · ! weak · ✕ not observable · = fixed · σ: one standard deviation "
+    "· required: largest σ allowed · bar: value ± 2σ (dark) in ± 2 required (light)"
+)
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """A number in the unit of its group; `names`: parameters that it is made of."""
+
+    label: str
+    value: float
+    sigma: float
+    require: float | None
+    verdict: Verdict | None
+    error: float | None
+    names: tuple[str, ...]
+    hint: str = ""
+
+    def times(self, factor: float) -> ResultRow:
+        """In another unit."""
+        scaled = {
+            name: None if number is None else factor * number
+            for name, number in vars(self).items()
+            if name in ("value", "sigma", "require", "error")
+        }
+        return replace(self, **scaled)  # type: ignore[arg-type]
+
+    @property
+    def ratio(self) -> float:
+        """Sigma over the requirement; 0 where there is none."""
+        return self.sigma / self.require if self.require else 0.0
+
+
+@dataclass(frozen=True)
+class ResultGroup:
+    """Numbers of one kind and unit; `note` where there are none."""
+
+    title: str
+    unit: str
+    rows: tuple[ResultRow, ...]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class ResultCard:
+    """The numbers of a sensor or a mount."""
+
+    title: str
+    groups: tuple[ResultGroup, ...]
+
+    @property
+    def rows(self) -> list[tuple[ResultGroup, ResultRow]]:
+        """All numbers."""
+        return [(group, row) for group in self.groups for row in group.rows]
+
+
+def result_cards(c: Calibration) -> list[ResultCard]:
+    """The sensors, then what the method declares, then what is left, nuisance parameters only where declared."""
+    triads = [name for name in TRIADS if f"{name}_k11" in c.values]
+    cards = [_triad_card(c, name) for name in triads]
+    shown = {name for card in cards for _, row in card.rows for name in row.names}
+    for title, groups in c.method.cards.items():
+        found = []
+        for group, unit, names in groups:
+            there = [name for name in names if name in c.values and name not in shown]
+            if there:
+                found.append(_group(c, group, unit, there))
+                shown |= set(there)
+        if found:
+            cards.append(ResultCard(title, tuple(found)))
+    others = []
+    for title, _, members in variables(c):
+        left = [q.name for q in members if q.group is None and q.name not in shown]
+        if left:
+            others.append(_group(c, title, "", left))
+    return [*cards, *([ResultCard("Others", tuple(others))] if others else [])]
+
+
+def result_table(card: ResultCard) -> Table:
+    """A card as a table."""
+    columns = (
+        Column(card.title),
+        *("value", "σ", "required"),
+        Column("", "drawing"),
+        Column("", "text"),
+    )
+    return Table(card.title, "", columns, tuple(_rows(card)), style="results", most_rows=None)
+
+
+def matrix_texts(c: Calibration) -> list[str]:
+    """K and b of each sensor of three axes, as text."""
+    found = []
+    for name in TRIADS:
+        if f"{name}_k11" in c.values:
+            K, bias = sensor_model(name, c.values)
+            rows = "\n".join("    [" + ", ".join(f"{x: .9g}" for x in row) + "]," for row in K)
+            b = ", ".join(f"{x: .9g}" for x in -K @ bias)
+            zero = ", ".join(f"{x: .9g}" for x in bias)
+            found.append(
+                f"{name}: nominal = K raw + b = K (raw - bias), SI\nK = [\n{rows}\n]\nb = [{b}]\nbias = [{zero}]"
+            )
+    return found
+
+
+def _rows(card: ResultCard) -> Iterator[Row]:
+    for group in card.groups:
+        yield (Cell(f"{group.title}{f', {group.unit}' if group.unit else ''}", small=group.note),)
+        for row in group.rows:
+            mark, words = MARKS[row.verdict or ""]
+            yield (
+                Cell(row.label, hint=row.hint),
+                to_digits_of(row.value, row.sigma),
+                rounded(row.sigma) if row.sigma > 0.0 else "fixed",
+                "" if not row.require else rounded(row.require),
+                Cell("", interval=Interval(row.sigma, row.require, row.error), tone=row.verdict or ""),
+                Cell(mark, tone=row.verdict or "", hint=f"{row.verdict or 'nuisance'}: {words}"),
+            )
+
+
+def _group(c: Calibration, title: str, unit: str, names: Sequence[str]) -> ResultGroup:
+    quantities = {q.name: q for q in quantities_of(c.problem, c.estimate)}
+    human, factor = human_unit(quantities[names[0]])
+    if unit:
+        human, factor = unit, _FACTORS[unit]
+    errors = truth_errors(c)
+    rows = []
+    for name in names:
+        p = c.parameters[name]
+        error = errors[name].error if name in errors else None
+        row = ResultRow(
+            name.rpartition("_")[2],
+            *(p.value, p.sigma, p.require, p.observability, error, (name,)),
+            hint=f"{name}: {meaning(c.method, name)}",
+        )
+        rows.append(row.times(factor))
+    return ResultGroup(title, human, tuple(rows))
+
+
+def _triad_card(c: Calibration, sensor: str) -> ResultCard:
+    names = [name for name in c.estimate.names if name.startswith((f"{sensor}_k", f"{sensor}_b")) and name[-1] in "123"]
+    symmetric = f"{sensor}_k21" not in names
+    unit = c.quantities[f"{sensor}_k11"].unit
+    plain = unit in ("", "1")
+
+    def parts(values: Array) -> Array:
+        K, bias = sensor_model(sensor, dict(zip(names, values.tolist(), strict=True)))
+        found = parts_of(K)
+        scale = found[:3] - 1.0 if plain else found[:3] / found[:3].mean() - 1.0
+        return np.concatenate([scale, found[3:], bias])
+
+    try:
+        rows = _derived(c, names, parts)
+    except ValueError:  # K is no sensor's
+        return ResultCard(_SENSORS[sensor], (_group(c, "K and b", "", names),))
+    scale = [row.times(100.0) for row in rows[:3]]
+    percent = "%"
+    if plain and max(abs(row.value) + row.sigma for row in scale) < 100.0 * _PPM:
+        scale, percent = [row.times(1e4) for row in scale], "ppm"
+    raw = unit.partition("/")[2]
+    bias_unit, factor = ("counts", 1.0) if raw == "count" else _BIAS_UNITS[sensor]
+    groups = [
+        ResultGroup("Scale error" if plain else "Scale error, relative to their mean", percent, tuple(scale)),
+        ResultGroup("Non-orthogonality", "deg", tuple(row.times(_DEG) for row in rows[3:6])),
+        ResultGroup("Misalignment", "deg", tuple(row.times(_DEG) for row in rows[6:9])),
+        ResultGroup("Bias", bias_unit, tuple(row.times(factor) for row in rows[9:])),
+    ]
+    if symmetric:
+        groups[2] = ResultGroup("Misalignment", "", (), "0 by definition: it defines the body's axes")
+    return ResultCard(_SENSORS[sensor], tuple(groups))
+
+
+_LABELS = (*"xyz", "xy", "xz", "yz", *"xyz", *"xyz")
+
+
+def _derived(c: Calibration, names: Sequence[str], function: Callable[[Array], Array]) -> list[ResultRow]:
+    """Functions of parameters, SI. Raises ValueError where they are not defined."""
+    quantities = [c.quantities[name] for name in names]
+    x, P = np.array([c.values[name] for name in names]), c.covariance_of(names)
+    step = np.where(np.diag(P) > 0.0, _STEP * np.sqrt(np.diag(P)), 0.0)
+    value, J = function(x), np.zeros((len(_LABELS), len(x)))
+    for j in np.flatnonzero(step):
+        h = step[j] * np.eye(len(x))[j]
+        J[:, j] = (function(x + h) - function(x - h)) / (2.0 * step[j])
+    wanted = np.array([q.require if q.judged else 0.0 for q in quantities])
+    prior = np.array([q.scale for q in quantities])
+    sigma, require, scale = (np.sqrt((J**2) @ v**2) for v in (np.zeros(len(x)), wanted, prior))
+    sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, P, J), 0.0))
+    truth = {name: found.value for name, found in truth_errors(c).items()}
+    error = value - function(np.array([truth[n] for n in names])) if truth.keys() >= set(names) else None
+    doubtful = rejects_many(c.findings)
+    rows = []
+    for i, label in enumerate(_LABELS):
+        fixed = sigma[i] <= _NOTHING * require[i]
+        found = verdict(
+            Quantity(label, "", 0.0 if fixed else scale[i], scale[i] or 1.0, require[i] or math.inf), sigma[i]
+        )
+        rows.append(
+            ResultRow(
+                label,
+                float(value[i]),
+                0.0 if fixed else float(sigma[i]),
+                float(require[i]) or None,
+                "weak" if doubtful and found == "observable" else found,
+                None if error is None else float(error[i]),
+                tuple(names),
+                "of K and b: " + ", ".join(n for n, d in zip(names, J[i], strict=True) if d)[:80],
+            )
+        )
+    return rows

@@ -1,0 +1,77 @@
+"""Uncertainty in use of a calibration: bands of the method's uses, from the joint covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from alidade.pipelines.diagnostics.use import Posterior, Truth, UseBands, use_bands
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.methods.formula import Formula, apply
+from alidade.pipelines.reports.result import Calibration, quantities_of
+
+
+class AppliedFormulas:
+    """Formulas with values in them; what is not among them counts as zero."""
+
+    def __init__(self, formulas: Sequence[Formula], values: Mapping[str, float], others: Mapping[str, float]) -> None:
+        self.values = values
+        self._formulas, self._all = formulas, {**others, **values}
+        self._needed = {name for formula in formulas for name in formula.measured}
+        self._first = {"temperature": others["first_temperature"]} if "first_temperature" in others else {}
+
+    def __call__(self, **measured: Array) -> Mapping[str, Array]:
+        """What follows from measurements, at the first temperature."""
+        given = {name: value for name, value in {**measured, **self._first}.items() if name in self._needed}
+        return apply(self._formulas, self._all, given)
+
+
+def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
+    """The bands of all uses of the method; none of a result without a solution."""
+    c = calibration
+    if not c.estimate.converged or not np.isfinite(c.covariance).all():
+        return ()
+    posterior, noise = posterior_of(c), {noise.name: noise.used for noise in c.noises}
+    true = Truth(posterior.names, posterior.x)
+    found = []
+    for use in c.method.uses(true, c.config, noise):
+        with suppress(AttributeError, KeyError):  # its formulas need parameters that this graph has not got
+            found.append(use_bands(use, posterior))
+    return tuple(found)
+
+
+def posterior_of(c: Calibration) -> Posterior:
+    """The estimate with what the formulas apply of it."""
+    quantities, names = quantities_of(c.problem, c.estimate), c.estimate.names
+    others = {**c.problem.constants, **dict.fromkeys((q.name for q in c.problem.quantities), 0.0)}
+    gains = [name for name in names if len(name) > 4 and name[-4:-2] == "_k"]
+    units = {q.name: q for q in quantities}
+    plain = all(units[name].unit in ("", "1") for name in gains)
+    nominal = {
+        q.name: (float(q.name[-1] == q.name[-2]) if q.name in gains else 0.0) if plain else q.prior_mean
+        for q in quantities
+        if q.group is None
+    }
+
+    def formulas(known: Sequence[str], values: Mapping[str, float]) -> AppliedFormulas:
+        kept = {name: values[name] for name in known if name in values}
+        return AppliedFormulas(c.method.formulas(list(known), c.config), kept, others)
+
+    everything = [q.name for q in c.problem.quantities]
+    truth = None
+    if c.truth is not None:
+        known = {name: value for name, value in c.truth.items() if isinstance(value, int | float)}
+        truth = np.array([known.get(name, value) for name, value in c.values.items()], dtype=float)
+    require = [q.require if q.judged and np.isfinite(q.require) else 0.0 for q in quantities]
+    return Posterior(
+        names=names,
+        x=c.estimate.values,
+        P=c.covariance,
+        require=np.array(require),
+        applied=formulas(c.applied, c.values),
+        nominal=formulas(c.applied, nominal),
+        whole=formulas(everything, c.values),
+        truth=truth,
+    )

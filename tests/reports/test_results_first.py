@@ -1,0 +1,128 @@
+"""The report's first page: verdict, what the calibration is good for, results in engineering units."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import alidade
+from alidade.pipelines.display.figure import Figure
+from alidade.pipelines.display.svg import interval_bar, svg, ticks
+from alidade.pipelines.display.table import Interval
+from alidade.pipelines.methods.triads import parts_of, sensor_model
+from alidade.pipelines.reports.calibration_report import calibration_report, report_html
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.results_table import result_cards
+from tests.support.browser import DESKTOP, PHONE, needs_browser, running
+from tests.support.pages import Page
+
+# Open content, px, that a report may have at both widths.
+MAX_HEIGHT = 6000
+SCENARIOS: dict[str, object] = {"tumble": None, "head": "head_mounts", "los": None, "cube": None, "indexer": None}
+CASES = [pytest.param(name, marks=[pytest.mark.slow] * (name != "tumble")) for name in SCENARIOS]
+
+
+@cache
+def calibrated(name: str) -> Calibration:
+    return alidade.calibrate(alidade.simulate(name, SCENARIOS[name], seed=1))  # type: ignore[arg-type]
+
+
+@needs_browser
+@pytest.mark.parametrize("name", CASES)
+def test_open_content_is_short_and_does_not_scroll_sideways(name: str, tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text(report_html(calibrated(name)), encoding="utf-8")
+    tab = running()
+    for width in (DESKTOP, PHONE):
+        tab.complaints.clear()
+        tab.size(width)
+        tab.screen()
+        tab.open((tmp_path / "page.html").as_uri())
+        tab.wait("document.readyState == 'complete'")
+        assert tab.value("document.documentElement.scrollHeight") <= MAX_HEIGHT
+        assert tab.value("document.documentElement.scrollWidth") <= width
+        assert not tab.complaints
+        first = "document.querySelector('#results').getBoundingClientRect().top + scrollY"
+        assert tab.value(first) < (500 if width == DESKTOP else 900)
+
+
+def test_sections_come_in_the_order_in_which_they_are_asked_for() -> None:
+    report = calibration_report(calibrated("tumble"))
+    titles = [section.title for section in report.sections if section.blocks and section.title]
+    assert titles == ["Results", "Uncertainty in use", "Frames", "Apply", "Diagnostics", "Details"]
+    page = Page(report_html(calibrated("tumble")))
+    first = ["All 9 required parameters", "heading, any direction", "Scale error, %"]
+    order = [*first, "In plain words", "Parameters parameter value"]
+    assert sorted(order, key=page.text.index) == order
+    assert report.summary is not None
+    assert len(report.summary.next_steps) == 1
+
+
+def test_the_verdict_is_one_sentence_whatever_fails() -> None:
+    """A cube of three poses once had eleven lines of names."""
+    few = alidade.calibrate(alidade.simulate("cube", {"poses": 3}, seed=1))
+    summary = calibration_report(few).summary
+    assert summary is not None
+    assert few.status == "unobservable"
+    assert summary.text.startswith("The recording does not determine this calibration: ")
+    assert len(summary.text) < 200
+    assert len(summary.next_steps) == 1
+    assert summary.next_steps[0].startswith("What to do: ")
+
+
+def test_scale_angles_and_bias_have_the_sigmas_of_draws() -> None:
+    c = calibrated("tumble")
+    (card, *_) = result_cards(c)
+    assert [group.title for group in card.groups] == ["Scale error", "Non-orthogonality", "Misalignment", "Bias"]
+    names = list(c.values)
+    draws = np.random.default_rng(0).multivariate_normal(c.estimate.values, c.covariance, 4000)
+    parts = []
+    for draw in draws:
+        K, bias = sensor_model("mag", dict(zip(names, draw.tolist(), strict=True)))
+        found = parts_of(K)
+        parts.append([*(100.0 * (found[:3] - 1.0)), *np.rad2deg(found[3:6]), *(1e6 * bias)])
+    rows = [row for _, row in card.rows]
+    np.testing.assert_allclose([row.value for row in rows], np.mean(parts, axis=0), rtol=1e-2, atol=2e-3)
+    np.testing.assert_allclose([row.sigma for row in rows], np.std(parts, axis=0), rtol=0.05)
+    assert all(row.verdict == "observable" for row in rows)
+    assert all(abs(row.error or 0.0) < 4.0 * row.sigma for row in rows)
+
+
+def test_figures_of_a_use_are_drawn_in_a_notebook() -> None:
+    c = calibrated("tumble")
+    page = c.plot("heading")
+    assert page.html.count('<svg class="curve"') == 2
+    assert "<iframe" in page._repr_html_()
+    assert 'id="bokeh"' not in page.html
+    assert "Correlation of the parameters" in c.plot("Correlation of the parameters").html
+    with pytest.raises(alidade.InputError, match="no plot 'headin'; there are heading, "):
+        c.plot("headin")
+
+
+def test_small_figures_have_round_ticks_and_begin_at_zero() -> None:
+    out = Figure("error, deg", "heading, deg", 236)
+    out.line(np.arange(0.0, 361.0), np.full(361, 0.07), "level", "x", "dashed")
+    out.band(np.arange(0.0, 361.0), np.zeros(361), np.full(361, 0.07), "x", "level")
+    text = svg(out)
+    assert all(f">{number}</text>" in text for number in ("0", "90", "180", "270", "360", "0.02"))
+    assert "var(--x)" in text
+    assert [text for _, text in ticks(-0.3, 0.3, 4)] == ["−0.2", "0", "0.2"]
+
+
+@pytest.mark.parametrize(
+    ("interval", "parts"),
+    [
+        (Interval(0.1, 1.0), ("track", "bar")),
+        (Interval(5.0, 1.0), ("track", "bar", "over")),
+        (Interval(0.1), ("none", "bar")),
+        (Interval(0.1, 1.0, 0.2), ("track", "bar", "truth")),
+        (Interval(0.0, 1.0), ()),
+    ],
+)
+def test_an_interval_shows_sigma_requirement_and_truth(interval: Interval, parts: tuple[str, ...]) -> None:
+    text = interval_bar(interval)
+    assert [part for part in ("track", "none", "bar", "over", "truth") if f'class="{part}"' in text] == sorted(
+        parts, key=("track", "none", "bar", "over", "truth").index
+    )
