@@ -21,7 +21,7 @@ from alidade.factors import so3
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Arrays, Session
 from alidade.pipelines.config import load_config
-from alidade.pipelines.methods.head.trajectory import helmet_gyro
+from alidade.pipelines.methods.head.report import helmet_gyro
 from alidade.pipelines.reports.result import Calibration
 from datasets.broad import Trial, marker_attitudes, read_trial, score, to_session
 

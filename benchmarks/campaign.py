@@ -77,7 +77,7 @@ def worker_costs(method: str, count: int, folder: Path, address: str) -> tuple[A
     costs = []
     for seed in range(count + 1):
         path = folder / f"{method}{seed}.mcap"
-        methods.simulate(method, methods.method(method).nominal(), seed, path)
+        methods.simulate(method, methods.method(method).default_scenario(), seed, path)
         fsspec.filesystem("s3").put_file(str(path), f"{address}/{path.name}")
         (remote,) = find([f"{address}/{path.name}"]).values()
         (here,) = find([str(path)]).values()

@@ -22,7 +22,7 @@ import numpy as np
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import kind
+from alidade.pipelines.estimation.parameters import kind
 
 NOTHING = "nothing"
 SIZES = (0.3, 1.0, 3.0, 6.0, 10.0)

@@ -21,7 +21,7 @@ from alidade.factors.model import Model
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers.engines import Compiled

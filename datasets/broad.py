@@ -22,7 +22,7 @@ from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes
 from alidade.pipelines.methods.head.recording import HeadData, write_head
-from alidade.pipelines.methods.head.trajectory import carried, helmet_gyro
+from alidade.pipelines.methods.head.report import carried, helmet_gyro
 
 Array = NDArray[np.float64]
 

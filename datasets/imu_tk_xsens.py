@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.data import CubeData
-from alidade.pipelines.methods.cube.writing import write_cube
+from alidade.pipelines.methods.cube.recording import CubeData, write_cube
 
 Array = NDArray[np.float64]
 

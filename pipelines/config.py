@@ -8,7 +8,7 @@ Everything wrong in a config is an InputError that names the key and the source 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,7 +18,18 @@ from pydantic import BaseModel, ValidationError, create_model
 from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
-from alidade.pipelines.settings import ATTACHMENT, Config
+from alidade.pipelines.methods import Method
+from alidade.pipelines.settings import (
+    ATTACHMENT,
+    Config,
+    Noise,
+    NoiseOrZero,
+    Section,
+    Sensors,
+    Sheet,
+    SigmaOrZero,
+    sensor_sheets,
+)
 
 if TYPE_CHECKING:
     from alidade.pipelines.recording.recording import Recording
@@ -65,12 +76,36 @@ def first_error(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
 
 @cache
 def model() -> type[Config]:
-    """The config with the sections of all methods there are."""
+    """The config with sections, noises and figures of data sheets of all methods there are."""
     names = methods.names()
-    sections = [section for name in names if (section := methods.method(name).section) is not None]
+    declared = [methods.method(name) for name in names]
+    sections = [each.config_section for each in declared if each.config_section is not None]
     fields: dict[str, Any] = {section.key: (section, section()) for section in sections}
     fields["method"] = (Literal[names] | None, None)
+    own: dict[str, Any] = {spec.name: (NoiseOrZero | None, None) for each in declared for spec in each.noise}
+    fields["noise"] = _with_default(
+        create_model("Noise", __base__=Noise, __doc__=Noise.__doc__, **own) if own else Noise
+    )
+    sensors = _sensors(declared)
+    fields["sensors"] = (sensor_sheets(sensors), sensors())
     return create_model("Config", __base__=Config, __doc__=Config.__doc__, **fields)
+
+
+def _with_default(section: type[Section]) -> tuple[type[Section], Section]:
+    return section, section()
+
+
+def _sensors(declared: Sequence[Method]) -> type[Sensors]:
+    """Data sheets with the figures of the methods that are not among the common ones."""
+    known, more = Sensors(), dict[str, Any]()
+    for name in {name for each in declared for name in each.data_sheets}:
+        sheet: Sheet = getattr(known, name, Sheet())
+        base = type(sheet)
+        figures = {figure for each in declared for figure in each.data_sheets.get(name, ())} - base.model_fields.keys()
+        if figures:
+            own: dict[str, Any] = dict.fromkeys(sorted(figures), (SigmaOrZero | None, None))
+            more[name] = _with_default(create_model(f"{name.capitalize()}Sheet", __base__=base, **own))
+    return create_model("Sensors", __base__=Sensors, __doc__=Sensors.__doc__, **more) if more else Sensors
 
 
 def _read(data: bytes, where: str) -> dict[Any, Any]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Collection, Iterable
-from typing import Annotated, ClassVar, Literal, TypeVar
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -27,6 +28,7 @@ from pydantic import Tag as Case
 
 from alidade.pipelines.belief import Belief, independent
 from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.noises import NOISES
 from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.recording.table_topics import TableTopic
 from alidade.pipelines.recording.topics import Topic
@@ -112,24 +114,7 @@ class Noise(Section):
 
 
 # Where neither the config nor a message says anything.
-DEFAULT_NOISE = Noise(
-    gyro_density=5.0e-5,
-    gyro_rate_noise=5.0e-5,
-    gyro_bias_walk=1.0e-6,
-    gyro_scale=0.0,
-    platform_gyro_density=1.0e-5,
-    accel_density=2.0e-3,
-    mag_density=5.0e-8,
-    los_error=2.0e-5,
-    los_roll=2.0e-4,
-    encoder=1.0e-5,
-    vision_attitude=8.7e-3,
-    corner_px=0.3,
-    gyro_repeatability=2.0e-5,
-    turn_repeatability=1.0e-3,
-    accel_repeatability=5.0e-4,
-    mag_repeatability=2.0e-8,
-)
+DEFAULT_NOISE = Noise.model_validate({name: spec.default for name, spec in NOISES.items() if spec.default is not None})
 
 
 class Sheet(Section):
@@ -236,17 +221,22 @@ class Sensors(Section):
     target: TargetSheet = TargetSheet()
 
 
-def _ideal(value: object) -> object:
+def _ideal(kind: type[Sensors], value: object) -> object:
     """`ideal` written out: all figures 0, but for the field, which is no sensor."""
     if value == "ideal":
-        sheets = {name: type(sheet).model_fields for name, sheet in Sensors() if name != "field"}
+        sheets = {name: type(sheet).model_fields for name, sheet in kind() if name != "field"}
         return {name: dict.fromkeys(figures, 0.0) for name, figures in sheets.items()}
     if isinstance(value, str):
         raise ValueError(f"must be data sheets by sensor, or ideal, not {value!r}")
     return value
 
 
-SensorSheets = Annotated[Sensors, BeforeValidator(_ideal)]
+def sensor_sheets(kind: type[Sensors]) -> Any:
+    """Type of a config's data sheets: by sensor, or `ideal`."""
+    return Annotated[kind, BeforeValidator(partial(_ideal, kind))]
+
+
+SensorSheets = Annotated[Sensors, BeforeValidator(partial(_ideal, Sensors))]
 
 
 class Vision(Section):

@@ -39,9 +39,8 @@ import alidade
 from alidade.pipelines import methods
 from alidade.pipelines.applications import cli
 from alidade.pipelines.config import load_config, model
-from alidade.pipelines.estimation.assumptions import Assumption
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.methods.meanings import NOISES, meaning
+from alidade.pipelines.noises import NOISES
 from alidade.pipelines.recording.topics import Topic
 from alidade.pipelines.reports.result_json import Result
 from alidade.pipelines.settings import DEFAULT_NOISE, Noise, Sensors
@@ -107,7 +106,7 @@ def noise() -> Iterator[str]:
     units = _meanings(Noise)
     yield from ("| key | unit | default | noise of |", "| --- | --- | --- | --- |")
     for key, default in DEFAULT_NOISE.model_dump().items():
-        meaning = NOISES.get(key, "").removesuffix(".")
+        meaning = NOISES[key].description.removesuffix(".")
         yield f"| `{key}` | {_cell(units[key])} | {default:g} | {meaning} |"
 
 
@@ -124,7 +123,7 @@ def parameters(name: str) -> Iterator[str]:
         prior = f"{first.prior_scale:.2g}" + (f" (`{sheet}`)" if sheet else "")
         require = f"{first.require:.2g}" if first.judged else ""
         unit = first.unit or "1"
-        yield f"| {names} | {_cell(meaning(method, first.name))} | {unit} | {prior} | {require} |"
+        yield f"| {names} | {_cell(method.describe(first.name))} | {unit} | {prior} | {require} |"
 
 
 def _quantities(method: methods.Method) -> list[Quantity]:
@@ -214,30 +213,9 @@ def data_sheets() -> Iterator[str]:
 
 def default_sigmas(figure: str) -> dict[str, float]:
     """Method -> default of a figure of a data sheet, in the methods that use it."""
-    sensor, _, name = figure.partition(".")
-    users = [each for each in methods.names() if name in methods.method(each).sheets.get(sensor, ())]
-    return {each: assumption.sigma for each in users for assumption in _assumptions(each) if _is(assumption, figure)}
+    specs = {name: methods.method(name).parameters for name in methods.names()}
+    return {name: spec.prior for name, own in specs.items() for spec in own if spec.data_sheet == figure}
 
-
-def _is(assumption: Assumption, figure: str) -> bool:
-    return f"{assumption.sheet}.{assumption.figure}" == figure
-
-
-def _assumptions(name: str) -> list[Assumption]:
-    """What a method's modules declare of its nuisance parameters."""
-    modules = [import_module(f"alidade.pipelines.methods.{part}") for part in (*_DECLARED[name], "place")]
-    values = [value for module in modules for value in vars(module).values()]
-    flat = [part for value in values for part in (value if isinstance(value, tuple) else (value,))]
-    return [each for each in flat if isinstance(each, Assumption)]
-
-
-_DECLARED = {
-    "los": ("los.parameters",),
-    "indexer": ("indexer.parameters",),
-    "head": ("head.parameters",),
-    "cube": ("cube.parameters",),
-    "tumble": ("tumble.turning", "tumble.recording"),
-}
 
 # Name of a directive -> the function that writes its Markdown; what stands behind the name is its argument.
 GENERATED: dict[str, Callable[..., Iterator[str]]] = {

@@ -443,7 +443,7 @@ def _checked(method: Method, data: Any) -> Any:
         InputError: an array is none of numbers or has rows of another shape than its class says, stamps are not in s
             or cannot be sorted as those of a file are, or what they stamp is not as long as they are, or not finite.
     """
-    streams = method.hypotheses().streams
+    streams = method.faults.streams
     # Stamps and what they stamp are arrays, whatever annotations say.
     rows = {name: Rows() for stamps, carried in streams.items() for name in (stamps, *carried)}
     rows |= rows_by_name(method.data)
@@ -484,7 +484,7 @@ def _checked(method: Method, data: Any) -> Any:
         check_time_unit(f"arrays: {stamps}", t_ns, SLOWEST_GYRO_S if has_gyro else SLOWEST_S)
         for name in names:
             # Those of a method that takes counts are looked at with their conversion.
-            if "gyro" in name and "raw" not in getattr(method.section, "model_fields", {}):
+            if "gyro" in name and "raw" not in getattr(method.config_section, "model_fields", {}):
                 with _of_arrays():
                     check_gyro(name, arrays[stamps], arrays[name])
     if dropped:

@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from alidade.pipelines.applications import exit_codes
+from alidade.pipelines.applications.cube_commands import cube_layout, cube_print
 from alidade.pipelines.applications.options import ConfigFile, Json, Quiet, RecordingPath, RecordingPaths
 from alidade.pipelines.solvers.window import parse_window
 
@@ -30,14 +31,14 @@ if TYPE_CHECKING:
 _TROUBLE = {"InputError": exit_codes.BAD_INPUT, "IndeterminateError": exit_codes.UNDETERMINED}
 
 
-class _WithMethods(TyperGroup):
-    """The commands below and those that methods bring: methods take long to import, and are asked last."""
+class _WithPlugins(TyperGroup):
+    """The commands below and those of other distributions."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*super().list_commands(ctx), *_of_methods()]
+        return [*super().list_commands(ctx), *_of_plugins()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        return super().get_command(ctx, cmd_name) or _of_methods().get(cmd_name)
+        return super().get_command(ctx, cmd_name) or _of_plugins().get(cmd_name)
 
     def get_params(self, ctx: Any) -> Any:
         """Flags all of them: those of typer default to None, and typer imports pydantic to check that; not False."""
@@ -48,24 +49,18 @@ class _WithMethods(TyperGroup):
 
 
 @cache
-def _of_methods() -> Mapping[str, Any]:
-    import logging
-
+def _of_plugins() -> Mapping[str, Any]:
     from alidade.pipelines import methods
 
     own = typer.Typer(rich_markup_mode=None)
     own.callback()(lambda: None)
-    for name in methods.names():
-        try:
-            for word, command in methods.method(name).commands.items():
-                own.command(word)(command)
-        except Exception as error:
-            logging.getLogger("alidade").warning("method %s: its commands cannot be loaded: %s", name, error)
+    for word, command in methods.commands().items():
+        own.command(word)(command)
     return typer.main.get_group(own).commands
 
 
 app = typer.Typer(
-    cls=_WithMethods,
+    cls=_WithPlugins,
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
@@ -703,6 +698,10 @@ def certificate(
     terminal.say(f"Wrote {', '.join(map(str, written))}")
     if missing:
         terminal.say(f"not stated: {', '.join(missing)}")
+
+
+app.command("cube-layout")(cube_layout)
+app.command("cube-print")(cube_print)
 
 
 def _beside(session: Path, what: str) -> Path:

@@ -63,7 +63,7 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
     found = []
     pairings: dict[tuple[str, str], Pairing | None] = {}
     for name in methods.names() if only is None else only:
-        if lacking(methods.method(name).needs, recording, config):
+        if lacking(methods.method(name).requirements, recording, config):
             made = _suggestion(name, recording, config, pairings)
             if made.topics and made.missing and config.method is None:
                 by_name = _suggestion(name, recording, config.model_copy(update={"method": name}), pairings)
@@ -81,7 +81,7 @@ def with_suggested(recording: Recording, config: Config, method: str | None = No
     """
     asked = method or config.method
     config = config.model_copy(update={"method": asked}) if asked else config
-    served = [name for name in methods.names() if not lacking(methods.method(name).needs, recording, config)]
+    served = [name for name in methods.names() if not lacking(methods.method(name).requirements, recording, config)]
     if asked in served or (asked is None and served):
         return recording, config
     # Through a copy, for the search reads topics that may not be used.
@@ -157,7 +157,7 @@ def _suggestion(
     method: str, recording: Recording, config: Config, pairings: dict[tuple[str, str], Pairing | None]
 ) -> Suggestion:
     chosen = methods.method(method)
-    needed = [one for need in chosen.needs for group in need for one in group if not isinstance(one, Setting)]
+    needed = [one for need in chosen.requirements for group in need for one in group if not isinstance(one, Setting)]
     taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
     topics: dict[str, TopicSource] = {}
     reasons: list[str] = []
@@ -191,7 +191,7 @@ def _suggestion(
             topics[topic.key] = TopicSource(topic=named)
             reasons.append(f"{named} ({_short(recording, named)}) proposed as {topic.key}")
     more = config.model_copy(update={"topics": {**config.topics, **topics}})
-    missing = lacking(chosen.needs, recording.with_config(more.topics.values()), more)
+    missing = lacking(chosen.requirements, recording.with_config(more.topics.values()), more)
     return Suggestion(method, topics, tuple(reasons), missing)
 
 

@@ -31,10 +31,10 @@ from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import kind
 from alidade.pipelines.estimation.believing import believing
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameters import kind
 from alidade.pipelines.estimation.problem import (
     Array,
     ChiSquare,

@@ -186,7 +186,9 @@ def predict(
         InputError: the recording would be unusable.
     """
     made = {} if made is None else made
-    drawn = range(_DRAWS if methods.method(method_name).drawn else 1) if seeds is None else seeds
+    drawn = (
+        range(_DRAWS if methods.method(method_name).require_simulator().randomised else 1) if seeds is None else seeds
+    )
     for seed in drawn:
         if (repr(scenario), seed) not in made:
             made[repr(scenario), seed] = _predicted(method_name, scenario, config_file, require, seed)
@@ -256,7 +258,7 @@ def _candidates(
     """Each possible change with what it would bring to the worst draw; those that cannot be recorded are left out."""
     seeds = (before.worst,)
     now = predict(method.name, before.scenario, config_file, require, seeds, made)
-    for change, scenario in method.candidates(before.scenario):
+    for change, scenario in method.guidance.variations(before.scenario):
         try:
             after = predict(method.name, scenario, config_file, require, seeds, made)
         except InputError:

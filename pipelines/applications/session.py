@@ -168,7 +168,7 @@ class Arrays:
 
     def facts(self, _: Config) -> SessionFacts:
         """Length of the data; there are no topics."""
-        start, stop = self.method.hypotheses().span(self.data)
+        start, stop = self.method.faults.span(self.data)
         return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
 
     def truth(self) -> dict[str, object] | None:
@@ -217,7 +217,7 @@ class Session:
         try:
             data = chosen.read(recording, config)
         except InputError as error:
-            if not lacking(chosen.needs, recording, config):
+            if not lacking(chosen.requirements, recording, config):
                 raise
             nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))
             raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
@@ -354,7 +354,7 @@ class Session:
             stable, change = self._change(estimate, quantities)
             if change is not None and change.kind == "change" and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
-            tables = self.method.findings(self.data, self.config, estimate) if report else {}
+            tables = self.method.report.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(problem, estimate)
             found.append(
                 Calibration(
@@ -375,7 +375,7 @@ class Session:
                     config=self.config,
                     truth=truth,
                     seconds=seconds,
-                    plots=partial(self.method.figures, self.data),
+                    plots=partial(self.method.report.figures, self.data),
                     beside=published if estimate.solver == "incremental" else None,
                     stability=stable,
                     solver_difference=difference,
@@ -394,7 +394,7 @@ class Session:
     @property
     def faults(self) -> FaultModel:
         """What can be wrong with the data."""
-        return self.method.hypotheses()
+        return self.method.faults
 
     def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float], str]:
         """Parameters of either half of the recording, held-out residuals by family, and what the time limit stopped."""
@@ -511,7 +511,7 @@ class Session:
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each fixed input of the graph, and the graph with that input off by its step."""
-        for exact in self.method.hypotheses().exact:
+        for exact in self.method.faults.exact:
             if deadline.passed(_SENSITIVITY):
                 return
             changed = exact.changed(self.data, self.config, exact.step)
@@ -579,7 +579,7 @@ def calibrate(
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
     """Facts about all topics of a recording, and what it lacks for each method."""
-    return facts_of(recording, config, {name: methods.method(name).needs for name in methods.names()})
+    return facts_of(recording, config, {name: methods.method(name).requirements for name in methods.names()})
 
 
 def checked_facts(recording: Recording, config: Config) -> SessionFacts:
@@ -619,7 +619,7 @@ def _refused(method: Method, recording: Recording, config: Config) -> str:
 
 def missing_for(name: str, recording: Recording, config: Config) -> tuple[str, ...]:
     """What a recording with this config lacks for a method, one phrase each; nothing if it can serve it."""
-    return lacking(methods.method(name).needs, recording, config)
+    return lacking(methods.method(name).requirements, recording, config)
 
 
 def resolve_method(option: str | None, recording: Recording, config: Config) -> str:
@@ -631,7 +631,7 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         return methods.method(option).name
     if config.method:
         return config.method
-    able = methods.without_yielding([name for name in methods.names() if not missing_for(name, recording, config)])
+    able = methods.prefer_specific([name for name in methods.names() if not missing_for(name, recording, config)])
     if len(able) == 1:
         return able[0]
     if able:
@@ -679,12 +679,12 @@ def _check_sheets(method: Method, config: Config) -> None:
 def _check_figures(method: Method, config: Config) -> None:
     """Raise InputError when a figure is stated that the method has no use for: it would be ignored in silence."""
     for name in sorted(config.sensors.model_fields_set):
-        sheet, figures = getattr(config.sensors, name), method.sheets.get(name, ())
+        sheet, figures = getattr(config.sensors, name), method.data_sheets.get(name, [])
         useless = [each for each in sorted(sheet.model_fields_set - {*figures}) if getattr(sheet, each) != 0.0]
         if not useless:
             continue
         where = f"sensors.{name}.{useless[0]}" if figures else f"sensors.{name}"
-        used = [f"sensors.{name}.{each}" for each in figures] or [f"sensors.{each}" for each in method.sheets]
+        used = [f"sensors.{name}.{each}" for each in figures] or [f"sensors.{each}" for each in method.data_sheets]
         useful = ", ".join(used) or "no data sheet"
         raise InputError(f"{where}: method {method.name} has no use for it; it uses {useful}")
 

@@ -23,11 +23,6 @@ from alidade.pipelines.settings import Config
 DAY_S = 86_400.0
 
 
-def of_recording(method: Method, name: str) -> bool:
-    """Whether a parameter belongs to a recording, as the method says."""
-    return any(fnmatchcase(name, pattern) for pattern in method.of_recording)
-
-
 def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, float]:
     """Parameter of the device -> how far it walks in the root of a day, SI; 0: not at all, or as far as several
     recordings say. Those of recordings are not among them.
@@ -40,7 +35,7 @@ def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, flo
             raise InputError(f"unknown key share.{pattern}{nearest(pattern, names)}")
     rates = {}
     for name in names:
-        share = _share(config, name) or ("recording" if of_recording(method, name) else "device")
+        share = _share(config, name) or ("recording" if method.is_per_recording(name) else "device")
         if share != "recording":
             rates[name] = 0.0 if isinstance(share, str) else share
     return rates

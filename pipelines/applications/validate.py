@@ -116,7 +116,7 @@ def validate(
     chosen = method(name)
     data = chosen.read(recording, config)
     values = calibration.values
-    validations = chosen.validate(data, config, values)
+    validations = chosen.report.validate(data, config, values)
     if known.sha256 == recording.sha256():
         return Validated(calibration, path.name, validations, True, recording.notes)
     session = Session(chosen, data, config, Recorded(recording))
@@ -127,7 +127,7 @@ def validate(
         return Validated(calibration, path.name, validations, False, lost)
     of_device = walks(chosen, config, [name for name in own if name in calibration.parameters])
     mixed = {**own, **{name: value for name, value in values.items() if name in of_device}}
-    device, best = (chosen.validate(data, config, each) for each in (mixed, own))
+    device, best = (chosen.report.validate(data, config, each) for each in (mixed, own))
     return Validated(calibration, path.name, validations, False, lost, held, device, best)
 
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
-from alidade.pipelines.estimation.assumptions import pull
 from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.parameters import pull
 from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, StepEstimate, Told
 
 # A recording in which nothing changed is taken for one in which something did so often.

@@ -22,7 +22,7 @@ import numpy as np
 
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.belief import Belief
-from alidade.pipelines.estimation.assumptions import kind
+from alidade.pipelines.estimation.parameters import kind
 from alidade.pipelines.estimation.problem import Array, Quantity, Told
 from alidade.pipelines.solvers.joint import Joined, join
 from alidade.pipelines.solvers.posterior import told_of

@@ -11,9 +11,9 @@ import numpy as np
 from alidade.pipelines.diagnostics.error_budget import dominant_priors
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import Advise, weak_directions
-from alidade.pipelines.estimation.assumptions import pull as prior_z_score
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameters import pull as prior_z_score
 from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 

@@ -1,6 +1,6 @@
 """Hypotheses on why residuals do not fit: faults of the data, each tested by solving again with that fault corrected.
 
-    find_hypotheses(method.graph, method.hypotheses(), data, config, estimate)
+    find_hypotheses(method.graph, method.faults, data, config, estimate)
 
 A hypothesis counts when the recording fits with it, or fits far better. Noise is offered where it is stated as known
 exactly and nothing else fits: noise large enough fits anything.

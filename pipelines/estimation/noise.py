@@ -7,28 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from alidade.pipelines.noises import NOISES, NoiseSpec
+
 Source = Literal["config", "message", "default"]
 
-UNITS = {
-    "gyro_density": "rad/s/√Hz",
-    "gyro_rate_noise": "1/√Hz",
-    "gyro_bias_walk": "rad/s/√s",
-    "platform_gyro_density": "rad/s/√Hz",
-    "accel_density": "m/s²/√Hz",
-    "mag_density": "T/√Hz",
-    "los_error": "rad",
-    "los_roll": "rad",
-    "encoder": "rad",
-    "gyro_repeatability": "rad/s",
-    "turn_repeatability": "",
-    "accel_repeatability": "m/s²",
-    "mag_repeatability": "T",
-    "turn_rate": "rad/s",
-    "move_rate": "rad/s",
-    "dwell_rate": "rad/s",
-    "vision_attitude": "rad",
-    "corner_px": "px",
-}
 
 # How well a noise is known, one sigma in its logarithm, that a message states or nobody. What the config states counts
 # as known no better once the recording contradicts it by so many sigmas.
@@ -50,6 +32,7 @@ class Noise:
             samples shows in few of them alike.
         beside: whether it is there beside the noise that its factors are whitened by, which say as `beside` how much
             of it they have: what means of many samples repeat to is more than white noise over their duration.
+        own: declaration of a noise that only one method has.
     """
 
     name: str
@@ -60,11 +43,17 @@ class Noise:
     rows: tuple[int, ...] | None = None
     least: float = 0.0
     beside: bool = False
+    own: NoiseSpec | None = None
+
+    @property
+    def spec(self) -> NoiseSpec:
+        """Its declaration."""
+        return self.own or NOISES.get(self.name) or NoiseSpec(self.name, "", "")
 
     @property
     def unit(self) -> str:
-        """SI, or pixels; of a noise that other distributions name, none."""
-        return UNITS.get(self.name, "")
+        """SI, or pixels."""
+        return self.spec.unit
 
     @property
     def estimated(self) -> bool:

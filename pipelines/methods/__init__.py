@@ -1,22 +1,23 @@
-"""Methods: what the rest of the toolkit may ask of one, and which there are.
+"""Calibration methods: what the toolkit asks of one, and which are installed.
 
-    method("head").simulate("head_nominal", seed=1).data      # arrays
-    names()                                                   # ("los", "indexer", "head", "cube", "tumble", ...)
+    method("head").problem(data, config)     # the factor graph
+    names()                                  # ("los", "indexer", "head", "cube", "tumble", ...)
 
-A method is an object of a class derived from `Method`. Those of the toolkit stand in folders beside this file; other
-distributions bring theirs as entry points of the group `alidade.methods`, name = the method's, value = the class.
+A method is a `Method`: nine required fields, defaults for the rest. Built-in methods are packages beside this file;
+other distributions register theirs as entry points of the group `alidade.methods`, name = "module:METHOD", and commands
+of their own as entry points of the group `alidade.commands`, word = "module:function".
 """
 
 from __future__ import annotations
 
 import logging
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from functools import cache
+from dataclasses import dataclass, field
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from alidade.pipelines.errors import InputError, nearest_three
 
@@ -29,210 +30,233 @@ if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.use import Truth, Use
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.display.table import Table
+    from alidade.pipelines.estimation.parameters import ParameterSpec
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.noises import NoiseSpec
     from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
-    from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config, MethodSection
     from alidade.pipelines.simulation.simulated import Simulated
 
-GROUP = "alidade.methods"
+GROUP, COMMANDS = "alidade.methods", "alidade.commands"
 _log = logging.getLogger("alidade")
 
-# A motion as a simulator's settings, plain values by key.
+# Settings of a simulator, plain values by key.
 Scenario = dict[str, Any]
 
 
-class Method(ABC):
-    """One method of calibration; `Any` stands for its data, a frozen dataclass of arrays that only it knows.
+def _not_offered(*_: Any) -> Any:
+    raise InputError("the method does not offer this")
 
-    Modules that take long to import, numpy and pydantic among them, are imported by the functions that need them: the
-    help asks all methods for their commands, and every command asks them for the attributes below.
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """One calibration method; `Any` stands for its data, whose class only the method knows.
 
     Attributes:
-        name: as in configs and on the command line.
-        title: what people call it.
-        sheets: the data sheets it uses, as under `sensors` in the config -> their figures.
-        of_recording: patterns of the parameters that belong to a recording; the others are the device's.
-        rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
-        meanings: pattern of parameters' names -> what they are, a sentence with {0}, {1} for the pattern's groups; what
-            `alidade.pipelines.methods.meanings` says of all methods need not stand there.
-        components: family of measurements -> what its residuals are, one by one, where they are not x, y and z.
-        cards: of the report's results: title -> groups of numbers, each with its title, the unit (empty: the usual one)
-            and the parameters; what no card has stands in a last one.
-        sketch: picture of the frames, SVG, if there is one; `alidade.pipelines.reports.sketch` says what it may have.
-        scenarios: folder with scenarios that come with the method, if it brings its own.
-        drawn: whether its simulator draws motions, or sensors far from nominal, from the seed, so that one recording of
-            a scenario determines more than another.
-        yields: whether it is chosen by itself only where no other method is served: it makes do with what others read
-            too.
+        name, title: as in the config and on the command line; as shown to people.
+        data: frozen dataclass of arrays with epoch_ns, Unix ns, the zero of all times; field names are public API. Its
+            annotations state the shape of a row (`alidade.pipelines.recording.shapes`) and are evaluated: the names in
+            them are imported at run time.
+        topics: every topic that is read, the optional ones included.
+        requirements: what a recording must contain.
+        read: recording, config -> data. Raises InputError when the recording cannot be used.
+        check: raises InputError where the sensors of arrays contradict one another, as `read` does of a recording.
+        write_data: file, data, truth, config (YAML), pictures -> recording; pictures replace what they show. Raises
+            InputError.
+        problem: data, config -> factor graph. Raises InputError when the data do not suffice, or when the config names
+            an unknown parameter.
+        faults: what can be wrong with the data; tried when residuals do not fit.
+        config_section: pydantic model of the method's own config section.
+        noise: noises under `noise` in the config that only this method has.
+        published: data, config, problem -> estimate by the published solver. Raises InputError where it does not apply.
+        proposed: recording, config -> config keys that the recording suggests, each with the reason.
+        parameters: unit, default prior, accuracy wanted, data sheet and description of every parameter.
+        simulator, guidance, report: see these classes.
+        frames: SVG of the frames for the report; `alidade.pipelines.reports.sketch` states what it may contain.
+        fallback: chosen automatically only for recordings that no other method can use.
     """
 
-    name: ClassVar[str]
-    title: ClassVar[str]
-    sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    of_recording: ClassVar[tuple[str, ...]] = ()
-    rotations: ClassVar[Mapping[str, str]] = {}
-    meanings: ClassVar[Mapping[str, str]] = {}
-    components: ClassVar[Mapping[str, tuple[str, ...]]] = {}
-    cards: ClassVar[Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]]] = {}
-    sketch: ClassVar[Path | None] = None
-    scenarios: ClassVar[Path | None] = None
-    drawn: ClassVar[bool] = False
-    yields: ClassVar[bool] = False
-
-    # -- from a recording to estimates
-
-    @property
-    @abstractmethod
-    def topics(self) -> tuple[Topic, ...]:
-        """What it reads, the optional ones included."""
-
-    @property
-    @abstractmethod
-    def needs(self) -> tuple[Need, ...]:
-        """What it cannot do without."""
+    name: str
+    title: str
+    data: type
+    topics: tuple[Topic, ...]
+    requirements: tuple[Need, ...]
+    read: Callable[[Recording, Config], Any]
+    write_data: Callable[..., None]
+    problem: Callable[[Any, Config], Problem]
+    parameters: tuple[ParameterSpec, ...]
+    faults: FaultModel
+    config_section: type[MethodSection] | None = None
+    noise: tuple[NoiseSpec, ...] = ()
+    published: Callable[[Any, Config, Problem], Estimate] = _not_offered
+    check: Callable[[Any], None] = lambda data: None  # noqa: ARG005
+    proposed: Callable[[Recording, Config], Sequence[str]] = lambda recording, config: ()  # noqa: ARG005
+    simulator: Simulator | None = None
+    guidance: Guidance = field(default_factory=lambda: Guidance())
+    report: Report = field(default_factory=lambda: Report())
+    frames: Path | None = None
+    fallback: bool = False
 
     @property
-    def section(self) -> type[MethodSection] | None:
-        """The model of its own section of the config, if it has one."""
-        return None
+    def data_sheets(self) -> dict[str, list[str]]:
+        """Sensor, as under `sensors` in the config -> figures that are used."""
+        found: dict[str, list[str]] = {}
+        for spec in self.parameters:
+            if spec.data_sheet and spec.figure not in found.setdefault(spec.sheet, []):
+                found[spec.sheet].append(spec.figure)
+        return found
 
-    @property
-    @abstractmethod
-    def data(self) -> type:
-        """The class of its data: a frozen dataclass of arrays, with epoch_ns (Unix ns) the zero of all times.
+    def is_per_recording(self, parameter: str) -> bool:
+        """Whether a parameter belongs to a recording, not to the device."""
+        spec = self.spec(parameter)
+        return spec is not None and spec.per_recording
 
-        Its annotations say what arrays hold in a row (`alidade.pipelines.recording.shapes`). They are evaluated: what
-        they name is imported when the program runs, too.
-        """
+    def describe(self, parameter: str) -> str:
+        """A sentence about a parameter; empty for an unknown one."""
+        spec = self.spec(parameter)
+        text = "" if spec is None else spec.describe(parameter)
+        return text[:1].upper() + text[1:]
 
-    @abstractmethod
-    def read(self, recording: Recording, config: Config) -> Any:
-        """The method's data. Raises InputError when the recording cannot be used."""
+    def spec(self, parameter: str) -> ParameterSpec | None:
+        """The declaration of a parameter; None for an unknown one."""
+        from alidade.pipelines.estimation.parameters import spec_of
 
-    def check(self, data: Any) -> None:  # noqa: B027
-        """Raise InputError where the sensors of arrays contradict one another, as `read` does of a recording."""
-
-    def proposed(self, recording: Recording, config: Config) -> Sequence[str]:  # noqa: ARG002
-        """Keys of the config that a recording it can read suggests, each with the reason; nothing takes them."""
-        return ()
-
-    @abstractmethod
-    def problem(self, data: Any, config: Config) -> Problem:
-        """The graph. Raises InputError when the data are too few, or the config names no such parameter."""
+        return spec_of(self.parameters, parameter)
 
     def graph(self, data: Any, config: Config) -> Problem:
-        """The graph with what the config knows of parameters in place of their priors. Raises as `problem` does."""
+        """The factor graph with the config's prior means and covariances applied. Raises as `problem` does."""
         from alidade.pipelines.estimation.believing import believing
 
         return believing(self.problem(data, config), config.beliefs)
 
-    @abstractmethod
-    def published(self, data: Any, config: Config, problem: Problem) -> Estimate:
-        """The published solver's estimate. Raises InputError where it cannot serve the data."""
-
-    # -- simulation and planning
-
-    @property
-    @abstractmethod
-    def scenario(self) -> type[BaseModel]:
-        """The model of the simulator's settings; all of them have defaults."""
-
-    @abstractmethod
     def simulate(self, scenario: Any, seed: int, images: bool = False) -> Simulated:
-        """Data and truth of a scenario (of the model above), in memory; with `images` pictures are drawn too.
+        """Data and truth in memory of a scenario. Raises InputError when there is no simulator, or it refuses."""
+        return self.require_simulator().simulate(scenario, seed, images)
 
-        Raises InputError when the scenario cannot be drawn.
-        """
-
-    def nominal(self, images: bool = False) -> str:  # noqa: ARG002
-        """Name of the scenario that is simulated where none is named."""
-        return f"{self.name}_nominal"
+    def write(self, path: Path, simulated: Simulated) -> None:
+        """Write simulated data as a recording with truth and config attached. Raises InputError."""
+        self.write_data(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
 
     def settings(self, scenario: str | None = None, images: bool = False) -> Any:
-        """The simulator's settings of a scenario, by name or file (None: the nominal one).
+        """The simulator's settings of a scenario, by name or file; None: the default scenario.
 
-        Raises InputError when there is no such scenario, or it does not fit the model.
+        Raises InputError when there is no such scenario, or when it does not fit the model.
         """
         from alidade.pipelines.simulation.scenario import load_scenario
 
-        return load_scenario(self.scenario, scenario or self.nominal(images), self.scenarios)
-
-    @abstractmethod
-    def write(self, path: Path, simulated: Simulated) -> None:
-        """Write data as a recording, with truth and config attached. Raises InputError when it cannot be written."""
-
-    def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:  # noqa: ARG002
-        """Changes of a motion that may determine more: in words, and the changed motion."""
-        return iter(())
-
-    # -- judgement
-
-    @abstractmethod
-    def hypotheses(self) -> FaultModel:
-        """What can be wrong with its data, to be tried when residuals do not fit."""
-
-    def validate(self, data: Any, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:  # noqa: ARG002
-        """Errors before and after compensation with parameter values by name. Raises InputError when there are none."""
-        raise InputError(f"method {self.name} has no validation")
-
-    def checklist(self, data: Any, config: Config) -> Sequence[ChecklistItem]:  # noqa: ARG002
-        """What there is by now of what the method needs, for the person recording."""
-        return ()
-
-    # -- reports
-
-    @abstractmethod
-    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:
-        """How a result with these parameters is applied, in the order of evaluation.
-
-        Assumptions that the recording does not determine are not among them.
-        """
-
-    def stated(self, config: Config) -> Mapping[str, Array]:  # noqa: ARG002
-        """What formulas ask to be measured that a config states, such as rotations of a drawing: name -> value."""
-        return {}
-
-    def findings(self, data: Any, config: Config, estimate: Estimate) -> Findings:  # noqa: ARG002
-        """What there is to tell beside the parameters."""
-        return {}
-
-    def figures(self, data: Any, calibration: Calibration) -> Sequence[Plot | Table]:  # noqa: ARG002
-        """The method's own figures and tables for the report."""
-        return ()
-
-    def uses(self, true: Truth, config: Config, noise: Mapping[str, float]) -> Sequence[Use]:  # noqa: ARG002
-        """What a result is used for, with the error that it leaves.
-
-        Args:
-            true: the estimate.
-            config: in force.
-            noise: name -> noise used, SI.
-        """
-        return ()
+        simulator = self.require_simulator()
+        return load_scenario(simulator.scenario, scenario or self.default_scenario(images), simulator.folder)
 
     @property
-    def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:
-        """Format -> what writes a calibration in it; may raise InputError."""
-        return {}
+    def scenario(self) -> type[BaseModel]:
+        """Model of the simulator's settings. Raises InputError when there is no simulator."""
+        return self.require_simulator().scenario
 
-    # -- the command line
+    def default_scenario(self, images: bool = False) -> str:
+        """Name of the scenario that is simulated where none is named."""
+        simulator = self.require_simulator()
+        return (simulator.default_with_images if images else "") or f"{self.name}_nominal"
 
-    @property
-    def commands(self) -> Mapping[str, Callable[..., None]]:
-        """Word -> a command of its own, a function as typer takes it; may raise InputError."""
-        return {}
+    def require_simulator(self) -> Simulator:
+        """The simulator. Raises InputError when the method has none."""
+        if self.simulator is None:
+            raise InputError(f"method {self.name} has no simulator")
+        return self.simulator
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulator:
+    """Simulated recordings.
+
+    Attributes:
+        scenario: pydantic model of the settings; all have defaults.
+        simulate: settings, seed, images wanted -> data and truth in memory. Raises InputError for settings that cannot
+            be simulated.
+        default_with_images: default scenario where images are wanted; empty: as without.
+        folder: the method's own scenario files.
+        randomised: motion or sensors depend on the seed, not only the noise: recordings of one scenario differ in what
+            they determine.
+    """
+
+    scenario: type[BaseModel]
+    simulate: Callable[[Any, int, bool], Simulated]
+    default_with_images: str = ""
+    folder: Path | None = None
+    randomised: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guidance:
+    """Motion that helps.
+
+    Attributes:
+        checklist: data, config -> progress of each requirement of the motion, for the person recording.
+        variations: settings of a planned motion -> changes that may determine more: description, changed settings.
+    """
+
+    checklist: Callable[[Any, Config], Sequence[ChecklistItem]] = lambda data, config: ()  # noqa: ARG005
+    variations: Callable[[Scenario], Iterator[tuple[str, Scenario]]] = lambda scenario: iter(())  # noqa: ARG005
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Results beside the parameters.
+
+    Attributes:
+        formulas: names of determined parameters, config -> how a result is applied, in order of evaluation.
+        fixed_rotations: config -> inputs of formulas that the config states, such as rotations of a drawing, by name.
+        findings: data, config, estimate -> the method's own tables.
+        figures: data, calibration -> the method's own figures and tables.
+        validate: data, config, parameter values -> errors before and after compensation. Raises InputError when there
+            are none.
+        uses: estimate, config, noise used by name (SI) -> uses of a result, with the error that it leaves.
+        cards: of the report's results: title -> groups of numbers, each with its title, the unit (empty: the usual one)
+            and the parameters; parameters of no card stand in a last one.
+        residual_names: family of measurements -> names of its residuals that are not x, y, z.
+    """
+
+    formulas: Callable[[Collection[str], Config], Sequence[Formula]] = lambda parameters, config: ()  # noqa: ARG005
+    fixed_rotations: Callable[[Config], Mapping[str, Array]] = lambda config: {}  # noqa: ARG005
+    findings: Callable[[Any, Config, Estimate], Findings] = lambda data, config, estimate: {}  # noqa: ARG005
+    figures: Callable[[Any, Calibration], Sequence[Plot | Table]] = lambda data, calibration: ()  # noqa: ARG005
+    validate: Callable[[Any, Config, Mapping[str, float]], Sequence[Validation]] = _not_offered
+    uses: Callable[[Truth, Config, Mapping[str, float]], Sequence[Use]] = lambda true, config, noise: ()  # noqa: ARG005
+    cards: Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]] = field(default_factory=dict)
+    residual_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+class _Deferred:
+    """An object that is imported when it is first called or asked for an attribute."""
+
+    def __init__(self, reference: str) -> None:
+        self._reference = reference
+
+    @cached_property
+    def _target(self) -> Any:
+        module, _, name = self._reference.partition(":")
+        return getattr(import_module(module), name)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._target(*args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._target, name)
+
+
+def deferred(reference: str) -> Any:
+    """The object "package.module:name", imported when first used: commands start fast."""
+    return _Deferred(reference)
 
 
 _BUILT_IN = ("los", "indexer", "head", "cube", "tumble")
 
 
 def names() -> tuple[str, ...]:
-    """The toolkit's methods, then those of other distributions that can be loaded; the others are logged once."""
-    return (*_BUILT_IN, *(name for name in _brought() if _is_sound(name)))
+    """Built-in methods, then those of other distributions that can be loaded; the others are logged once."""
+    return (*_BUILT_IN, *(name for name in _plugins() if _is_sound(name)))
 
 
 @cache
@@ -252,27 +276,38 @@ def method(name: str) -> Method:
         found = import_module(f"alidade.pipelines.methods.{name}").METHOD
         assert isinstance(found, Method)
         return found
-    entry = _brought().get(name)
+    entry = _plugins().get(name)
     if entry is None:
         raise InputError(f"no method {name!r}; {nearest_three(name, names())}")
     try:
-        made = entry.load()()
+        made = entry.load()
     except Exception as error:
-        raise InputError(f"method {name}, brought by {_origin(entry)}, cannot be loaded: {error}") from error
+        raise InputError(f"method {name}, brought by {_distribution(entry)}, cannot be loaded: {error}") from error
     if not isinstance(made, Method) or made.name != name:
-        raise InputError(f"method {name}, brought by {_origin(entry)}: {entry.value} is no Method of that name")
+        raise InputError(f"method {name}, brought by {_distribution(entry)}: {entry.value} is no Method of that name")
     return made
 
 
-def without_yielding(able: Sequence[str]) -> list[str]:
-    """Of the methods that a recording serves those that do not yield; all of them where there are no others."""
-    return [name for name in able if not method(name).yields] or list(able)
+def prefer_specific(able: Sequence[str]) -> list[str]:
+    """Names of methods without the fallback ones, unless there are no others."""
+    return [name for name in able if not method(name).fallback] or list(able)
+
+
+def commands() -> dict[str, Callable[..., None]]:
+    """Word -> command of another distribution, a function as typer takes it; one that cannot be loaded is logged."""
+    found: dict[str, Callable[..., None]] = {}
+    for entry in entry_points(group=COMMANDS):
+        try:
+            found[entry.name] = entry.load()
+        except Exception as error:
+            _log.warning("command %s, brought by %s, cannot be loaded: %s", entry.name, _distribution(entry), error)
+    return found
 
 
 def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool = False) -> None:
-    """Simulate a scenario, by name or file (None: the method's nominal one), and write it as a recording.
+    """Simulate a scenario, by name or file (None: the default one), and write it as a recording.
 
-    Raises InputError when there is no such method or scenario, or the recording cannot be written.
+    Raises InputError when there is no such method or scenario, or when the recording cannot be written.
     """
     chosen = method(name)
     chosen.write(out, chosen.simulate(chosen.settings(scenario, images), seed, images))
@@ -282,17 +317,18 @@ def scenarios() -> dict[str, dict[str, Path]]:
     """Method -> name -> file of the scenarios that are found by name; the name begins with the method's."""
     from alidade.pipelines.simulation.scenario import shipped
 
+    folders = {name: simulator.folder for name in names() if (simulator := method(name).simulator) is not None}
     return {
-        name: {stem: path for stem, path in shipped(method(name).scenarios).items() if stem.startswith(f"{name}_")}
-        for name in names()
+        name: {stem: path for stem, path in shipped(folder).items() if stem.startswith(f"{name}_")}
+        for name, folder in folders.items()
     }
 
 
 @cache
-def _brought() -> Mapping[str, EntryPoint]:
-    """Methods of other distributions, by name."""
+def _plugins() -> Mapping[str, EntryPoint]:
+    """Entry points of methods of other distributions, by name."""
     return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in _BUILT_IN}
 
 
-def _origin(entry: EntryPoint) -> str:
+def _distribution(entry: EntryPoint) -> str:
     return entry.dist.name if entry.dist is not None else entry.value

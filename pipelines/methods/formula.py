@@ -1,25 +1,40 @@
-"""How a result is applied: formulas as text for people and as code.
+"""How a result is applied: formulas as text, and their evaluation.
 
-    Formula("rate of the helmet, rad/s in v", "w_iv", "gyro - gyro_bias", ("gyro",), lambda v: v.gyro - v.gyro_bias)
+    Formula("rate of the helmet, rad/s in v", "w_iv", "gyro - gyro_bias", ("gyro",))
 
-The text is written in the names of the parameters and of what is measured, with * for the product of rotations and for
-a rotation applied to a vector, Exp the rotation of a rotation vector, and Rx(a) = transpose(Exp(a ex)), Ry and Rz
-likewise.
+An expression is written in the names of parameters, inputs and earlier formulas, as Python writes it: + - * / **, sin,
+cos, lists as vectors and matrices. * composes rotations, applies a rotation or a matrix to a vector, and multiplies
+vectors element by element. Exp is the rotation of a rotation vector, Exp(angle ez) that about an axis; Rx(a) =
+transpose(Exp(a ex)), Ry and Rz likewise; inverse is that of a rotation or a matrix. Three parameters name_x, name_y,
+name_z are also the vector `name`. A parameter that has no value is 0.
 """
 
 from __future__ import annotations
 
+import ast
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.gyro import symmetric
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.estimation.problem import Array, Parameter
+
+# A vector has shape (..., 3), a rotation is a quaternion w, x, y, z (..., 4), a matrix is constant, (3, 3).
+Kind = Literal["scalar", "vector", "matrix", "rotation"]
+_CONSTANTS: tuple[Kind, ...] = ("scalar", "vector", "matrix")
+# Inputs: a name with an R between two frames is a rotation.
+_ROTATION, _VECTOR = (
+    re.compile(r"\w*[a-zA-Z]R[a-zA-Z]\w*|\w*rotation\w*"),
+    re.compile(r"(\w+_)?(gyro|accel|mag)(_\w+)?|d_b"),
+)
+# `Exp(angle ez)`: a number before the name of an axis.
+_AXIS = re.compile(r"(\w+) (e[xyz])\b")
+AXES = {"ex": np.eye(3)[0], "ey": np.eye(3)[1], "ez": np.eye(3)[2]}
 
 
 @dataclass(frozen=True)
@@ -27,24 +42,140 @@ class Formula:
     """One quantity that follows from a calibration and, maybe, from measurements.
 
     Attributes:
-        meaning: what it is, with unit and frame.
+        description: what it is, with unit and frame.
         name: what later formulas call it.
-        expression: the formula's right-hand side.
-        measured: what it needs beside parameters and formulas before it.
-        compute: the same as code: from a namespace of parameters (numbers; three of them name_x, name_y, name_z also as
-            the vector `name`), measurements and earlier results. Rotations are quaternions w, x, y, z.
+        expression: the right-hand side, see the module.
+        inputs: names of the measurements that it needs, through earlier formulas too.
     """
 
-    meaning: str
+    description: str
     name: str
     expression: str
-    measured: tuple[str, ...]
-    compute: Callable[[Any], Array]
+    inputs: tuple[str, ...]
 
     @property
     def text(self) -> str:
-        """As calibration.yaml has it."""
-        return f"{self.meaning}: {self.name} = {self.expression}"
+        """One line of calibration.yaml."""
+        return f"{self.description}: {self.name} = {self.expression}"
+
+    @property
+    def tree(self) -> ast.expr:
+        """The parsed expression."""
+        return ast.parse(_AXIS.sub(r"\1*\2", self.expression), mode="eval").body
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """A value of an expression, or many of them."""
+
+    kind: Kind
+    array: Array
+
+    @classmethod
+    def constant(cls, array: Array) -> Value:
+        """A number, a vector (3,) or a matrix (3, 3)."""
+        return cls(_CONSTANTS[array.ndim], array)
+
+
+def input_kind(name: str) -> Kind:
+    """Kind of an input by its name."""
+    return "rotation" if _ROTATION.fullmatch(name) else "vector" if _VECTOR.fullmatch(name) else "scalar"
+
+
+def with_vectors(values: Mapping[str, float]) -> dict[str, Array]:
+    """Parameters by name, and three of them name_x, name_y, name_z as the vector `name` too."""
+    known = {name: np.array(value, dtype=float) for name, value in values.items()}
+    for stem in {name[:-2] for name in values if name.endswith("_x")}:
+        if all(f"{stem}_{axis}" in values for axis in "xyz"):
+            known[stem] = np.array([values[f"{stem}_{axis}"] for axis in "xyz"], dtype=float)
+    return known
+
+
+def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Array]:
+    """Everything that follows from a calibration's values and measurements.
+
+    Args:
+        formulas: of the method, in order.
+        values: parameter -> value, SI.
+        measured: input -> numbers, vectors (..., 3) or quaternions w, x, y, z (..., 4).
+
+    Returns:
+        Name -> result, for each formula whose inputs are given.
+
+    Raises:
+        InputError: an input of no formula, or one that is useless without others that are not given.
+    """
+    known = dict.fromkeys(name for formula in formulas for name in formula.inputs)
+    for name in measured:
+        if name not in known:
+            raise InputError(f"apply: nothing is computed from {name}; measurements are {', '.join(known)}")
+    for name in measured:
+        beside = [set(formula.inputs) for formula in formulas if name in formula.inputs]
+        if all(needed - measured.keys() for needed in beside):
+            fewest = min((needed - measured.keys() for needed in beside), key=len)
+            raise InputError(f"apply: {name} serves only together with {', '.join(sorted(fewest))}")
+    space = {name: Value.constant(array) for name, array in (with_vectors(values) | AXES).items()}
+    space |= {name: Value(input_kind(name), np.asarray(given, dtype=float)) for name, given in measured.items()}
+    results: dict[str, Array] = {}
+    for formula in formulas:
+        if all(name in measured for name in formula.inputs):
+            space[formula.name] = evaluate(formula.tree, space)
+            results[formula.name] = space[formula.name].array
+    return results
+
+
+def evaluate(tree: ast.expr, names: Mapping[str, Value]) -> Value:
+    """The value of a parsed expression; names without a value are 0. Raises ValueError for anything else."""
+    match tree:
+        case ast.Constant(value=int() | float() as number):
+            return Value("scalar", np.array(float(number)))
+        case ast.Name(id=name):
+            return names.get(name) or Value("scalar", np.array(0.0))
+        case ast.List(elts=rows):
+            return Value.constant(np.array([evaluate(row, names).array for row in rows]))
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return operate("minus", evaluate(operand, names))
+        case ast.BinOp(left=left, op=op, right=right):
+            return operate(OPERATORS[type(op)], evaluate(left, names), evaluate(right, names))
+        case ast.Call(func=ast.Name(id=name), args=[argument]):
+            return operate(name, evaluate(argument, names))
+    raise ValueError(f"not an expression of a formula: {ast.unparse(tree)}")
+
+
+OPERATORS: Mapping[type[ast.operator], str] = {
+    ast.Add: "add",
+    ast.Sub: "sub",
+    ast.Mult: "mul",
+    ast.Div: "div",
+    ast.Pow: "pow",
+}
+
+
+def operate(op: str, *parts: Value) -> Value:
+    """An operation of OPERATORS, "minus", or a function that expressions may call."""
+    kind, arrays = result_kind(op, [part.kind for part in parts]), [part.array for part in parts]
+    if op == "inverse" and kind == "rotation":
+        return Value(kind, so3.inverse(*arrays))
+    if op == "mul" and parts[0].kind in ("matrix", "rotation"):
+        return Value(kind, _applied(parts[0], parts[1]))
+    if len(parts) == 2 and kind == "vector":
+        arrays = [part.array[..., None] if part.kind == "scalar" else part.array for part in parts]
+    return Value(kind, np.asarray(_COMPUTED[op](*arrays)))
+
+
+def result_kind(op: str, kinds: Sequence[Kind]) -> Kind:
+    """Kind of an operation's result."""
+    if op in ("Exp", "Rx", "Ry", "Rz"):
+        return "rotation"
+    if op == "mul" and kinds[0] in ("matrix", "rotation"):
+        return kinds[1]
+    return "vector" if "vector" in kinds else kinds[0]
+
+
+def _applied(left: Value, right: Value) -> Array:
+    if left.kind == "matrix":
+        return np.asarray(right.array @ left.array.T)
+    return (so3.rotate if right.kind == "vector" else so3.multiply)(left.array, right.array)
 
 
 def passive(axis: int, angle: Any) -> Array:
@@ -52,69 +183,67 @@ def passive(axis: int, angle: Any) -> Array:
     return so3.exp(-np.asarray(angle, dtype=float)[..., None] * np.eye(3)[axis])
 
 
+_COMPUTED: Mapping[str, Callable[..., Array]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "pow": np.power,
+    "minus": np.negative,
+    "sin": np.sin,
+    "cos": np.cos,
+    "inverse": np.linalg.inv,
+    "Exp": so3.exp,
+    "Rx": partial(passive, 0),
+    "Ry": partial(passive, 1),
+    "Rz": partial(passive, 2),
+}
+
+
 def matrix_text(rows: Sequence[Sequence[str]], known: Collection[str]) -> str:
-    """A matrix of parameters as formulas write it, those that are not among the known ones as 0."""
+    """A matrix of parameters as an expression, with 0 for unknown names."""
     return f"[{', '.join(vector_text(row, known) for row in rows)}]"
 
 
 def vector_text(names: Sequence[str], known: Collection[str]) -> str:
-    """A vector of parameters, likewise."""
+    """A vector of parameters as an expression, with 0 for unknown names."""
     return f"[{', '.join(name if name in known else '0' for name in names)}]"
 
 
 def symmetric_text(names: Sequence[str], known: Collection[str]) -> str:
-    """I + S, S of the numbers xx yy zz xy xz yz."""
+    """I + S as an expression, S of the numbers xx yy zz xy xz yz, with 0 for unknown names."""
     xx, yy, zz, xy, xz, yz = (name if name in known else "0" for name in names)
     return f"[[1 + {xx}, {xy}, {xz}], [{xy}, 1 + {yy}, {yz}], [{xz}, {yz}, 1 + {zz}]]"
 
 
-def numbers_of(space: Any, names: Sequence[str]) -> Array:
-    """Values of parameters, 0 for those that are not there."""
-    return np.array([getattr(space, name, 0.0) for name in names])
+def temperature_text(names: Sequence[str], known: Collection[str]) -> str:
+    """Drift of a bias with temperature as an expression, by its slopes."""
+    return f"{vector_text(names, known)} * (temperature - first_temperature)"
 
 
 def gyro_rate(
     known: Collection[str], s: Sequence[str], g: Sequence[str], c: Sequence[str] = ()
-) -> tuple[str, tuple[str, ...], Callable[[Any], Array]]:
-    """The true rate w from what a gyro reads, (I + S) w + G f + c (temperature - first_temperature) + gyro_bias.
-
-    Text, what it measures, and the same as code.
+) -> tuple[str, tuple[str, ...]]:
+    """The true rate w from a gyro's reading (I + S) w + G f + c (temperature - first_temperature) + gyro_bias.
 
     Args:
         known: parameters that are applied.
         s, g, c: names of the numbers of S, xx yy zz xy xz yz, of those of G by rows, and of c.
+
+    Returns:
+        Expression and inputs.
     """
     scaled, feels, drifts = (any(name in known for name in names) for names in (s, g, c))
-
-    def compute(v: Any) -> Array:
-        rate = v.gyro - v.gyro_bias
-        if feels:
-            rate = rate - v.accel @ numbers_of(v, g).reshape(3, 3).T
-        if drifts:
-            rate = rate - over_temperature(v, c)
-        return np.asarray(rate @ np.linalg.inv(np.eye(3) + symmetric(numbers_of(v, s))))
-
     force = f" - {matrix_text([g[:3], g[3:6], g[6:]], known)} * accel" if feels else ""
     text = f"gyro{force}{f' - {temperature_text(c, known)}' if drifts else ''} - gyro_bias"
     return (
         f"inverse({symmetric_text(s, known)}) * ({text})" if scaled else text,
         ("gyro", *(["accel"] if feels else []), *(["temperature"] if drifts else [])),
-        compute,
     )
 
 
-def temperature_text(names: Sequence[str], known: Collection[str]) -> str:
-    """What a sensor reads too much at a temperature, by its slopes."""
-    return f"{vector_text(names, known)} * (temperature - first_temperature)"
-
-
-def over_temperature(v: Any, names: Sequence[str]) -> Array:
-    """The same as code, (..., 3)."""
-    return np.asarray((v.temperature - v.first_temperature)[..., None] * numbers_of(v, names))
-
-
 def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, known: Collection[str]) -> list[Formula]:
-    """The axes' angles from what their encoders read; none where no error of theirs is applied.
+    """The axes' angles from the readings of their encoders; none where no encoder error is applied.
 
     Args:
         axes: names of the readings; the results have `_angle` added.
@@ -125,56 +254,26 @@ def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, k
     if not any(name in known for name in (*once_per_turn, delay)):
         return []
     late = f", {delay} s after the stamp of the reading" if delay in known else ""
-
-    def angle(axis: str, names: Sequence[str]) -> Formula:
-        def compute(v: Any) -> Array:
-            (sine, cosine), read = numbers_of(v, names), np.asarray(getattr(v, axis))
-            return np.asarray(read - sine * np.sin(read) - cosine * np.cos(read))
-
-        waves = [
-            f" - {name} * {wave}({axis})" for name, wave in zip(names, ("sin", "cos"), strict=True) if name in known
-        ]
-        return Formula(f"angle of the {axis} axis, rad{late}", f"{axis}_angle", axis + "".join(waves), (axis,), compute)
-
-    return [angle(axis, once_per_turn[2 * i : 2 * i + 2]) for i, axis in enumerate(axes)]
-
-
-def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Array]:
-    """Everything that follows from a calibration's values and what is measured.
-
-    Args:
-        formulas: of the method, in order.
-        values: parameter -> value, SI.
-        measured: name -> numbers, vectors (..., 3) or quaternions w, x, y, z (..., 4).
-
-    Returns:
-        Name -> result, for each formula whose measurements are given.
-
-    Raises:
-        InputError: something is given that no formula measures, or that only serves with what is not given.
-    """
-    known = dict.fromkeys(name for formula in formulas for name in formula.measured)
-    for name in measured:
-        if name not in known:
-            raise InputError(f"apply: nothing is computed from {name}; measurements are {', '.join(known)}")
-    for name in measured:
-        beside = [set(formula.measured) for formula in formulas if name in formula.measured]
-        if all(needed - measured.keys() for needed in beside):
-            fewest = min((needed - measured.keys() for needed in beside), key=len)
-            raise InputError(f"apply: {name} serves only together with {', '.join(sorted(fewest))}")
-    space = SimpleNamespace(**values, **_vectors(values), **{k: np.asarray(v, float) for k, v in measured.items()})
-    results: dict[str, Array] = {}
-    for formula in formulas:
-        if all(name in measured for name in formula.measured):
-            results[formula.name] = formula.compute(space)
-            setattr(space, formula.name, results[formula.name])
-    return results
+    waves = list(zip(once_per_turn[::2], once_per_turn[1::2], strict=True))
+    return [
+        Formula(
+            f"angle of the {axis} axis, rad{late}",
+            f"{axis}_angle",
+            axis
+            + "".join(f" - {n} * {wave}({axis})" for n, wave in zip(names, ("sin", "cos"), strict=True) if n in known),
+            (axis,),
+        )
+        for axis, names in zip(axes, waves, strict=True)
+    ]
 
 
-def _vectors(values: Mapping[str, float]) -> dict[str, Array]:
-    stems = dict.fromkeys(name[:-2] for name in values if name.endswith(("_x", "_y", "_z")))
-    return {
-        stem: np.array([values[f"{stem}_{axis}"] for axis in "xyz"])
-        for stem in stems
-        if all(f"{stem}_{axis}" in values for axis in "xyz")
-    }
+def picture_time(known: Collection[str]) -> str:
+    """Time of a picture on the gyro's clock by time_offset and clock_skew, as an expression of its stamp."""
+    offset, skew = "time_offset" in known, "clock_skew" in known
+    return f"stamp{' + time_offset' * offset}{' - clock_skew * (stamp - first_stamp)' * skew}"
+
+
+def clock_constants(clock: Parameter | None, first_stamp: float) -> dict[str, float]:
+    """The first stamp, s, where the formula of a picture's time needs it."""
+    skewed = clock is not None and any(q.name == "clock_skew" for q in clock.quantities)
+    return {"first_stamp": first_stamp} if skewed else {}

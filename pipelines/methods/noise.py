@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise, Source
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.settings import DEFAULT_NOISE, Config
+from alidade.pipelines.noises import NOISES, NoiseSpec
+from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ _MUCH_SMALLER = 0.8
 
 
 def stated(
-    name: str,
+    spec: str | NoiseSpec,
     config: Config,
     message: float | None = None,
     families: Sequence[str] = (),
@@ -49,20 +50,23 @@ def stated(
     """A noise of the config's section `noise`: its figure, else what messages state, else the default.
 
     Args:
-        name: its key.
+        spec: its key, or the declaration of a noise that only one method has.
         config: in force.
         message: typical figure of the messages; None: they state none.
         families, rows: as Noise has them.
     """
-    given = getattr(config.noise, name)
-    figure, source = getattr(DEFAULT_NOISE, name), _DEFAULT
+    own = NOISES[spec] if isinstance(spec, str) else spec
+    given: float | None = getattr(config.noise, own.name, None)
+    assert own.default is not None
+    figure, source = own.default, _DEFAULT
     if given is not None:
-        figure, source = given, _CONFIG
+        figure, source = float(given), _CONFIG
     elif message is not None:
-        figure, source = message, _MESSAGE
+        figure, source = float(message), _MESSAGE
     # Who takes the config's figures for exact wants no level estimated.
     known = config.noise_known if given is not None or config.noise_known == 0.0 else ROUGHLY
-    return Noise(name, float(figure), source, known, tuple(families), None if rows is None else tuple(rows))
+    of = None if rows is None else tuple(rows)
+    return Noise(own.name, figure, source, known, tuple(families), of, own=None if own.name in NOISES else own)
 
 
 def repeatability(sensor: str, config: Config, family: str) -> Level:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.earth import magnetic_field
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import Assumption
+from alidade.pipelines.estimation.parameters import ParameterSpec
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import Topic, wanted
 from alidade.pipelines.settings import Config, first_given
@@ -17,7 +17,16 @@ from alidade.pipelines.settings import Config, first_given
 Array = NDArray[np.float64]
 
 # The earth's field, each component about its model: outdoors; a building may add ten times that.
-FIELD = Assumption(("field_e", "field_n", "field_u"), "T", "field", "model_error", 5e-7)
+FIELD = ParameterSpec(
+    "field",
+    "T",
+    5e-7,
+    "Local magnetic field, {axis} component.",
+    "field.model_error",
+    axes="enu",
+    require=1e-6,
+    per_recording=True,
+)
 # Of the total intensity by WMM 2025, T: global error model of its technical report (NOAA/NCEI and BGS, 2024).
 STRENGTH_SIGMA = 1.38e-7
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.estimation.assumptions import Assumption, parameter
+from alidade.pipelines.estimation.parameters import ParameterSpec, parameter, temperature_slope
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
@@ -14,11 +14,14 @@ from alidade.pipelines.recording.streams import StreamReader, Temperature
 from alidade.pipelines.recording.topics import TEMPERATURE, wanted
 from alidade.pipelines.settings import Config
 
+# Slopes of consumer sensors' biases, one sigma.
+GYRO_SLOPE = temperature_slope("gyro", "rad/s", 1e-4)
+ACCEL_SLOPE = temperature_slope("accel", "m/s^2", 1e-2)
 # What formulas call the temperature at which a bias is the bias, degrees Celsius.
 FIRST = "first_temperature"
 
 
-def read(reader: StreamReader, config: Config, slopes: Sequence[Assumption], sensor_t: Array) -> Temperature | None:
+def read(reader: StreamReader, config: Config, slopes: Sequence[ParameterSpec], sensor_t: Array) -> Temperature | None:
     """Temperature of a sensor with samples at sensor_t (N,), s; None without the topic, or if all slopes are fixed.
 
     Raises InputError as StreamReader.temperature does.

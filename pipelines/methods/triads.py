@@ -6,27 +6,53 @@ definition of the body's axes there are only the six on and above the diagonal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from typing import Any
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.gyro import symmetric
+from alidade.pipelines.estimation.parameters import SENSORS, ParameterSpec
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula
 
 TRIADS = ("accel", "gyro", "mag")
 # Of S of a gyro, in the order that `symmetric` takes.
 _ELEMENTS = ("x", "y", "z", "xy", "xz", "yz")
-# Sensor -> what comes out, and what formulas call it.
-_RESULTS = {
-    "accel": ("specific force along the {body} axes, {unit}", "f_b", "m/s^2"),
-    "gyro": ("rate along the {body} axes, {unit}", "w_b", "rad/s"),
-    "mag": ("field along the {body} axes, {unit}", "m_b", "T"),
+# Sensor -> name of the calibrated vector in formulas; its description and SI unit.
+RESULTS = {"accel": "f_b", "gyro": "w_b", "mag": "m_b"}
+_DESCRIPTIONS = {
+    "accel": ("specific force along the {body} axes, {unit}", "m/s^2"),
+    "gyro": ("rate along the {body} axes, {unit}", "rad/s"),
+    "mag": ("field along the {body} axes, {unit}", "T"),
 }
 # Of K's entries, for the derivatives of its parts.
 _STEP = 1e-6
+
+
+def triad_specs(
+    name: str, unit: str, gain: tuple[float, float], bias: tuple[float, float], per_recording: bool = False
+) -> tuple[ParameterSpec, ...]:
+    """The numbers of a triad: entries of K on and off the diagonal, b.
+
+    Args:
+        name: of the sensor.
+        unit: of b.
+        gain, bias: prior sigma and accuracy wanted, of entries of K and of b.
+        per_recording: whether b belongs to a recording.
+    """
+    sensor = SENSORS[name].capitalize()
+    diagonal, others = (tuple(f"{i}{j}" for i in "123" for j in "123" if (i == j) is own) for own in (True, False))
+    gains = ((diagonal, "gain, {first}"), (others, "cross-axis term ({last} into {first})"))
+    K = (
+        ParameterSpec(f"{name}_k{{}}", "1", gain[0], f"{sensor} {text}.", axes=axes, require=gain[1])
+        for axes, text in gains
+    )
+    b = ParameterSpec(
+        f"{name}_b{{}}", unit, bias[0], f"{sensor} offset, {{axis}} (after K).", axes="123", require=bias[1]
+    )
+    return (*K, replace(b, per_recording=per_recording))
 
 
 def triad_names(name: str, symmetric: bool = False) -> tuple[str, ...]:
@@ -63,34 +89,27 @@ def sensor_model(name: str, values: Mapping[str, float]) -> tuple[Array, Array]:
 def triad_formula(
     name: str,
     parameters: Collection[str],
-    said: str,
-    measured: tuple[str, ...],
-    read: Callable[[Any], Array],
+    reading: str,
+    inputs: tuple[str, ...],
     body: str = "cube's",
     unit: str | None = None,
 ) -> Formula:
-    """K and b applied to what a sensor said, as text and as code.
+    """K and b applied to a sensor's reading.
 
     Args:
         name: of the sensor.
         parameters: that there are.
-        said: the sensor's reading as the formula writes it, and `read` as code.
-        measured: what that needs.
-        read: from the names' values.
+        reading: the sensor's reading as an expression.
+        inputs: of that expression.
         body: whose axes the result is along.
         unit: of the result, where it is not the SI one.
     """
-    meaning, result, si = _RESULTS[name]
-    names = gain_names(name, parameters)
-    rows = ", ".join(f"[{', '.join(row)}]" for row in names)
-
-    def compute(v: Any) -> Array:
-        K = np.array([[getattr(v, entry) for entry in row] for row in names])
-        b = np.array([getattr(v, f"{name}_b{i}") for i in "123"])
-        return np.asarray(read(v) @ K.T + b)
-
+    description, si = _DESCRIPTIONS[name]
+    rows = ", ".join(f"[{', '.join(row)}]" for row in gain_names(name, parameters))
     bias = f"[{', '.join(f'{name}_b{i}' for i in '123')}]"
-    return Formula(meaning.format(body=body, unit=unit or si), result, f"[{rows}] * {said} + {bias}", measured, compute)
+    return Formula(
+        description.format(body=body, unit=unit or si), RESULTS[name], f"[{rows}] * {reading} + {bias}", inputs
+    )
 
 
 def parts_of(K: Array) -> Array:

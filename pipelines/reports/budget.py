@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from alidade.pipelines.estimation.assumptions import kind
+from alidade.pipelines.estimation.parameters import kind
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.solvers.joint import RECORDING, WALK
 

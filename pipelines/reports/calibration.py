@@ -154,7 +154,7 @@ class SavedCalibration(_Record, SensorValues):
         text = "\n".join(self.formulas)
         # A formula names a parameter, or the vector that it is a component of.
         applied = [name for name in self.parameters if re.search(rf"\b({name}|{name[:-2]})\b", text)]
-        formulas = method(self.method).formulas(applied, self._config)
+        formulas = method(self.method).report.formulas(applied, self._config)
         if [formula.text for formula in formulas] != self.formulas:
             raise InputError("apply: the formulas in the calibration are not those of its parameters and this config")
         values = {name: value for name, value in self.values.items() if name in applied or name in self.constants}
@@ -227,14 +227,13 @@ def load_calibration(path: Path, config: Config | None = None) -> SavedCalibrati
 def rotations_of(calibration: Calibration) -> dict[str, SavedRotation]:
     """The parameters that are rotation vectors, as quaternions."""
     values: Mapping[str, float] = {name: p.value for name, p in calibration.parameters.items()}
-    known = calibration.method.rotations
     found = {}
     for parameter in calibration.problem.parameters:
         names = [q.name for q in parameter.quantities]
         if parameter.is_rotation and all(name in values for name in names):
-            name = names[0].rsplit("_", 1)[0]
+            name, spec = names[0].rsplit("_", 1)[0], calibration.method.spec(names[0])
             w, x, y, z = (_rounded(v) for v in so3.exp(np.array([values[n] for n in names])).tolist())
-            found[name] = SavedRotation(name=known.get(name, name), wxyz=(w, x, y, z))
+            found[name] = SavedRotation(name=spec.rotation if spec and spec.rotation else name, wxyz=(w, x, y, z))
     return found
 
 
@@ -242,22 +241,22 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
     """The formulas that are rotations and need nothing measured, by the frames in their meaning: "a to b, ..."."""
     estimate, covariance = calibration.estimate, calibration.covariance
     unknown = dict.fromkeys((q.name for q in calibration.problem.quantities), 0.0)
-    given = calibration.method.stated(calibration.config)
+    given = calibration.method.report.fixed_rotations(calibration.config)
     formulas: list[Formula] = []
 
     def at(values: Array) -> dict[str, Array]:
-        needed = {name: given[name] for formula in formulas for name in formula.measured}
+        needed = {name: given[name] for formula in formulas for name in formula.inputs}
         return apply(formulas, {**unknown, **dict(zip(estimate.names, values.tolist(), strict=True))}, needed)
 
     for formula in calibration.formulas:
-        if given.keys() >= set(formula.measured):
+        if given.keys() >= set(formula.inputs):
             formulas.append(formula)
             try:
                 at(estimate.values)
             except AttributeError:  # of parameters that this graph has not got
                 formulas.pop()
     results = at(estimate.values)
-    rotations = {f.name: f for f in formulas if results[f.name].shape == (4,) and _FRAMES.match(f.meaning)}
+    rotations = {f.name: f for f in formulas if results[f.name].shape == (4,) and _FRAMES.match(f.description)}
     if not rotations:
         return {}
     ends = [(at(estimate.values + step), at(estimate.values - step)) for step in _STEP * np.eye(len(estimate.names))]
@@ -265,7 +264,7 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
     for name, formula in rotations.items():
         turns = [so3.log(so3.multiply(ahead[name], so3.inverse(behind[name]))) for ahead, behind in ends]
         J = np.array(turns).T / (2.0 * _STEP)
-        child, parent = (word.strip().lower().replace(" ", "_") for word in _frames(formula.meaning))
+        child, parent = (word.strip().lower().replace(" ", "_") for word in _frames(formula.description))
         w, x, y, z = (_rounded(v) for v in results[name].tolist())
         spread = tuple(_rounded(float(v), _FEWER_DIGITS) for v in (J @ covariance @ J.T).ravel())
         found[name] = SavedTransform(parent=parent, child=child, wxyz=(w, x, y, z), covariance=spread)

@@ -15,8 +15,8 @@ from alidade.pipelines.display.units import human_unit, noise_unit, rounded, sig
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.methods.meanings import NOISES, meaning
 from alidade.pipelines.methods.triads import TRIADS
+from alidade.pipelines.noises import NOISES
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.reports.budget import Limit, limits
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
@@ -330,9 +330,9 @@ def direction_blocks(findings: Sequence[Finding]) -> tuple[Block, ...]:
 
 def _frames(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     """The method's sketch with the estimated mounts drawn in."""
-    if c.method.sketch is None:
+    if c.method.frames is None:
         return ()
-    svg = c.method.sketch.read_text(encoding="utf-8")
+    svg = c.method.frames.read_text(encoding="utf-8")
     shown = {name: each for name, each in file.transforms.items() if f'data-turn="{name}"' in svg}
     drawing = Svg(sketch_with(svg, shown))
     if not shown:
@@ -386,7 +386,7 @@ def _estimate_cells(c: Calibration, q: Quantity) -> tuple[Cell | str, ...]:
     numbers = (p.value, p.sigma) if _is_known(q, p) else ()
     value, sigma = (to_digits_of(factor * x, factor * p.sigma) for x in numbers) if numbers else ("unknown", "unknown")
     prior = "free" if p.prior_sigma is None else rounded(factor * p.prior_sigma, 3)
-    return Cell(p.name, meaning(c.method, p.name)), value, sigma, unit, prior
+    return Cell(p.name, c.method.describe(p.name)), value, sigma, unit, prior
 
 
 def _is_known(q: Quantity, p: ParameterResult) -> bool:
@@ -440,7 +440,7 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
 
 def _call(c: Calibration) -> str:
     """What the formulas measure, as arguments."""
-    return ", ".join(f"{name}={name}" for name in dict.fromkeys(n for formula in c.formulas for n in formula.measured))
+    return ", ".join(f"{name}={name}" for name in dict.fromkeys(n for formula in c.formulas for n in formula.inputs))
 
 
 def _noise(c: Calibration) -> Table | None:
@@ -454,6 +454,7 @@ def _noise(c: Calibration) -> Table | None:
         "used",
         *(["inflation"] if inflated else []),
     )
+    specs = NOISES | {spec.name: spec for spec in c.method.noise}
     rows: list[Row] = []
     for n in c.noises:
         if not (n.stated or n.used):
@@ -461,7 +462,8 @@ def _noise(c: Calibration) -> Table | None:
         unit, factor = noise_unit(n.name, n.unit)
         estimated = "" if n.estimated is None else to_digits_of(factor * n.estimated, factor * (n.sigma or 0.0))
         sigma = "" if n.sigma is None else f" ± {rounded(factor * n.sigma)}"
-        name = Cell(n.name, hint=f"{NOISES.get(n.name, n.name)} Stated by {n.source}; {n.used:.3g} {n.unit} used.")
+        what = specs[n.name].description if n.name in specs else n.name
+        name = Cell(n.name, hint=f"{what} Stated by {n.source}; {n.used:.3g} {n.unit} used.")
         inflation = (f"{n.inflation:.2f}" if n.inflation > 1.0 else "",) if inflated else ()
         numbers = (rounded(factor * n.stated, 3), estimated + sigma, rounded(factor * n.used, 3))
         rows.append((name, unit, *numbers, *inflation))

@@ -26,7 +26,6 @@ from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
@@ -366,7 +365,7 @@ def _readable(row: Row, result: Result) -> _Readable:
 def _meaning(result: Result, name: str) -> str:
     """Meaning of a parameter; empty for a method that is not installed here."""
     with suppress(InputError):
-        return meaning(method(result.method), name)
+        return method(result.method).describe(name)
     return ""
 
 

@@ -13,7 +13,6 @@ from alidade.pipelines.display.figure import COLORS, Dash, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, signed, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.result import Calibration
@@ -92,7 +91,7 @@ def _comparison_table(calibrations: Sequence[Calibration], quantities: Sequence[
     known = calibrations[0].truth is not None
     columns: list[Column | str] = ["parameter", Column("unit", "text")]
     rows: list[list[Cell | str]] = [
-        [Cell(q.name, meaning(calibrations[0].method, q.name)), human_unit(q)[0]] for q in quantities
+        [Cell(q.name, calibrations[0].method.describe(q.name)), human_unit(q)[0]] for q in quantities
     ]
     for c in calibrations:
         solver, errors = c.estimate.solver, truth_errors(c)
@@ -210,7 +209,7 @@ def _halves(c: Calibration, quantities: Sequence[Quantity], halves: Mapping[str,
             half, (unit, factor) = halves[q.name], human_unit(q)
             pairs = ((half.first, half.first_sigma), (half.second, half.second_sigma))
             cells = (_with_sigma(factor * value, factor * sigma) for value, sigma in pairs)
-            rows.append((Cell(q.name, meaning(c.method, q.name)), unit, *cells, signed(half.z)))
+            rows.append((Cell(q.name, c.method.describe(q.name)), unit, *cells, signed(half.z)))
     caption = (
         "Each half solved by itself, as if the other had not been recorded. A difference beyond three or four sigmas "
         "means that something changed, or that the model lacks something."
@@ -272,6 +271,6 @@ def _convergence(calibrations: Sequence[Calibration], quantities: Sequence[Quant
         if reach and out.marks:
             edge = 0.05 * (max(reach) - min(reach))
             out.y_range = (min(reach) - edge, max(reach) + edge)
-            caption = meaning(calibrations[0].method, q.name)
+            caption = calibrations[0].method.describe(q.name)
             plots.append(Plot(f"{q.name} over time", f"{caption} The band is one sigma of incremental.".strip(), out))
     return plots

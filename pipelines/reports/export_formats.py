@@ -1,4 +1,4 @@
-"""A calibration for the programs that apply it: static transforms, ROS 2 parameters, formats of the methods."""
+"""A calibration for the programs that apply it: static transforms, ROS 2 parameters, formats of triads."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.triads import TRIADS
+from alidade.pipelines.reports import triad_export
 from alidade.pipelines.reports.calibration import SavedCalibration, SavedTransform
 
 _SAID = "covariance of small rotations about the parent's axes, rad^2, by rows"
@@ -17,12 +18,13 @@ _PLACE = "only the rotation is calibrated: put the translation in"
 
 
 def exported(saved: SavedCalibration, form: str) -> str:
-    """The text of a calibration in a format: mounting rotations as static transforms, or a format of the method.
+    """The text of a calibration in a format: mounting rotations as static transforms, or gain and offset of triads.
 
     Raises:
         InputError: there is no such format for the calibration.
     """
-    formats = {**methods.method(saved.method).exporters, **(_TRANSFORMS if saved.transforms else {})}
+    has_triad = any(f"{name}_k11" in saved.parameters for name in TRIADS)
+    formats = {**(triad_export.FORMATS if has_triad else {}), **(_TRANSFORMS if saved.transforms else {})}
     if not formats:
         raise InputError(f"this calibration of {saved.method} holds nothing that another program could be given")
     if form not in formats:

@@ -12,7 +12,7 @@ from alidade.pipelines.diagnostics.device_changes import Change
 from alidade.pipelines.display.figure import COLORS, Figure, Plot, milliseconds
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
-from alidade.pipelines.estimation.assumptions import kind
+from alidade.pipelines.estimation.parameters import kind
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import PartResult

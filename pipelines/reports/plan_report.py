@@ -7,7 +7,6 @@ from alidade.pipelines.applications.planning import Plan
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded
-from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.budget import limits
 from alidade.pipelines.reports.calibration_report import direction_blocks
 from alidade.pipelines.reports.report import Code, Plots, Report, Section, Summary, Text
@@ -51,7 +50,7 @@ def _parameter_table(plan: Plan) -> Table:
         verdict = plan.now.verdicts[q.name]
         cells: Row = (unit, *(rounded(factor * sigma) for sigma in sigmas), Cell(verdict, tone=verdict))
         largest = f"{source}, {100.0 * share:.0f} %" if source else ""
-        rows.append((Cell(q.name, meaning(method, q.name)), *cells, largest))
+        rows.append((Cell(q.name, method.describe(q.name)), *cells, largest))
     columns: Columns = (
         *("parameter", Column("unit", "text"), "required", "predicted"),
         *changed,

@@ -35,7 +35,7 @@ def common_plots(calibration: Calibration) -> list[Plot]:
         plots.append(_learning(calibration, history))
     for family, residuals in estimate.residuals.items():
         if len(residuals.time):
-            names = components(calibration.method.components.get(family), residuals)
+            names = components(calibration.method.report.residual_names.get(family), residuals)
             plots.append(_residuals(family, residuals, names, estimate.has_innovations))
             if estimate.has_innovations:
                 plots.append(_squares(family, residuals))

@@ -22,9 +22,9 @@ from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest, S
 from alidade.pipelines.diagnostics.observability import TimeToAccuracy, Verdict, time_to_accuracy, verdicts
 from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.table import Table
-from alidade.pipelines.estimation.assumptions import pull
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameters import pull
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
@@ -194,7 +194,7 @@ class Calibration(SensorValues):
         if moved is None:
             return None
         found = {}
-        for exact in self.method.hypotheses().exact:
+        for exact in self.method.faults.exact:
             if exact.name in moved:
                 moves = moved[exact.name]
                 by_unit = {name: moves[name] / exact.step for name in self._calibrated if name in moves}
@@ -308,8 +308,8 @@ class Calibration(SensorValues):
         values = {name: parameter.value for name, parameter in self.parameters.items() if name in self.applied}
         unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
         needed, possible = (
-            {name for formula in formulas for name in formula.measured}
-            for formulas in (self.formulas, self.method.formulas(list(unknown), self.config))
+            {name for formula in formulas for name in formula.inputs}
+            for formulas in (self.formulas, self.method.report.formulas(list(unknown), self.config))
         )
         given = {name: value for name, value in measured.items() if name in needed or name not in possible}
         return apply(self.formulas, {**self.problem.constants, **unknown, **values}, given)
@@ -346,7 +346,7 @@ class Calibration(SensorValues):
     @property
     def formulas(self) -> Sequence[Formula]:
         """How it is applied, assumptions that the recording does not determine left out."""
-        return self.method.formulas(self.applied, self.config)
+        return self.method.report.formulas(self.applied, self.config)
 
     @property
     def applied(self) -> list[str]:

@@ -16,7 +16,6 @@ from alidade.pipelines.diagnostics.observability import Verdict, rejects_many, v
 from alidade.pipelines.display.table import Cell, Column, Interval, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.problem import Array, Quantity
-from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.methods.triads import TRIADS, parts_of, sensor_model
 from alidade.pipelines.reports.plots import variables
 from alidade.pipelines.reports.result import Calibration, quantities_of
@@ -102,7 +101,7 @@ def result_cards(c: Calibration) -> list[ResultCard]:
     triads = [name for name in TRIADS if f"{name}_k11" in c.values]
     cards = [_triad_card(c, name) for name in triads]
     shown = {name for card in cards for _, row in card.rows for name in row.names}
-    for title, groups in c.method.cards.items():
+    for title, groups in c.method.report.cards.items():
         found = []
         for group, unit, names in groups:
             there = [name for name in names if name in c.values and name not in shown]
@@ -173,7 +172,7 @@ def _group(c: Calibration, title: str, unit: str, names: Sequence[str]) -> Resul
         row = ResultRow(
             name.rpartition("_")[2],
             *(p.value, p.sigma, p.require, p.observability, error, (name,)),
-            hint=f"{name}: {meaning(c.method, name)}",
+            hint=f"{name}: {c.method.describe(name)}",
         )
         rows.append(row.times(factor))
     return ResultGroup(title, human, tuple(rows))

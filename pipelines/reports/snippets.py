@@ -1,108 +1,107 @@
 """Formulas with a calibration's numbers in them, as Python and as C, to be copied.
 
-The expressions of `alidade.pipelines.methods.formula` are read with Python's own `ast`; whatever depends on nothing
-measured is computed here, so that the code holds numbers. Rotations are matrices, 3x3, in the code.
+What depends on no input is computed by `alidade.pipelines.methods.formula`, so that the code holds numbers.
+Rotations are matrices, 3x3, in the code.
 """
 
 from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from alidade.factors import so3
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.formula import Formula
-
-Kind = Literal["scalar", "vector", "matrix"]
-_RANKS: tuple[Kind, ...] = ("scalar", "vector", "matrix")
-# Measured: frames with an R between them are rotations.
-_ROTATION, _VECTOR = (
-    re.compile(r"\w*[a-zA-Z]R[a-zA-Z]\w*|\w*rotation\w*"),
-    re.compile(r"(platform_)?gyro|accel|mag|d_b"),
+from alidade.pipelines.methods.formula import (
+    AXES,
+    OPERATORS,
+    Formula,
+    Kind,
+    Value,
+    input_kind,
+    operate,
+    result_kind,
+    with_vectors,
 )
-# `Exp(angle ez)`: a number before the name of an axis.
-_AXIS = re.compile(r"(\w+) (e[xyz])\b")
-_AXES = {"ex": np.eye(3)[0], "ey": np.eye(3)[1], "ez": np.eye(3)[2]}
+
+_RANKS: tuple[Kind, ...] = ("scalar", "vector", "matrix")
 
 
 @dataclass(frozen=True)
 class _Node:
     """A part of an expression: its kind, and its value where it is a constant, else an operation on others.
 
-    Operations: a name that is measured, "name"; a call of an earlier formula, "call"; the names in `_PYTHON`.
+    Operations: the name of an input, "name"; a call of an earlier formula, "call"; those of `operate`.
     """
 
     kind: Kind
-    value: Array | None = None
+    value: Value | None = None
     op: str = ""
     parts: tuple[_Node, ...] = ()
     name: str = ""
     arguments: tuple[str, ...] = ()
+
+    @property
+    def array(self) -> Array | None:
+        """The constant; a rotation as a matrix."""
+        if self.value is None:
+            return None
+        return so3.matrix(self.value.array) if self.value.kind == "rotation" else self.value.array
 
 
 class _Reader:
     """Expressions of formulas, one after the other."""
 
     def __init__(self, values: Mapping[str, float]) -> None:
-        self._known: dict[str, Array] = {name: np.array(value) for name, value in values.items()}
-        for stem in {name[:-2] for name in values if name.endswith("_x")}:
-            if all(f"{stem}_{axis}" in values for axis in "xyz"):
-                self._known[stem] = np.array([values[f"{stem}_{axis}"] for axis in "xyz"])
+        self._known = with_vectors(values) | AXES
         self._earlier: dict[str, tuple[_Node, tuple[str, ...]]] = {}
-        self._measured: tuple[str, ...] = ()
+        self._inputs: tuple[str, ...] = ()
 
     def read(self, formula: Formula) -> _Node:
-        self._measured = formula.measured
-        node = self._node(ast.parse(_AXIS.sub(r"\1*\2", formula.expression), mode="eval").body)
-        self._earlier[formula.name] = node, formula.measured
+        self._inputs = formula.inputs
+        node = self._node(formula.tree)
+        self._earlier[formula.name] = node, formula.inputs
         return node
 
     def _node(self, tree: ast.expr) -> _Node:
         match tree:
             case ast.Constant(value=int() | float() as number):
-                return _constant(np.array(float(number)))
+                return _constant(Value("scalar", np.array(float(number))))
             case ast.Name(id=name):
-                return self._name(name)
+                return self.name(name)
             case ast.List(elts=rows):
-                return _constant(np.array([_value(self._node(row)) for row in rows]))
+                return _constant(Value.constant(np.array([_value(self._node(row)).array for row in rows])))
             case ast.UnaryOp(op=ast.USub(), operand=operand):
                 return _made("minus", self._node(operand))
             case ast.BinOp(left=left, op=op, right=right):
-                return _made(_OPERATORS[type(op)], self._node(left), self._node(right))
+                return _made(OPERATORS[type(op)], self._node(left), self._node(right))
             case ast.Call(func=ast.Name(id=name), args=[argument]):
                 return _made(name, self._node(argument))
         raise ValueError(f"not an expression of a formula: {ast.unparse(tree)}")
 
-    def _name(self, name: str) -> _Node:
+    def name(self, name: str) -> _Node:
+        """An earlier formula, an input or a parameter."""
         if name in self._earlier:
             node, arguments = self._earlier[name]
             return node if node.value is not None else _Node(node.kind, None, "call", (), name, arguments)
-        if name in self._measured:
-            kind: Kind = "matrix" if _ROTATION.fullmatch(name) else "vector" if _VECTOR.fullmatch(name) else "scalar"
-            return _Node(kind, None, "name", (), name)
-        return _constant(_AXES[name] if name in _AXES else self._known.get(name, np.array(0.0)))
+        if name in self._inputs:
+            return _Node(_printed(input_kind(name)), None, "name", (), name)
+        return _constant(Value.constant(self._known.get(name, np.array(0.0))))
 
 
-_OPERATORS: Mapping[type[ast.operator], str] = {
-    ast.Add: "add",
-    ast.Sub: "sub",
-    ast.Mult: "mul",
-    ast.Div: "div",
-    ast.Pow: "pow",
-}
+def _printed(kind: Kind) -> Kind:
+    """Rotations are matrices in the code."""
+    return "matrix" if kind == "rotation" else kind
 
 
-def _constant(value: Array) -> _Node:
-    return _Node(_RANKS[value.ndim], value)
+def _constant(value: Value) -> _Node:
+    return _Node(_printed(value.kind), value)
 
 
-def _value(node: _Node) -> Array:
+def _value(node: _Node) -> Value:
     if node.value is None:
         raise ValueError("a matrix with something measured in it")
     return node.value
@@ -110,53 +109,19 @@ def _value(node: _Node) -> Array:
 
 def _made(op: str, *parts: _Node) -> _Node:
     """The operation, computed where its parts are constants; what is times 0, or added to 0, is left out."""
+    kind = _printed(result_kind(op, [part.kind for part in parts]))
     if op in ("add", "sub", "mul"):
         a, b = parts
-        zero_a, zero_b = (part.value is not None and not part.value.any() for part in parts)
+        zero_a, zero_b = (part.value is not None and not part.value.array.any() for part in parts)
         if op == "mul" and (zero_a or zero_b):
-            kind = _kind(op, parts)
-            return _constant(np.zeros((3,) * _RANKS.index(kind)))
+            return _constant(Value(kind, np.zeros((3,) * _RANKS.index(kind))))
         if zero_b and _RANKS.index(b.kind) <= _RANKS.index(a.kind):
             return a
         if op == "add" and zero_a and _RANKS.index(a.kind) <= _RANKS.index(b.kind):
             return b
     if all(part.value is not None for part in parts):
-        return _constant(np.asarray(_COMPUTED[op](*(_value(part) for part in parts))))
-    return _Node(_kind(op, parts), None, op, parts)
-
-
-def _kind(op: str, parts: Sequence[_Node]) -> Kind:
-    kinds = [part.kind for part in parts]
-    if op in ("Exp", "Rx", "Ry", "Rz"):
-        return "matrix"
-    if op == "mul" and kinds == ["matrix", "vector"]:
-        return "vector"
-    return max(kinds, key=_RANKS.index)
-
-
-def _times(a: Array, b: Array) -> Array:
-    return np.asarray(a @ b if a.ndim == 2 and b.ndim > 0 else a * b)
-
-
-def _turned(axis: int, angle: Array) -> Array:
-    return so3.matrix(so3.exp(-angle * np.eye(3)[axis]))
-
-
-_COMPUTED: Mapping[str, Callable[..., Array]] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": _times,
-    "div": np.divide,
-    "pow": np.power,
-    "minus": np.negative,
-    "sin": np.sin,
-    "cos": np.cos,
-    "inverse": np.linalg.inv,
-    "Exp": lambda v: so3.matrix(so3.exp(v)),
-    "Rx": partial(_turned, 0),
-    "Ry": partial(_turned, 1),
-    "Rz": partial(_turned, 2),
-}
+        return _constant(operate(op, *map(_value, parts)))
+    return _Node(kind, None, op, parts)
 
 
 def python_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str:
@@ -164,11 +129,11 @@ def python_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str
     reader, lines = _Reader(values), []
     for formula in formulas:
         node = reader.read(formula)
-        lines += ["", "", f"# {formula.meaning}"]
+        lines += ["", "", f"# {formula.description}"]
         if node.value is not None:
             lines.append(f"{formula.name} = {_python(node)}")
         else:
-            lines += [f"def {formula.name}({', '.join(formula.measured)}):", f"    return {_python(node)}"]
+            lines += [f"def {formula.name}({', '.join(formula.inputs)}):", f"    return {_python(node)}"]
     body = "\n".join(lines)
     helpers = [text for name, text in _PYTHON_HELPERS.items() if re.search(rf"\b{name}\(", body)]
     return "\n".join(["import numpy as np", *helpers]) + body + "\n"
@@ -187,8 +152,8 @@ _PYTHON_HELPERS = {
 
 
 def _python(node: _Node) -> str:
-    if node.value is not None:
-        text = repr(np.vectorize(_digits, otypes=[float])(node.value).tolist())
+    if node.array is not None:
+        text = repr(np.vectorize(_digits, otypes=[float])(node.array).tolist())
         return text if node.kind == "scalar" else f"np.array({text})"
     turned = _axis_turn(node)
     if turned:
@@ -224,8 +189,8 @@ def _axis_turn(node: _Node) -> tuple[str, _Node] | None:
     """Exp(angle ez) as Rz(-angle)."""
     if node.op == "Exp" and node.parts[0].op == "mul":
         angle, axis = node.parts[0].parts
-        for name, unit in _AXES.items():
-            if axis.value is not None and np.array_equal(axis.value, unit):
+        for name, unit in AXES.items():
+            if axis.array is not None and np.array_equal(axis.array, unit):
                 return f"R{name[1]}", _made("minus", angle)
     return None
 
@@ -239,11 +204,11 @@ def c_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str:
     for formula in formulas:
         node = reader.read(formula)
         kind = _C_TYPES[node.kind]
-        lines += ["", f"/* {formula.meaning} */"]
-        if node.value is not None:
-            lines.append(f"static const {kind} {formula.name} = {_c_numbers(node.value)};")
+        lines += ["", f"/* {formula.description} */"]
+        if node.array is not None:
+            lines.append(f"static const {kind} {formula.name} = {_c_numbers(node.array)};")
         else:
-            needed = ", ".join(f"{_C_TYPES[reader._name(name).kind]} {name}" for name in formula.measured)
+            needed = ", ".join(f"{_C_TYPES[reader.name(name).kind]} {name}" for name in formula.inputs)
             lines.append(f"static {kind} {formula.name}({needed}) {{ return {_c(node)}; }}")
     body = "\n".join(lines)
     needed_helpers: list[str] = []
@@ -291,8 +256,8 @@ _C_HELPERS = {
 
 
 def _c(node: _Node) -> str:
-    if node.value is not None:
-        text = _c_numbers(node.value)
+    if node.array is not None:
+        text = _c_numbers(node.array)
         return text if node.kind == "scalar" else f"({_C_TYPES[node.kind]}){text}"
     turned = _axis_turn(node)
     if turned:

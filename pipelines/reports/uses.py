@@ -19,7 +19,7 @@ class AppliedFormulas:
     def __init__(self, formulas: Sequence[Formula], values: Mapping[str, float], others: Mapping[str, float]) -> None:
         self.values = values
         self._formulas, self._all = formulas, {**others, **values}
-        self._needed = {name for formula in formulas for name in formula.measured}
+        self._needed = {name for formula in formulas for name in formula.inputs}
         self._first = {"temperature": others["first_temperature"]} if "first_temperature" in others else {}
 
     def __call__(self, **measured: Array) -> Mapping[str, Array]:
@@ -36,7 +36,7 @@ def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
     posterior, noise = posterior_of(c), {noise.name: noise.used for noise in c.noises}
     true = Truth(posterior.names, posterior.x)
     found = []
-    for use in c.method.uses(true, c.config, noise):
+    for use in c.method.report.uses(true, c.config, noise):
         with suppress(AttributeError, KeyError):  # its formulas need parameters that this graph has not got
             found.append(use_bands(use, posterior))
     return tuple(found)
@@ -57,7 +57,7 @@ def posterior_of(c: Calibration) -> Posterior:
 
     def formulas(known: Sequence[str], values: Mapping[str, float]) -> AppliedFormulas:
         kept = {name: values[name] for name in known if name in values}
-        return AppliedFormulas(c.method.formulas(list(known), c.config), kept, others)
+        return AppliedFormulas(c.method.report.formulas(list(known), c.config), kept, others)
 
     everything = [q.name for q in c.problem.quantities]
     truth = None

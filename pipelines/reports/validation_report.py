@@ -14,7 +14,6 @@ from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Table
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.whole import write_page
@@ -77,7 +76,7 @@ def _changes(validated: Validated) -> tuple[Block, ...]:
         unit, factor = human_unit(validated.held.quantities[step.name])
         numbers = (step.size, step.sigma, validated.held.changes.limit * step.sigma)
         change, sigma, threshold = (to_digits_of(factor * x, factor * step.sigma) for x in numbers)
-        name = Cell(step.name, meaning(method(validated.calibration.method), step.name))
+        name = Cell(step.name, method(validated.calibration.method).describe(step.name))
         rows.append((name, change, sigma, threshold, unit))
     caption = (
         "Change: this recording's estimate less the calibration's. Threshold: beyond it a change is significant "

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from alidade.pipelines.errors import InputError, nearest
-from alidade.pipelines.estimation.assumptions import Assumption, quantities
+from alidade.pipelines.estimation.parameters import ParameterSpec, quantities
 from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config, Sensors
 
@@ -39,7 +39,7 @@ class Warming(BaseModel):
 
 
 def true_values(
-    assumptions: Sequence[Assumption],
+    assumptions: Sequence[ParameterSpec],
     sensors: Sensors | None,
     given: Mapping[str, float],
     rng: np.random.Generator,
@@ -72,7 +72,7 @@ def measured(warming: Warming | None, duration: float) -> Temperature | None:
     return None if warming is None else warming.measured(duration)
 
 
-def known(assumptions: Sequence[Assumption], warming: Warming | None) -> list[Assumption]:
+def known(assumptions: Sequence[ParameterSpec], warming: Warming | None) -> list[ParameterSpec]:
     """Without those about a temperature, where there is none."""
     return [each for each in assumptions if warming is not None or each.figure != "temperature"]
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-from alidade.pipelines.methods import names
+import pytest
+
+from alidade.pipelines.methods import _Deferred, method, names
 
 ROOT = Path(__file__).parents[2]
 ROOMS = [ROOT / "factors", ROOT / "pipelines"]
@@ -43,3 +47,24 @@ def test_no_test_imports_from_another_test() -> None:
     imports = re.compile(r"^\s*(?:from|import) tests\.(?:\w+\.)*(test_\w+)", re.MULTILINE)
     for path in (ROOT / "tests").rglob("*.py"):
         assert set(imports.findall(path.read_text(encoding="utf-8"))) <= {path.stem}, path.name
+
+
+@pytest.mark.parametrize("name", names())
+def test_everything_that_a_method_defers_can_be_imported(name: str) -> None:
+    found = method(name)
+    assert found.simulator is not None
+    groups: list[Any] = [found.simulator, found.guidance, found.report, found.faults]
+    for group in groups:
+        for field in dataclasses.fields(getattr(group, "_target", group)):
+            value = getattr(group, field.name)
+            assert callable(value._target) if isinstance(value, _Deferred) else True, field.name
+    for function in (found.problem, found.published, found.read, found.write_data):
+        assert callable(getattr(function, "_target", function))
+    assert found.settings() is not None
+
+
+def test_declarations_of_methods_import_nothing_slow() -> None:
+    """Every command reads them."""
+    code = "import sys; from alidade.pipelines.methods import method, names; [method(name) for name in names()]"
+    run = [sys.executable, "-c", f"{code}; print([m for m in ('cv2', 'scipy', 'bokeh') if m in sys.modules])"]
+    assert subprocess.run(run, cwd=ROOT, capture_output=True, text=True).stdout.strip() == "[]"

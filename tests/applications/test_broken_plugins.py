@@ -17,7 +17,7 @@ from tests.support.command import Command
 @pytest.fixture
 def broken(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     entry = EntryPoint("torn", "no_such_module:Torn", methods.GROUP)
-    monkeypatch.setattr(methods, "_brought", lambda: {"torn": entry})
+    monkeypatch.setattr(methods, "_plugins", lambda: {"torn": entry})
     methods._is_sound.cache_clear()
     yield
     methods._is_sound.cache_clear()

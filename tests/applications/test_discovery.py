@@ -14,8 +14,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.methods.head.recording import read_head
-from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
+from alidade.pipelines.methods.head.recording import VISION_ATTITUDE, read_head
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.pairing import pair

@@ -18,7 +18,6 @@ import alidade as door
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.finding import KINDS
-from alidade.pipelines.methods.meanings import COMMON as MEANINGS
 from docs._site.tables import arrays, commands, config_keys, data_sheets, noise, result_keys, scenarios
 from docs._site.words import BUDGET, BUDGETS, counted, dialect, generated, prose, words
 from tests.install.walk import Step, difference, steps
@@ -161,7 +160,7 @@ def test_parameters_scenarios_and_arrays_are_in_the_words_of_the_field(method: s
 
 
 def _meanings(method: str) -> list[str]:
-    return [*MEANINGS.values(), *methods.method(method).meanings.values()]
+    return [spec.description for spec in methods.method(method).parameters]
 
 
 def test_pages_keep_their_budgets() -> None:

@@ -10,9 +10,9 @@ import pytest
 from alidade.pipelines.belief import independent
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.topics import CubeConfig, field_date
-from alidade.pipelines.methods.head.topics import HEAD_IMU, HeadConfig
-from alidade.pipelines.methods.los.topics import GIMBAL
+from alidade.pipelines.methods.cube.recording import CubeConfig, field_date
+from alidade.pipelines.methods.head.recording import HEAD_IMU, HeadConfig
+from alidade.pipelines.methods.los.recording import GIMBAL
 from alidade.pipelines.settings import Tag, check_names, first_given
 
 # The example of the file format, with every key.

@@ -26,9 +26,9 @@ from alidade.pipelines.diagnostics.trial_fit import held_out_residuals, solve_tr
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Estimate, Problem, Residuals, Step
 from alidade.pipelines.methods import Method, method
+from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.cube.topics import CubeConfig
 from alidade.pipelines.methods.head.recording import write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
@@ -88,7 +88,7 @@ def with_noise(config: Config, **factors: float) -> Config:
 
 def hypotheses(case: Case, estimate: Estimate | None = None) -> tuple[Finding, ...]:
     found, data, config = case
-    return find_hypotheses(found.graph, found.hypotheses(), data, config, estimate)
+    return find_hypotheses(found.graph, found.faults, data, config, estimate)
 
 
 def first_hypothesis(case: Case) -> str:
@@ -151,7 +151,7 @@ def test_sign_of_the_platform_gyro(head: Case) -> None:
 def test_faults_of_the_head_are_mended(head: Case) -> None:
     """What each trial changes, changed back by the same."""
     find, data, config = head
-    inverted, reordered, reordered_back, swapped, moving = find.hypotheses().faults
+    inverted, reordered, reordered_back, swapped, moving = find.faults.faults
     once = inverted.corrected(data, config)
     assert once is not None
     np.testing.assert_allclose(once[0].vision_wxyz, so3.inverse(data.vision_wxyz))
@@ -316,7 +316,7 @@ def test_size_of_the_cubes_tags(seed: int) -> None:
 
 def test_a_cut_keeps_stamps_and_readings_together(head: Case) -> None:
     _, data, _ = head
-    part = method("head").hypotheses().segment(data, 3.0, 7.0)
+    part = method("head").faults.segment(data, 3.0, 7.0)
     for stamps, values in ((part.head_t, part.head_gyro), (part.vision_t, part.vision_wxyz)):
         assert len(stamps) == len(values)
         assert 3.0 <= stamps[0] < stamps[-1] < 7.0
@@ -341,13 +341,13 @@ def test_a_tenth_rejected_is_a_note_and_a_quarter_is_inconsistent(head: Case) ->
 
 def test_halves_of_a_recording_agree_and_those_of_two_do_not(head: Case) -> None:
     find, data, config = head
-    halves = split_halves(find.graph, find.hypotheses(), data, config)
+    halves = split_halves(find.graph, find.faults, data, config)
     assumed = {q.name for q in find.graph(data, config).quantities if q.group}
     assert set(halves) - assumed == {"gyro_bias_x", "gyro_bias_y", "gyro_bias_z"}
     assert max(abs(half.z) for half in halves.values()) < 4.0
     late = data.head_t > 0.5 * data.head_t[-1]
     jump = data.head_gyro + 0.02 * late[:, None] * np.array([1.0, 0.0, 0.0])
-    changed = split_halves(find.graph, find.hypotheses(), replace(data, head_gyro=jump), config)["gyro_bias_x"]
+    changed = split_halves(find.graph, find.faults, replace(data, head_gyro=jump), config)["gyro_bias_x"]
     assert changed.z > 4.0
     assert changed.step == pytest.approx(0.02, rel=0.3)
 
@@ -397,7 +397,7 @@ def test_a_trial_that_raises_ends_alone_and_is_logged(
 
     monkeypatch.setattr(hypothesis_tests, "trial_cases", some)
     with caplog.at_level(logging.DEBUG, trial_fit.__name__):
-        found = find_hypotheses(fragile, find.hypotheses(), flipped, config)
+        found = find_hypotheses(fragile, find.faults, flipped, config)
     assert found[0].evidence["label"] == "the sign of the helmet gyro's y is wrong"
     warnings = [record.message for record in caplog.records if record.levelno == logging.WARNING]
     assert any("deg/s" in text and "RuntimeError: no such key" in text for text in warnings)
@@ -420,9 +420,9 @@ def test_without_residual_families_there_is_no_worst_segment_and_no_crash(head: 
         return replace(built, steps=steps, loss=None)
 
     wrong = replace(data, head_gyro=data.head_gyro * [1.0, -1.0, 1.0])
-    short = find.hypotheses().segment(wrong, 0.0, 3.0)
+    short = find.faults.segment(wrong, 0.0, 3.0)
     assert solve_trial(processes, short, config) is not None
-    find_hypotheses(processes, replace(find.hypotheses(), signs={}, faults=()), short, config, nothing)
+    find_hypotheses(processes, replace(find.faults, signs={}, faults=()), short, config, nothing)
 
 
 @pytest.mark.slow

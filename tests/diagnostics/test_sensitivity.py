@@ -56,7 +56,7 @@ def in_sigmas(moved: Array, estimate: Estimate, names: list[str]) -> Array:
 
 def moves(of: Session, name: str) -> tuple[Array, Array]:
     """What an input off by a little moves, as foretold and when solved again, in sigmas of the usual size."""
-    exact = next(e for e in of.method.hypotheses().exact if e.name == name)
+    exact = next(e for e in of.method.faults.exact if e.name == name)
     changed = exact.changed(of.data, of.config, SHARE * exact.step)
     assert changed is not None
     before = solve_batch(of.problem(), budget=True, changed=[(name, of.method.problem(*changed))])
@@ -105,7 +105,7 @@ def test_an_input_that_cannot_be_changed_is_left_out(monkeypatch: pytest.MonkeyP
     def unusable(data: Any, config: Config, change: float) -> tuple[Any, Config]:
         return replace(data, gyro=-change * data.gyro), config
 
-    found = of.method.hypotheses()
+    found = of.method.faults
     found = replace(found, exact=(ExactInput("direction", "1", 1.0, unusable), *found.exact))
     monkeypatch.setattr(type(of.method), "hypotheses", lambda _: found)
     sensitivity = of.calibrate().sensitivity

@@ -13,8 +13,8 @@ from alidade.pipelines.applications.follow.guidance import View, Watch
 from alidade.pipelines.diagnostics import change_test
 from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
-from alidade.pipelines.estimation.assumptions import pull
 from alidade.pipelines.estimation.finding import Severity
+from alidade.pipelines.estimation.parameters import pull
 from alidade.pipelines.estimation.problem import Array, Course, Estimate, History, Quantity, Told
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch

@@ -51,7 +51,7 @@ def test_true_values_applied_leave_no_error(name: str) -> None:
     posterior = posterior_of(c)
     true = Truth(posterior.names, posterior.x)
     noise = {each.name: each.used for each in c.noises}
-    for use in c.method.uses(true, c.config, noise):
+    for use in c.method.report.uses(true, c.config, noise):
         for line in use.lines:
             left = line.error(posterior.whole, true)
             before = line.error(posterior.nominal, true)

@@ -11,11 +11,11 @@ from ruamel.yaml import YAML
 
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.assumptions import Assumption
-from alidade.pipelines.methods.cube.parameters import ASSUMPTIONS as CUBE
-from alidade.pipelines.methods.head.parameters import ASSUMPTIONS as HEAD
-from alidade.pipelines.methods.indexer.parameters import ASSUMPTIONS as INDEXER
-from alidade.pipelines.methods.los.parameters import ASSUMPTIONS as LOS
+from alidade.pipelines.estimation.parameters import ParameterSpec
+from alidade.pipelines.methods.cube.parameters import NUISANCE as CUBE
+from alidade.pipelines.methods.head.parameters import NUISANCE as HEAD
+from alidade.pipelines.methods.indexer.parameters import NUISANCE as INDEXER
+from alidade.pipelines.methods.los.parameters import NUISANCE as LOS
 from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.methods.tumble import turning
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
@@ -24,7 +24,7 @@ from docs._site.tables import SHEETS, default_sigmas
 from tests.install.walk import steps
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "data-sheets.md"
-ASSUMED: dict[str, Sequence[Assumption]] = {
+ASSUMED: dict[str, Sequence[ParameterSpec]] = {
     "los": LOS,
     "head": HEAD,
     "indexer": INDEXER,
@@ -32,7 +32,7 @@ ASSUMED: dict[str, Sequence[Assumption]] = {
     "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD, ACCEL_SQUARE),
 }
 DEFAULTS = {
-    (method, f"{each.sheet}.{each.figure}"): each.sigma for method, assumed in ASSUMED.items() for each in assumed
+    (method, f"{each.sheet}.{each.figure}"): each.prior for method, assumed in ASSUMED.items() for each in assumed
 }
 SECTIONS = [pytest.param(step.file.split("-")[0], step.text, id=step.file) for step in steps(PAGE)]
 
@@ -64,6 +64,6 @@ def test_defaults_shown_are_those_of_the_program() -> None:
 def test_sections_state_what_their_methods_have_a_use_for(method: str, section: str) -> None:
     sensors = load_config(section.encode()).sensors
     for sensor in sensors.model_fields_set:
-        assert sensor in methods.method(method).sheets
+        assert sensor in methods.method(method).data_sheets
         for figure in getattr(sensors, sensor).model_fields_set:
             assert (method, f"{sensor}.{figure}") in DEFAULTS

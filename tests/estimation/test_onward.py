@@ -22,7 +22,7 @@ WARMED = 0.5
 def _between(name: str, data: Any, start: float, stop: float) -> Any:
     """What was measured in between."""
     cut: dict[str, Any] = {}
-    for stamps, carried in method(name).hypotheses().streams.items():
+    for stamps, carried in method(name).faults.streams.items():
         t = getattr(data, stamps)
         inside = (t >= start) & (t < stop)
         cut |= {field: getattr(data, field)[inside] for field in (stamps, *carried) if getattr(data, field) is not None}

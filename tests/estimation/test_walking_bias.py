@@ -10,9 +10,9 @@ import pytest
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.estimation.walking_bias import WalkingBias
-from alidade.pipelines.methods.head.graph import problem as head_problem
+from alidade.pipelines.methods.head.model import problem as head_problem
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from alidade.pipelines.methods.los.graph import problem as los_problem
+from alidade.pipelines.methods.los.model import problem as los_problem
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch

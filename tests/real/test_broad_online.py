@@ -25,7 +25,7 @@ def test_every_second_is_within_the_sigmas_given_then(name: str, shared_data: Pa
     converted(shared_data / "broad" / f"{name}.mat", tmp_path / "s.mcap")
     session = Session.read(open_recording(tmp_path / "s.mcap"), None, None)
     method, config = session.method, session.config
-    whole = method.graph(method.hypotheses().segment(session.data, 0.0, SECONDS), config)
+    whole = method.graph(method.faults.segment(session.data, 0.0, SECONDS), config)
     final, online = solve_batch(whole), solve_incremental(whole)
     history = online.history
     assert history is not None
@@ -35,7 +35,7 @@ def test_every_second_is_within_the_sigmas_given_then(name: str, shared_data: Pa
     off = np.abs(history.values - final.values)[rows][:, steady] / history.sigmas[rows][:, steady]
     assert off.max() < 4.0
     for moment in ASKED:
-        then = solve_batch(method.graph(method.hypotheses().segment(session.data, 0.0, moment), config))
+        then = solve_batch(method.graph(method.faults.segment(session.data, 0.0, moment), config))
         row = int(np.searchsorted(history.time, moment, side="right")) - 1
         assert (history.sigmas[row, ~fixed] > 0.7 * then.sigmas[~fixed]).all(), moment
     assert (np.abs(online.values - final.values)[~fixed] < 0.5 * final.sigmas[~fixed]).all()

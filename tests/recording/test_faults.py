@@ -15,10 +15,10 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head import model as head
 from alidade.pipelines.methods.head.recording import read_head, write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.recording import read_los, write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledGyro

@@ -19,7 +19,7 @@ from alidade.pipelines.applications.session import calibrate, session_facts
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method, simulate
-from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
+from alidade.pipelines.methods.head.recording import VISION_ATTITUDE
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.mcap_writer import write_session

@@ -45,7 +45,7 @@ def test_which_methods_a_recording_serves(shared_data: Path) -> None:
         config = load_config(recording.attachment("alidade.yaml"))
         facts = session_facts(recording, config)
         # What makes do with a magnetometer yields to all others.
-        assert [name for name in facts.methods if not method(name).yields] == [config.method]
+        assert [name for name in facts.methods if not method(name).fallback] == [config.method]
         assert resolve_method(None, recording, NONE) == config.method
         assert all(topic.duplicates == topic.out_of_order == 0 for topic in facts.topics)
 
@@ -109,7 +109,7 @@ def test_several_methods_served_is_an_error_that_names_them(tmp_path: Path) -> N
 
 def test_needs_are_made_of_known_keys() -> None:
     topics = {topic for name in names() for topic in method(name).topics}
-    needed = {one for name in names() for need in method(name).needs for group in need for one in group}
+    needed = {one for name in names() for need in method(name).requirements for group in need for one in group}
     settings = {one.phrase.split(" in the config")[0] for one in needed if isinstance(one, Setting)}
     assert {one for one in needed if isinstance(one, Topic)} <= topics
     assert settings <= {"latitude_deg", "head.board", "cube.tags", "`method: cube`", "`method: tumble`"}

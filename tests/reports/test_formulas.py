@@ -87,10 +87,11 @@ def _config(case: str) -> Config:
 def test_the_text_says_what_the_code_computes(case: str) -> None:
     name, parameters = CASES[case]
     rng = np.random.default_rng(0)
-    formulas = method(name).formulas(parameters, _config(case))
+    formulas = method(name).report.formulas(parameters, _config(case))
     values = {parameter: float(x) for parameter, x in zip(parameters, rng.normal(size=len(parameters)), strict=True)}
+    values["first_stamp"] = 0.3
     measured: dict[str, Any] = {}
-    for quantity in dict.fromkeys(m for formula in formulas for m in formula.measured):
+    for quantity in dict.fromkeys(m for formula in formulas for m in formula.inputs):
         if quantity in ROTATIONS:
             measured[quantity] = so3.exp(rng.normal(size=3))
         else:
@@ -115,14 +116,14 @@ def test_los_formulas_are_those_of_the_graph_whatever_is_free() -> None:
     angles = 0.1 * rng.normal(size=len(names))
     gimbal = rng.normal(size=(1, 2))
     cRm = LosDirectionFactor(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)), gimbal, names).camera(angles[None])[0]
-    formulas = method("los").formulas(names, Config())
+    formulas = method("los").report.formulas(names, Config())
     values = dict(zip(names, angles.tolist(), strict=True))
     found = apply(formulas, values, {"azimuth": gimbal[0, 0], "elevation": gimbal[0, 1]})
     np.testing.assert_allclose(so3.log(so3.compose(found["lRb"], found["M"], so3.inverse(cRm))), 0.0, atol=1e-12)
     text = " ".join(formula.text for formula in formulas)
     assert all(name in text for name in names)
     assert "time_offset" not in text
-    assert "time_offset" in method("los").formulas([*names, "time_offset"], Config())[-1].text
+    assert "time_offset" in method("los").report.formulas([*names, "time_offset"], Config())[-1].text
 
 
 def test_indexer_formulas_scale_the_gyro_and_tilt_the_axes_where_these_are_free() -> None:
@@ -134,7 +135,9 @@ def test_indexer_formulas_scale_the_gyro_and_tilt_the_axes_where_these_are_free(
     theta, bias, scale = (np.array([values[f"{n}_{a}"] for a in "xyz"]) for n in ("theta", "gyro_bias", "gyro_scale"))
     rate = rng.normal(size=3)
     measured = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), rate) + bias
-    found = apply(method("indexer").formulas(free, Config()), values, {"gyro": measured, "outer": 0.3, "inner": 0.7})
+    found = apply(
+        method("indexer").report.formulas(free, Config()), values, {"gyro": measured, "outer": 0.3, "inner": 0.7}
+    )
     np.testing.assert_allclose(found["w_it"], rate, atol=1e-12)
     tilt = values["axis_nonperpendicularity"]
     np.testing.assert_allclose(so3.matrix(found["bRt"]), so3.matrix(base_from_platform(0.3, 0.7, tilt)), atol=1e-12)
@@ -152,9 +155,9 @@ def test_a_calibration_applies_itself() -> None:
     off, left = (np.abs(rate - plain.head_gyro + bias).max() for rate in (data.head_gyro - bias, found["w_iv"]))
     assert left < 0.3 * off
     assert found["bRv"].shape == (3, 4)
-    feels = method("head").formulas(["gyro_g_xx"], Config())
+    feels = method("head").report.formulas(["gyro_g_xx"], Config())
     # No g-sensitivity was determined: the specific force, given all the same, is not looked at.
-    assert not any("accel" in formula.measured for formula in calibration.formulas)
+    assert not any("accel" in formula.inputs for formula in calibration.formulas)
     same = calibration.apply(gyro=data.head_gyro, accel=data.head_force)
     np.testing.assert_array_equal(same["w_iv"], found["w_iv"])
     with pytest.raises(InputError, match="apply: gyro serves only together with accel"):
@@ -191,7 +194,7 @@ def test_a_saved_calibration_applies_as_the_one_it_is_of(
     loaded = alidade.load(tmp_path / "calibration.yaml")
     rng = np.random.default_rng(0)
     numbers = ("azimuth", "elevation", "outer", "inner", "stamp")
-    names = dict.fromkeys(name for formula in calibration.formulas for name in formula.measured)
+    names = dict.fromkeys(name for formula in calibration.formulas for name in formula.inputs)
     vectors = {name: rng.normal(size=3) for name in names}
     measured = {
         name: vector[0] if name in numbers else so3.exp(vector) if re.search("R|rotation", name) else vector
@@ -209,3 +212,11 @@ def test_formulas_of_another_config_are_refused(tmp_path: Path) -> None:
     file.write_text(calibration_yaml(calibration).replace("mag_k11, mag_k12", "mag_k12, mag_k11"))
     with pytest.raises(InputError, match="not those of its parameters and this config"):
         alidade.load(file).apply(mag=[0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("name", ["head", "los"])
+def test_time_of_a_picture_has_the_clock_drift(name: str) -> None:
+    values = {"time_offset": 0.02, "clock_skew": 1e-4}
+    own = [each for each in method(name).report.formulas(values, Config()) if each.name == "time"]
+    found = apply(own, values | {"first_stamp": 5.0}, {"stamp": np.array([5.0, 605.0])})
+    np.testing.assert_allclose(found["time"], [5.02, 605.02 - 0.06], atol=1e-12)

@@ -7,13 +7,12 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.settings import Config
 from tests.support.formulas import CASES
 
 NAMES = {
     "los": ["gyro_temperature_x", "target_rate_x", "encoder_azimuth_sin"],
-    "indexer": ["encoder_outer_cos", "encoder_delay"],
+    "indexer": ["encoder_outer_x_cos", "encoder_delay"],
     "head": ["platform_bias_x", "platform_skew_xy", "clock_skew", "vision_scale"],
     "cube": ["field_e", "accel_cube_2", "camera_focal", "camera_centre_x", "gyro_g_xy"],
     "tumble": ["mag_delay", "field_strength", "field_dip", "gravity", "mag_k12", "accel_b1"],
@@ -24,21 +23,21 @@ NAMES = {
 def test_every_parameter_has_a_meaning(case: str) -> None:
     name, parameters = CASES[case]
     for each in (*parameters, *NAMES.get(name, ())):
-        assert meaning(method(name), each).endswith("."), each
+        assert method(name).describe(each).endswith("."), each
 
 
 def test_the_words_are_of_the_parameter() -> None:
-    assert meaning(method("head"), "gyro_bias_y") == "Gyro bias about y."
-    assert meaning(method("cube"), "mag_k12") == "Magnetometer cross-axis term (y into x)."
-    assert meaning(method("head"), "unheard_of") == ""
+    assert method("head").describe("gyro_bias_y") == "Gyro bias about y."
+    assert method("cube").describe("mag_k12") == "Magnetometer cross-axis term (y into x)."
+    assert method("head").describe("unheard_of") == ""
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_sketches_are_svg_of_the_transforms_that_there_are(name: str) -> None:
-    sketch = method(name).sketch
+    sketch = method(name).frames
     assert sketch is not None
     root = ET.parse(sketch).getroot()
     assert root.tag.endswith("svg")
     turns = {each.attrib["data-turn"] for each in root.iter() if "data-turn" in each.attrib}
     parameters = next((known for of, known in CASES.values() if of == name), ())
-    assert turns <= {formula.name for formula in method(name).formulas(parameters, Config())}
+    assert turns <= {formula.name for formula in method(name).report.formulas(parameters, Config())}

@@ -11,8 +11,8 @@ import pytest
 
 from alidade.pipelines.display.drawing import along, covered, swaying
 from alidade.pipelines.methods.cube.faces import SIDES, Side
-from alidade.pipelines.methods.cube.picture import rested
-from alidade.pipelines.methods.indexer.picture import turning
+from alidade.pipelines.methods.cube.guidance import rested
+from alidade.pipelines.methods.indexer.guidance import turning
 
 
 def _words(picture: str) -> list[str]:

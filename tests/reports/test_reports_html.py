@@ -16,8 +16,8 @@ from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import Attitudes, Parameter, Quantity, Residuals
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.methods.head.figures import head_plots
 from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.head.report import head_plots
 from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.plots import common_plots

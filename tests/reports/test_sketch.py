@@ -19,7 +19,7 @@ def turned(*degrees: float) -> SavedTransform:
 
 
 def test_the_axes_found_are_drawn_where_the_parents_are() -> None:
-    sketch = method("los").sketch
+    sketch = method("los").frames
     assert sketch is not None
     svg = sketch.read_text()
     drawn = sketch_with(svg, {"M": turned(0.0, 0.0, 90.0)})

@@ -28,8 +28,8 @@ def case(name: str) -> tuple[list[Formula], dict[str, float], dict[str, Array]]:
     chosen, names = CASES[name]
     values = {each: float(value) for each, value in zip(names, rng.normal(0.0, 0.05, len(names)), strict=True)}
     values |= {each: 1.0 + values[each] for each in names if each.endswith(("k11", "k22", "k33"))}
-    formulas = list(method(chosen).formulas(names, Config()))
-    measured = {each: measurement(each, rng) for formula in formulas for each in formula.measured}
+    formulas = list(method(chosen).report.formulas(names, Config()))
+    measured = {each: measurement(each, rng) for formula in formulas for each in formula.inputs}
     return formulas, values, measured
 
 
@@ -53,7 +53,7 @@ def test_python_code_computes_what_apply_does(name: str) -> None:
     given = as_matrices(measured)
     for formula in formulas:
         made = space[formula.name]
-        found = made(*(given[each] for each in formula.measured)) if callable(made) else made
+        found = made(*(given[each] for each in formula.inputs)) if callable(made) else made
         expected = as_matrices(apply(formulas, values, measured))[formula.name]
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8, err_msg=formula.text)
 
@@ -68,7 +68,7 @@ def test_c_code_computes_what_apply_does(name: str, tmp_path: Path) -> None:
         kind, text = ("double", "vec", "mat")[value.ndim], str(value.tolist()).replace("[", "{").replace("]", "}")
         lines.append(f"{kind} {each} = {text if value.ndim == 0 else '{' + text + '}'};")
     for formula in formulas:
-        call = f"{formula.name}({', '.join(formula.measured)})" if formula.measured else formula.name
+        call = f"{formula.name}({', '.join(formula.inputs)})" if formula.inputs else formula.name
         kind, size = ("double", "vec", "mat")[expected[formula.name].ndim], expected[formula.name].size
         lines += [f"{{ {kind} r = {call}; const double *p = (const double *)&r;"]
         lines += [f'for (int i = 0; i < {size}; i++) printf("%.12g ", p[i]);', 'printf("\\n"); }']

@@ -94,7 +94,7 @@ def test_a_cubes_mounts_are_those_of_its_config_corrected() -> None:
     calibration = Session.of(cube, simulated).calibrate()
     transforms = saved(calibration).transforms
     assert (transforms["BRC"].parent, transforms["BRC"].child) == ("reference", "camera")
-    given = np.array(cube.stated(calibration.config)["camera_rotation"])
+    given = np.array(cube.report.fixed_rotations(calibration.config)["camera_rotation"])
     mount = np.array([calibration.parameters[f"camera_mount_{axis}"].value for axis in "xyz"])
     expected = so3.matrix(so3.compose(given, so3.exp(mount)))
     np.testing.assert_allclose(so3.matrix(np.array(transforms["BRC"].wxyz)), expected, atol=1e-10)

@@ -13,8 +13,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.methods.cube.faces import Resting
-from alidade.pipelines.methods.cube.poses import static_poses
-from alidade.pipelines.methods.cube.recording import read_cube
+from alidade.pipelines.methods.cube.recording import CubeConfig, read_cube
 from alidade.pipelines.methods.cube.scenario import (
     YEAR,
     CubeCamera,
@@ -26,8 +25,7 @@ from alidade.pipelines.methods.cube.scenario import (
     cube_config,
 )
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.cube.static_intervals import static_intervals
-from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.static_poses import static_intervals, static_poses
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 

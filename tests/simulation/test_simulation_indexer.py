@@ -12,7 +12,6 @@ from alidade.factors.earth import EARTH_RATE
 from alidade.pipelines.config import load_config
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.methods.indexer.recording import read_indexer
-from alidade.pipelines.methods.indexer.runs import axis_motion
 from alidade.pipelines.methods.indexer.simulation import (
     ARCSEC,
     IndexerNoise,
@@ -20,6 +19,7 @@ from alidade.pipelines.methods.indexer.simulation import (
     Position,
     simulate_indexer,
 )
+from alidade.pipelines.methods.indexer.windows import axis_motion
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from alidade.factors import so3
 from alidade.pipelines.methods.los import simulation
-from alidade.pipelines.methods.los.parameters import ASSUMPTIONS
+from alidade.pipelines.methods.los.parameters import NUISANCE
 from alidade.pipelines.methods.los.simulation import (
     LosAngles,
     LosNoise,
@@ -27,7 +27,7 @@ from alidade.pipelines.simulation.motion import EulerMotion
 SILENT = LosNoise(gyro_density=0.0, gyro_bias_walk=0.0, encoder=0.0, los_error=0.0, los_roll=0.0)
 STRAIGHT = LosAngles(delta_px=0, delta_pz=0, delta_gx=0, delta_gy=0, delta_gz=0)
 IDEAL: dict[str, Any] = {"noise": SILENT, "gyro_turn_on_bias": 0.0, "duration_s": 20.0, "acquisition_error": 0.0}
-PERFECT = {name: 0.0 for each in ASSUMPTIONS for name in each.names}
+PERFECT = {name: 0.0 for each in NUISANCE for name in each.names}
 
 
 def test_gyro_samples_multiply_to_the_carriers_attitude() -> None:

@@ -16,7 +16,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem
-from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.methods.los.recording import read_los, write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.recording import open_recording
@@ -40,7 +40,7 @@ IDENTITY = {"recording": "first", "config": "{}"}
 RESUME = """
 import json, sys
 from pathlib import Path
-from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.config import load_config
 from alidade.pipelines.methods.los.recording import read_los
 from alidade.pipelines.recording.recording import open_recording

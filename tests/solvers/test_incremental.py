@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods.head.simulation import HeadScenario
-from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import los_config, simulate_los
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion

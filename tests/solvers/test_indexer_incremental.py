@@ -12,7 +12,7 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Problem
-from alidade.pipelines.methods.indexer.graph import problem
+from alidade.pipelines.methods.indexer.model import problem
 from alidade.pipelines.methods.indexer.recording import read_indexer
 from alidade.pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.recording.recording import open_recording

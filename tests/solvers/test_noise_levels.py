@@ -16,7 +16,7 @@ from alidade.factors import so3
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
-from alidade.pipelines.methods.cube.static_intervals import static_intervals
+from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.methods.noise import white_density
 from alidade.pipelines.settings import DEFAULT_NOISE, Config
 from alidade.pipelines.settings import Noise as NoiseSettings

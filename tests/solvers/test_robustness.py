@@ -14,12 +14,12 @@ from alidade.factors import so3
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Problem
-from alidade.pipelines.methods.cube import graph as cube
+from alidade.pipelines.methods.cube import model as cube
 from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.indexer import graph as indexer
+from alidade.pipelines.methods.indexer import model as indexer
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
-from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.recording import write_los
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
 from alidade.pipelines.methods.triads import triad_names

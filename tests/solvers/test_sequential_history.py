@@ -10,7 +10,7 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.methods.indexer import graph as indexer
+from alidade.pipelines.methods.indexer import model as indexer
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers import chain

@@ -13,7 +13,7 @@ from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
-from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers import levenberg
 from alidade.pipelines.solvers.batch import minimum, solve_batch

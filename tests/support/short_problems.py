@@ -7,9 +7,9 @@ from typing import Any
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head import model as head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 

@@ -426,7 +426,7 @@ def test_a_real_cube_of_18_tags(shared_data) -> None:  # type: ignore[no-untyped
     # Its shutter does not roll.
     assert abs(layout.line_time[0]) < 3.0 * layout.line_time_sigma[0]
     from alidade.pipelines.methods.cube.layout import _shots
-    from alidade.pipelines.methods.cube.topics import CubeConfig
+    from alidade.pipelines.methods.cube.recording import CubeConfig
 
     shots, given = _shots(recording, config), TagBody.from_board(config.section(CubeConfig))
     assert shots.time is not None

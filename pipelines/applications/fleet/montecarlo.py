@@ -178,7 +178,7 @@ def run_study(
                 interrupted = True
     known = {**store.results, **killed}
     results = {seed: known[str(seed)] for seed in seeds if str(seed) in known}
-    name = Path(scenario or chosen.nominal()).stem
+    name = Path(scenario or chosen.default_scenario()).stem
     return Study(method, name, tuple(solvers), results, len(seeds), kept, interrupted)
 
 

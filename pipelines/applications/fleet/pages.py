@@ -20,7 +20,6 @@ from alidade.pipelines.display.table import Cell, Column, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.report import Block, Bullets, Plots, Report, Section, Summary, Text
 
 if TYPE_CHECKING:
@@ -163,7 +162,7 @@ def _parameter_row(p: Population, several: bool) -> tuple[Cell | str, ...]:
         drift = f"{to_digits_of(slope, slope_sigma)} ± {rounded(slope_sigma)}"
     outlying, changed = int(p.outlying.sum()), len({p.units[i] for i in np.flatnonzero(p.changed)})
     return (
-        Cell(p.name, meaning(method(p.method), p.name)),
+        Cell(p.name, method(p.method).describe(p.name)),
         *((p.method,) if several else ()),
         *("device" if p.of_device else "recording", unit, str(len(p.values)), centre),
         *(_component(p.population, factor), _component(p.repeatability, factor), rounded(sigma), limits, beyond),
@@ -280,7 +279,7 @@ def _accuracy_table(study: Study, solvers: Sequence[str]) -> Table:
             bias = f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {rounded(factor * a.bias_sigma)}"
             rows.append(
                 (
-                    *(Cell(name, meaning(method(study.method), name)), solver, unit),
+                    *(Cell(name, method(study.method).describe(name)), solver, unit),
                     Cell(bias, tone="bad" if abs(a.bias) > 3.0 * a.bias_sigma else ""),
                     *(rounded(factor * a.rms, 3), rounded(factor * a.sigma, 3), f"{a.rms / a.sigma:.3g}"),
                     *_shares(a.coverage),

@@ -253,7 +253,7 @@ class Follower:
     def _collect(self, session: Session) -> None:
         """What there is by now; what was enough once stays so."""
         before, self._checklist = self._checklist, {}
-        for item in session.method.checklist(session.data, session.config):
+        for item in session.method.guidance.checklist(session.data, session.config):
             earlier = before.get(item.what, item)
             self._checklist[item.what] = earlier if item.wanted and not earlier.wanted else item
 

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import permutations
 
 import numpy as np
 
+from alidade.factors import so3
+from alidade.factors.earth import magnetic_field
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
-from alidade.pipelines.display.drawing import covered
+from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, FaultModel, ScaleFactor
+from alidade.pipelines.display.drawing import covered, resting, swaying
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.cube.data import CubeData
-from alidade.pipelines.methods.cube.faces import SIDES, Side
-from alidade.pipelines.methods.cube.picture import rested
-from alidade.pipelines.methods.cube.poses import static_poses
+from alidade.pipelines.methods import Guidance, Scenario
+from alidade.pipelines.methods.cube.faces import SIDES, Resting, Side
+from alidade.pipelines.methods.cube.parameters import FOCAL, is_stated
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData
+from alidade.pipelines.methods.cube.scenario import YEAR, CubeScenario
+from alidade.pipelines.methods.cube.simulation import attitudes
+from alidade.pipelines.methods.cube.static_poses import static_poses
 from alidade.pipelines.settings import Config
 
 # Poses that determine the twelve numbers of a triad, and those of published practice: each of six faces thrice.
@@ -85,3 +93,186 @@ def _information(vectors: Array) -> Array:
 def _gain(information: Array, vector: Array) -> float:
     row = np.append(vector, 1.0)
     return float(row @ np.linalg.solve(information, row))
+
+
+# Poses that are proposed together, and the seed of their simulation.
+_SERIES, _SEED = 6, 0
+
+
+def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+    """In words, and the changed scenario."""
+    single, series = next_poses(CubeScenario.model_validate(scenario), _SEED, _SERIES)
+    for poses in (*([pose] for pose in single), series):
+        more = [*scenario["attitudes"], *(pose.model_dump() for pose in poses)]
+        words = "; then ".join(str(pose) for pose in poses)
+        yield (
+            f"{'one more pose' if len(poses) == 1 else f'{len(poses)} more poses'}: {words}",
+            {**scenario, "attitudes": more},
+        )
+    yield "each pose held twice as long", {**scenario, "static_s": 2.0 * scenario["static_s"]}
+    if scenario["turn_axes"]:
+        yield "turns about any axis", {**scenario, "turn_axes": []}
+    if scenario["cube"]["hidden"]:
+        yield "every face shown", {**scenario, "cube": {**scenario["cube"], "hidden": []}}
+
+
+def _tag_sizes(data: CubeData, config: Config, factor: float) -> tuple[CubeData, Config] | None:
+    """All tags larger or smaller than the config says; None where it names none."""
+    cube = config.section(CubeConfig)
+    if not cube.tags:
+        return None
+    tags = {i: tag.model_copy(update={"size": factor * tag.size}) for i, tag in cube.tags.items()}
+    return data, config.model_copy(update={"cube": cube.model_copy(update={"tags": tags})})
+
+
+def _latitude(data: CubeData, config: Config, change: float) -> tuple[CubeData, Config] | None:
+    if data.latitude is None:
+        return None
+    return _as_found(data, config, replace(data, latitude=data.latitude + np.deg2rad(change)), config)
+
+
+def _tag_size(data: CubeData, config: Config, change: float) -> tuple[CubeData, Config] | None:
+    changed = _tag_sizes(replace(data), config, 1.0 + change)
+    return None if data.camera is None or changed is None else _as_found(data, config, *changed)
+
+
+def _focal_length(data: CubeData, config: Config, change: float) -> tuple[CubeData, Config] | None:
+    # Of one that is free the parameter tells.
+    if data.camera is None or is_stated(FOCAL, config):
+        return None
+    K = data.camera.K * np.array([1.0 + change, 1.0 + change, 1.0])[:, None]
+    K[:2, 2] = data.camera.centre
+    return _as_found(data, config, replace(data, camera=replace(data.camera, K=K)), config)
+
+
+def _as_found(data: CubeData, config: Config, changed: CubeData, other: Config) -> tuple[CubeData, Config]:
+    """Changed data and config with the poses that were found in the data as they are.
+
+    They would be the same, but for first guesses; finding them takes longer than all the rest.
+    """
+    before, after = config.model_dump_json(), other.model_dump_json()
+    changed.computed.update({(name, after): found for (name, of), found in data.computed.items() if of == before})
+    return changed, other
+
+
+# Opposite signs of accelerometer and magnetometer are part of what is calibrated.
+FAULTS = FaultModel(
+    streams={"imu_t": ("gyro", "accel"), "mag_t": ("mag",), "reference_t": ("reference_wxyz", "reference_cov")},
+    signs={"gyro": ("gyro", AXES)},
+    scalings=(ScaleFactor("the tags are {factor:.3g} times as large as the config says", _tag_sizes),),
+    exact=(
+        ExactInput("latitude_deg", "deg", 0.1, _latitude),
+        ExactInput("tag_size", "1", 2e-3, _tag_size),
+        ExactInput("focal_length", "1", 5e-3, _focal_length),
+    ),
+    cut=False,
+)
+
+
+_UP: dict[str, Side] = {"x": "+x", "y": "+y", "z": "+z"}
+
+
+def advice(weights: Mapping[str, float]) -> Motion:
+    """The motion that would make a weak direction observable."""
+    strongest = [name for name, w in weights.items() if abs(w) > 0.3] or list(weights)
+    if all(name.startswith("field") for name in strongest):
+        return Motion(
+            "give tighter priors on field_e, field_n, field_u",
+            why="the magnetometer's scale follows the field model's strength",
+        )
+    gyro = "".join(sorted({"xyz"[int(name[-1]) - 1] for name in strongest if name.startswith("gyro_k")}))
+    if gyro:
+        words = f"turn the cube between poses about its {' and '.join(gyro)} axis, by a quarter turn or more, both ways"
+        return Motion(words, swaying(gyro, "cube", (0.8, 0.8, 0.8)))
+    still = {name.split("_")[0] for name in strongest if name.startswith(("accel", "mag"))}
+    if still:
+        axes = sorted({"xyz"[int(name[-1]) - 1] for name in strongest if name.startswith(("accel_k", "mag_k"))})
+        about = f", its {' and '.join(axes)} axis up, down and level" if axes else ""
+        picture = rested(_UP[axes[0] if axes else "x"])
+        return Motion(f"add static poses in other attitudes{about}", picture, " and ".join(sorted(still)))
+    if any(name.startswith("gyro_b") for name in strongest):
+        return Motion("let the cube stand still longer")
+    if any(name.startswith("tag_") for name in strongest):
+        tags = sorted({name.split("_")[1] for name in strongest if name.startswith("tag_")})
+        return Motion(f"show tag {' and '.join(tags)} to the camera together with its neighbours")
+    return Motion(
+        "turn the cube through more attitudes", why="heading, camera mount and field trade against each other"
+    )
+
+
+_LEANS = (0.0, 45.0)
+# Fisher information before any pose, small beside what one adds: makes the sum invertible.
+_REGULARISER = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _FisherInformation:
+    """Of accelerometer, magnetometer (if any) and turns, and the attitude rested in last."""
+
+    accel: Array
+    mag: Array | None
+    turns: Array
+    last: Array | None
+
+
+def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[Resting], list[Resting]]:
+    """Single poses that tell most, of one sensor or of all, and the best so many to rest in one after the other."""
+    field = None
+    if scenario.magnetometer:
+        place = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
+        field = magnetic_field(float(place[0]), float(place[1]), scenario.place.height, YEAR)
+        field = field / np.linalg.norm(field)
+    known = _FisherInformation(
+        _REGULARISER * np.eye(4), None if field is None else _REGULARISER * np.eye(4), _REGULARISER * np.eye(3), None
+    )
+    for nRb in attitudes(scenario, seed):
+        known = _after(known, nRb, field)
+    choices = [
+        Resting(up=up, north=north, lean_deg=lean)
+        for up in SIDES
+        for north in SIDES
+        for lean in _LEANS
+        if up[1] != north[1]
+    ]
+    gains = _gains(known, choices, field)
+    single = [choices[int(np.argmax(column))] for column in [gains.sum(axis=1), *gains.T]]
+    series: list[Resting] = []
+    for _ in range(together):
+        series.append(choices[int(np.argmax(_gains(known, choices, field).sum(axis=1)))])
+        known = _after(known, series[-1].nRb, field)
+    return list(dict.fromkeys(single)), series
+
+
+def _rows(known: _FisherInformation, nRb: Array, field: Array | None) -> list[tuple[Array, Array]]:
+    """Information so far and the row that resting in nRb next adds to it, of each sensor."""
+    bRn = so3.inverse(nRb)
+    found = [(known.accel, np.append(so3.rotate(bRn, [0.0, 0.0, 1.0]), 1.0))]
+    if field is not None and known.mag is not None:
+        found.append((known.mag, np.append(so3.rotate(bRn, field), 1.0)))
+    turned = np.zeros(3) if known.last is None else so3.log(so3.multiply(so3.inverse(known.last), nRb))
+    return [*found, (known.turns, turned)]
+
+
+def _after(known: _FisherInformation, nRb: Array, field: Array | None) -> _FisherInformation:
+    sums = [information + np.outer(row, row) for information, row in _rows(known, nRb, field)]
+    return _FisherInformation(sums[0], sums[1] if len(sums) > 2 else None, sums[-1], nRb)
+
+
+def _gains(known: _FisherInformation, choices: Sequence[Resting], field: Array | None) -> Array:
+    """(choices, sensors)"""
+    return np.array(
+        [
+            [np.log1p(row @ np.linalg.solve(information, row)) for information, row in _rows(known, each.nRb, field)]
+            for each in choices
+        ]
+    )
+
+
+@cache
+def rested(up: Side, north: Side | None = None) -> str:
+    """A side up; with another one to the north a compass is drawn."""
+    ahead = next(side for side in SIDES if side[1] != up[1]) if north is None else north
+    return resting(Resting(up=up, north=ahead).nRb, compass=north is not None)
+
+
+GUIDANCE = Guidance(checklist=checklist, variations=candidates)

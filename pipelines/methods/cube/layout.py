@@ -10,8 +10,8 @@ import numpy as np
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import dump_yaml
-from alidade.pipelines.methods.cube.sightings import read_camera
-from alidade.pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
+from alidade.pipelines.methods.cube.recording import TAG_DETECTIONS, CubeConfig
+from alidade.pipelines.methods.cube.tags import read_camera
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import IMAGE
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given

@@ -1,10 +1,23 @@
-"""A cube recording prepared for its graph: poses, reference, parameters, and first guesses of the attitudes."""
+"""The cube method: accelerometer, gyro and magnetometer calibrated in a cube of AprilTags.
+
+The graph's states are the attitudes nRb of the static poses. Each is seen by the camera through the corners of its tags
+(with the cube's place in the camera as a by-product), by gravity, the earth's field and the earth's rate; the gyro's
+whole model is integrated over the turns between them. Methods page, section 4.
+
+What the recording holds decides what is known: without a magnetometer, or without a position for the field model, there
+is no magnetometer to calibrate; without a reference the camera stands still at an unknown attitude; without a camera
+the poses follow from gravity and the turns alone, and the accelerometer's own axes define the body frame: accel_k21,
+accel_k31 and accel_k32 are zero unless given a prior.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
 
+import gtsam
 import numpy as np
 
 from alidade.factors import so3
@@ -12,16 +25,155 @@ from alidade.factors.chi_square import gate
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
+from alidade.factors.tags import TagAttitudeFactor
+from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor
+from alidade.factors.turns import GyroRotationFactor, Samples, Turns
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.cube.data import DENSITIES, CubeData, local_field, nominal
-from alidade.pipelines.methods.cube.noises import noises
-from alidade.pipelines.methods.cube.parameters import Parameters, cube_parameters
-from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses, turn
+from alidade.pipelines.estimation.believing import believing
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.priors import rotation_about, vector_about
+from alidade.pipelines.estimation.problem import Array, Attitudes, ChainLayout, Factor, Problem, Step
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.cube.guidance import advice
+from alidade.pipelines.methods.cube.parameters import (
+    CURVATURE_KEY,
+    FIELD_KEY,
+    LENS_KEY,
+    MOUNT_KEY,
+    SAID_KEY,
+    SENSITIVITY_KEY,
+    SLOPE_KEYS,
+    TRIAD_KEYS,
+    Parameters,
+    cube_parameters,
+    first_priors,
+    tag_key,
+)
+from alidade.pipelines.methods.cube.recording import (
+    DENSITIES,
+    CubeConfig,
+    CubeData,
+    computed_once,
+    local_field,
+    nominal,
+    stated_density,
+)
 from alidade.pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
-from alidade.pipelines.methods.cube.topics import CubeConfig
-from alidade.pipelines.methods.cube.wandering import GaussMarkovDeviation
+from alidade.pipelines.methods.cube.static_poses import SeenTags, StaticPoses, static_poses, turn
+from alidade.pipelines.methods.cube.tags import layout_belief, tag_place_key
+from alidade.pipelines.methods.cube.wandering import GaussMarkovDeviation, deviation_key, sum_key
+from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
 from alidade.pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from alidade.pipelines.vision.camera import Camera
+
+
+_NO_FIELD = (
+    "The magnetometer is not calibrated, for the field is not known where nobody says where it was: give latitude_deg "
+    "and longitude_deg in the config, or record /reference/fix."
+)
+# Sigmas of priors as good as none, m on the cube's place in the camera and rad on an attitude that no gyro leads to:
+# these only make the new variables of a step determined without its measurements.
+_POSITION_PRIOR_SIGMA, _ATTITUDE_PRIOR_SIGMA = 10.0, np.pi
+
+
+def problem(data: CubeData, config: Config) -> Problem:
+    """The graph of a cube recording.
+
+    Raises:
+        InputError: there is no static pose, the position is unknown, the date is outside the field model, or no tag of
+            the cube is seen well though there is a camera.
+    """
+    model, layout = prepare(data, config), layout_belief(config)
+    graph = Problem(
+        method="cube",
+        parameters=model.parameters.all,
+        steps=partial(_steps, model),
+        loss=model.loss,
+        attitudes=partial(_trajectory, model),
+        advice=advice,
+        dropped=model.dropped,
+        premises=(_NO_FIELD,) if model.poses.mag is not None and model.field is None else (),
+        noises=tuple(noises(data, config).values()),
+        constants=temperature.constants(temperature.reference(data.temperature)),
+        layout=ChainLayout(states="xdepR" if model.reference.moves else "xdep"),
+    )
+    return graph if layout is None or data.camera is None else believing(graph, [layout])
+
+
+def _steps(model: Model, _: int) -> Iterator[Step]:
+    """One step a static pose, with the turn before it; the calibration variables come with the first.
+
+    No variable ages: a session has tens of poses, few enough to keep them all.
+    """
+    yield from (_step(model, k) for k in range(len(model.poses)))
+
+
+def _step(model: Model, k: int) -> Step:
+    initial = gtsam.Values()
+    factors: list[Factor] = []
+    if k == 0:
+        initial.insert(model.parameters.initial(model.gyro_bias))
+        factors += first_priors(model.parameters)
+    initial.insert(pose_key(k), so3.to_gtsam(model.initial[k]))
+    initial.insert(deviation_key(k), np.zeros(3))
+    initial.insert(sum_key(k), np.zeros(3))
+    factors += [*model.deviation.factors(k), *_process(model, k)]
+    seen = model.poses.tags[k]
+    if seen is not None:
+        initial.insert(place_key(k), seen.pose.position)
+        factors.append(vector_about(place_key(k), seen.pose.position, _POSITION_PRIOR_SIGMA))
+    if model.data.camera is not None and (seen is not None if model.reference.moves else k == 0):
+        initial.insert(reference_key(k), so3.to_gtsam(model.reference.nRB[k]))
+        if model.reference.covariance is not None:
+            R = np.linalg.cholesky(np.linalg.inv(model.reference.covariance[k])).T
+            factors.append(rotation_about(reference_key(k), model.reference.nRB[k], R, "reference"))
+    factors += sensor_factors(model, k)
+    if seen is not None:
+        factors.append(tag_factor(model, k, seen))
+    return Step(
+        time=float(model.poses.span[k, 1]),
+        initial=initial,
+        factors=factors,
+        predict=partial(_predict, model, k, initial) if k > 0 and model.samples(k).whole else None,
+        keyframes=range(k, k + 1),
+    )
+
+
+def _trajectory(model: Model, poses: Sequence[int], values: gtsam.Values) -> Attitudes:
+    """Attitudes nRb of the static poses, at their middles."""
+    wxyz = so3.from_gtsam([values.atRot3(pose_key(k)) for k in poses])
+    return Attitudes(model.poses.span[list(poses)].mean(axis=1), wxyz)
+
+
+def _process(model: Model, k: int) -> list[Factor]:
+    """What leads to the attitude of pose k: the turn before it, or nothing."""
+    if k > 0 and model.samples(k).whole:
+        return [turn_factor(model, k)]
+    return [rotation_about(pose_key(k), model.initial[k], np.eye(3) / _ATTITUDE_PRIOR_SIGMA)]
+
+
+def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:
+    """The attitude of pose k carried on by the gyro as calibrated so far; the rest as measured."""
+    out = gtsam.Values(initial)
+    samples, deviation = model.samples(k), current.atVector(deviation_key(k - 1))
+    own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), deviation)
+    gyro, accel = samples.gyro, samples.accel
+    if samples.warmth is not None:
+        slopes = model.parameters.slopes
+        drifts = {name: np.outer(samples.warmth, current.atVector(SLOPE_KEYS[name])) for name in slopes}
+        gyro, accel = gyro - drifts.get("gyro", 0.0), accel - drifts.get("accel", 0.0)
+    of_force = []
+    if model.parameters.sensitivity is not None:
+        of_force = [current.atVector(SENSITIVITY_KEY)[None], current.atVector(TRIAD_KEYS["accel"])[None], accel]
+    (turned,) = Turns.of(Samples.of([samples.t]), gyro, own[None], *of_force).rotation
+    out.update(deviation_key(k), model.deviation.correlation[k] * deviation)
+    before = so3.from_gtsam([current.atRot3(pose_key(k - 1))])[0]
+    earth = so3.exp(-model.earth_rate * (samples.t[-1] - samples.t[0]))
+    out.update(pose_key(k), so3.to_gtsam(so3.compose(earth, before, turned)))
+    return out
+
 
 # A pause of the gyro's record in a turn longer than this, s, breaks the chain of turns.
 _LONGEST_GAP = 0.1
@@ -147,3 +299,151 @@ def _levelled(nRb: Array, accel: Array) -> Array:
     sine = float(np.linalg.norm(axis))
     angle = float(np.arctan2(sine, up[2]))
     return so3.multiply(so3.exp(axis * (angle / max(sine, 1e-12))), nRb)
+
+
+@computed_once
+def noises(data: CubeData, config: Config) -> dict[str, Level]:
+    """What is in force, by name, in nominal SI. Raises InputError when there is no static pose."""
+    raw, poses = config.section(CubeConfig).raw, static_poses(data, config)
+    gyro = stated_density("gyro_density", data, config, "gyro turns", "gyro at rest")
+    accel = stated_density("accel_density", data, config)
+    causes = poses.accel if poses.celsius is None else np.column_stack([poses.accel, poses.celsius])
+    found = [
+        sampled(gyro, data.imu_t, nominal(data.gyro, raw.gyro)),
+        sampled(accel, data.imu_t, nominal(data.accel, raw.accel)),
+        walked(stated("gyro_bias_walk", config), poses.span.mean(axis=1), poses.gyro, causes),
+        repeatability("gyro", config, "gyro at rest"),
+        repeatability("turn", config, "gyro turns"),
+        repeatability("accel", config, "accelerometer"),
+    ]
+    if data.mag is not None and data.mag_t is not None:
+        mag = stated_density("mag_density", data, config)
+        found += [sampled(mag, data.mag_t, nominal(data.mag, raw.mag)), repeatability("mag", config, "magnetometer")]
+    if data.camera is not None:
+        seen = None if data.sightings is None else data.sightings.covariance
+        corners = typical(None if seen is None else seen.reshape(-1, 2, 2), 0, 1)
+        found.append(Level(stated("corner_px", config, corners, ("tags",))))
+    return {level.noise.name: level for level in found}
+
+
+# Steps of derivatives by a share of the focal length and by the centre, px.
+_FOCAL_STEP, _CENTRE_STEP = 1e-4, 0.1
+
+
+def pose_key(k: int) -> int:
+    """Variable of nRb in pose k, a Rot3."""
+    return int(gtsam.symbol("x", k))
+
+
+def place_key(k: int) -> int:
+    """Variable of the cube's place in the camera in pose k, (3,) m."""
+    return int(gtsam.symbol("p", k))
+
+
+def reference_key(k: int) -> int:
+    """Variable of what the reference says in pose k, nRB, a Rot3; of pose 0 where it stands still."""
+    return int(gtsam.symbol("R", k))
+
+
+def sensor_factors(model: Model, k: int) -> list[Factor]:
+    """Accelerometer, gyro and magnetometer at rest in pose k."""
+    poses, row = model.poses, slice(k, k + 1)
+    time = 0.5 * poses.span[row].sum(axis=1)
+    gyro_density, accel_density, mag_density = model.density
+    duration = poses.duration[row]
+    curved, feels = model.parameters.curvature is not None, model.parameters.sensitivity is not None
+    warmths = {name: model.warmth(name, k) for name in SLOPE_KEYS}
+    slopes = {name: [] if warmths[name] is None else [key] for name, key in SLOPE_KEYS.items()}
+    accel_sigma = accel_density / np.sqrt(duration)
+    accel = AccelFactor(time, poses.accel[row], accel_sigma, model.gravity, curved, warmths["accel"])
+    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.unknown_rate**2)
+    gravity = model.gravity if feels else None
+    gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, gravity, warmths["gyro"])
+    terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
+    of_accel = accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms, *slopes["accel"])
+    of_gyro = gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G, *slopes["gyro"])
+    factors = [
+        Factor.of("accelerometer", of_accel, 1.0 / accel.sigma),
+        Factor.of("gyro at rest", of_gyro, 1.0 / gyro.sigma),
+    ]
+    if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
+        mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))
+        seen = mag.on(pose_key(k), TRIAD_KEYS["mag"], FIELD_KEY, loss=model.loss)
+        factors.append(Factor.of("magnetometer", seen, 1.0 / mag.sigma))
+    return factors
+
+
+def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
+    """All tags seen in pose k."""
+    from alidade.pipelines.vision.pose import TagBody
+
+    body = TagBody.from_board(model.config.section(CubeConfig))
+    camera = model.data.camera
+    assert camera is not None
+    rows = np.searchsorted(body.ids, seen.ids)
+    rays = camera.rays(seen.corners)
+    # How z = 1 coordinates follow pixels, by central differences over a pixel.
+    ahead, behind = (camera.rays(seen.corners[..., None, :] + s * 0.5 * np.eye(2)) for s in (1.0, -1.0))
+    slope = np.swapaxes(ahead[..., :2] / ahead[..., 2:] - behind[..., :2] / behind[..., 2:], -1, -2)
+    covariance = slope @ seen.covariance @ np.swapaxes(slope, -1, -2)
+    n = len(seen.ids)
+    tags = TagAttitudeFactor(
+        time=np.full(n, 0.5 * model.poses.span[k].sum()),
+        measured=rays[..., :2] / rays[..., 2:],
+        sqrt_information=np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2),
+        corners=so3.rotate(so3.inverse(body.bRt[rows])[:, None], body.corners[rows] - body.position[rows, None]),
+        bRt=body.bRt[rows],
+        position=body.position[rows],
+        BRC=model.reference.BRC,
+        placed=bool(model.parameters.places),
+        by_lens=None if model.parameters.lens is None else _by_lens(camera, seen.corners),
+    )
+    reference = reference_key(k if model.reference.moves else 0)
+    measurement = tags.on(
+        [pose_key(k)] * n,
+        [place_key(k)] * n,
+        [reference] * n,
+        SAID_KEY,
+        MOUNT_KEY,
+        [tag_key(int(i)) for i in seen.ids],
+        *([[tag_place_key(int(i)) for i in seen.ids]] if tags.placed else []),
+        *([] if model.parameters.lens is None else [LENS_KEY]),
+        loss=model.loss,
+    )
+    return Factor.of("tags", measurement)
+
+
+def _by_lens(camera: Camera, corners: Array) -> Array:
+    """Derivatives (n, 4, 2, 3) of the corners' z = 1 coordinates by the share of focal length and the centre in px."""
+    columns = []
+    for step, moved in (
+        (_FOCAL_STEP, np.append(camera.focal, [0.0, 0.0])),
+        (_CENTRE_STEP, np.array([0.0, 0.0, 1.0, 0.0])),
+        (_CENTRE_STEP, np.array([0.0, 0.0, 0.0, 1.0])),
+    ):
+        change = step * np.append(moved, np.zeros(len(camera.coefficients)))
+        ahead, behind = (camera.with_intrinsics(camera.intrinsics + sign * change).rays(corners) for sign in (1, -1))
+        columns.append((ahead[..., :2] / ahead[..., 2:] - behind[..., :2] / behind[..., 2:]) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def turn_factor(model: Model, k: int) -> Factor:
+    """What the gyro turned from pose k - 1 to pose k."""
+    samples, feels = model.samples(k), model.parameters.sensitivity is not None
+    t = samples.t
+    duration = float(t[-1] - t[0])
+    sigma = np.sqrt([model.density[0] ** 2 * duration + (model.unknown_rate * duration) ** 2])
+    accel = [samples.accel] if feels else None
+    slopes = model.parameters.slopes
+    # What an accelerometer drifts by alone is nothing beside a gyro that does not.
+    drifting = [name for name in ("gyro", *(["accel"] if feels else [])) if name in slopes and "gyro" in slopes]
+    warmth = None if samples.warmth is None or not drifting else [samples.warmth]
+    drifts = "accel" in drifting
+    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, warmth, drifts)
+    of_force = [SENSITIVITY_KEY, TRIAD_KEYS["accel"]] if feels else []
+    gyro = TRIAD_KEYS["gyro"]
+    slope = [SLOPE_KEYS[name] for name in drifting]
+    ends = pose_key(k - 1), pose_key(k)
+    measured = rotation.on(*ends, gyro, deviation_key(k - 1), deviation_key(k), *of_force, *slope)
+    angle = float(np.sum(np.linalg.norm(samples.gyro[1:], axis=1) * np.diff(t)))
+    return Factor.process_of("gyro turns", measured, angle / sigma)

@@ -1,10 +1,11 @@
-"""What the cube method calibrates and what it assumes: priors, first values and the numbers they are reported as."""
+"""Parameters of the cube method: priors, first values, and the numbers that they are reported as."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 
 import gtsam
 import numpy as np
@@ -12,49 +13,80 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.triad import TriadPriorFactor, calibration, triad
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation import assumptions
-from alidade.pipelines.estimation.assumptions import (
-    Assumption,
-    quantities,
-    sensitivity_assumption,
-    stated,
-    temperature_assumption,
-)
 from alidade.pipelines.estimation.linear import linear_factor
+from alidade.pipelines.estimation.parameters import (
+    ParameterSpec,
+    accel_square,
+    check_parameters,
+    g_sensitivity,
+    parameter,
+    quantities,
+    scalar,
+    stated,
+)
 from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
-from alidade.pipelines.methods.cube.tag_places import CAMERA_NUMBERS, tag_place_names, tag_places
-from alidade.pipelines.methods.cube.topics import CubeConfig, RawConversion
+from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
+from alidade.pipelines.methods.cube.tags import CAMERA_NUMBERS, tag_place_names, tag_places
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA
-from alidade.pipelines.methods.triads import TRIADS, triad_names
-from alidade.pipelines.settings import Config, check_names
+from alidade.pipelines.methods.temperature import ACCEL_SLOPE, GYRO_SLOPE
+from alidade.pipelines.methods.triads import TRIADS, triad_names, triad_specs
+from alidade.pipelines.settings import Config
 
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
 MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY, LENS_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQL")
 # Sensor -> variable of its slope over temperature.
 SLOPE_KEYS: dict[str, int] = {"gyro": int(gtsam.symbol("K", 0)), "accel": int(gtsam.symbol("J", 0))}
 
-# The grades of consumer MEMS sensors and of a dual-antenna reference, one sigma.
-SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-4)
-SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel", "square", 1e-5)
-CUBE = Assumption(tuple(f"accel_cube_{i}" for i in "123"), "s^4/m^2", "accel", "cube", 1e-6)
-TEMPERATURE = {
-    "gyro": temperature_assumption("gyro", "rad/s", 1e-4),
-    "accel": temperature_assumption("accel", "m/s^2", 1e-2),
+# Prior sigma and accuracy wanted of entries of K, and of b.
+_GAIN = 0.2, 5e-3
+TRIAD_SPECS = {
+    "accel": triad_specs("accel", "m/s^2", _GAIN, (2.0, 0.02), per_recording=True),
+    "gyro": triad_specs("gyro", "rad/s", _GAIN, (0.2, 2e-3), per_recording=True),
+    "mag": triad_specs("mag", "T", _GAIN, (1e-4, 5e-7)),
 }
-TILT = Assumption(("reference_tilt_e", "reference_tilt_n"), "rad", "reference", "tilt", 1e-3)
-# What CameraInfo is off by; taken for exact unless the config says something of it.
-FOCAL = Assumption(("camera_focal",), "", "camera", "focal", 5e-3)
-CENTRE = Assumption(("camera_centre_x", "camera_centre_y"), "px", "camera", "centre", 3.0)
-ASSUMPTIONS = (SENSITIVITY, SQUARE, CUBE, TILT, FOCAL, CENTRE, *TEMPERATURE.values())
+MOUNT = ParameterSpec(
+    "camera_mount",
+    "rad",
+    5e-3,
+    "Camera mount about {axis}, correction of the config.",
+    require=1e-2,
+    rotation="correction of BRC",
+)
+TAG = ParameterSpec(
+    "tag_{}",
+    "rad",
+    3e-3,
+    "Tag {first} rotation about {last}, correction of the config.",
+    axes=("*_x", "*_y", "*_z"),
+    require=1e-2,
+)
+HEADING = scalar("reference_heading", "rad", 1e-2, "Heading error of the reference.", require=1e-2, per_recording=True)
 
-# Triad -> unit of its nominal value, default prior sigma and accuracy wanted of its bias.
-_BIAS: Mapping[str, tuple[str, float, float]] = {
-    "accel": ("m/s^2", 2.0, 0.02),
-    "gyro": ("rad/s", 0.2, 2e-3),
-    "mag": ("T", 1e-4, 5e-7),
-}
-_GAIN_PRIOR, _GAIN_REQUIRE = 0.2, 5e-3
+# The grades of consumer MEMS sensors and of a dual-antenna reference, one sigma.
+SENSITIVITY = g_sensitivity(2e-4)
+SQUARE = accel_square(1e-5)
+CUBE = ParameterSpec(
+    "accel_cube", "s^4/m^2", 1e-6, "Accelerometer cubic nonlinearity, {axis}.", "accel.cube", axes="123"
+)
+TEMPERATURE = {"gyro": GYRO_SLOPE, "accel": ACCEL_SLOPE}
+TILT = ParameterSpec(
+    "reference_tilt",
+    "rad",
+    1e-3,
+    "Tilt error of the reference about {axis}.",
+    "reference.tilt",
+    axes="en",
+    per_recording=True,
+)
+# What CameraInfo is off by; taken for exact unless the config says something of it.
+FOCAL = scalar("camera_focal", "", 5e-3, "Relative correction of the focal length.", "camera.focal")
+CENTRE = ParameterSpec(
+    "camera_centre", "px", 3.0, "Correction of the image centre along {axis}.", "camera.centre", axes="xy"
+)
+NUISANCE = (SENSITIVITY, SQUARE, CUBE, TILT, FOCAL, CENTRE, *TEMPERATURE.values())
+PARAMETERS = (*chain.from_iterable(TRIAD_SPECS.values()), MOUNT, TAG, HEADING, *NUISANCE, FIELD)
+
 # Without a camera these are zero by definition of the body frame.
 _FRAME = ("accel_k21", "accel_k31", "accel_k32")
 
@@ -97,14 +129,7 @@ class Parameters:
     @property
     def all(self) -> tuple[Parameter, ...]:
         """In reporting order."""
-        rest = [
-            *self.rotations[:1],
-            self.said,
-            *self.rotations[1:],
-            *self.places,
-            self.field,
-            *self.assumed,
-        ]
+        rest = [*self.rotations[:1], self.said, *self.rotations[1:], *self.places, self.field, *self.assumed]
         return (*self.triads.values(), *(p for p in rest if p is not None))
 
     @property
@@ -120,11 +145,11 @@ class Parameters:
     def initial(self, gyro_bias: Array) -> gtsam.Values:
         """First values: nominal sensors but for the gyro's offset (3,), mounts as given, the model's field."""
         values = gtsam.Values()
-        for name, parameter in self.triads.items():
+        for name, own in self.triads.items():
             b = -gyro_bias if name == "gyro" else np.zeros(3)
-            values.insert(parameter.key, triad(np.eye(3), b))
-        for parameter in self.rotations:
-            values.insert(parameter.key, so3.to_gtsam(so3.identity()))
+            values.insert(own.key, triad(np.eye(3), b))
+        for rotation in self.rotations:
+            values.insert(rotation.key, so3.to_gtsam(so3.identity()))
         for vector in self.zeros:
             values.insert(vector.key, np.zeros(len(vector.quantities)))
         if self.field is not None and self.field_model is not None:
@@ -136,14 +161,14 @@ def first_priors(parameters: Parameters) -> list[Factor]:
     """Priors on all calibration variables."""
     mean = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
     factors = []
-    for name, parameter in parameters.triads.items():
+    for name, own in parameters.triads.items():
         prior = TriadPriorFactor(np.zeros(1), mean[None], parameters.priors[name][None])
-        factors.append(Factor.process_of("prior", prior.on(parameter.key)))
+        factors.append(Factor.process_of("prior", prior.on(own.key)))
     factors += [rotation_prior(p) for p in parameters.rotations]
     factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in parameters.zeros]
     if parameters.field is not None and parameters.field_model is not None:
         factors.append(vector_prior(parameters.field, parameters.field_model))
-        if prior_sigmas(parameters.field).max() <= FIELD.sigma:
+        if prior_sigmas(parameters.field).max() <= FIELD.prior:
             factors.append(_strength(parameters.field.key, parameters.field_model))
     return factors
 
@@ -179,43 +204,35 @@ def cube_parameters(
             "leave it out, or write priors: {gyro_k11: ...} and sensors: {gyro: {g_sensitivity: ...}} instead"
         )
     tags = sorted(config.section(CubeConfig).tags)
-    _check_names(config, tags)
+    known = [f"tag_{tag}_{axis}" for tag in tags for axis in "xyz"]
+    check_parameters(PARAMETERS, config, [*known, *tag_place_names(config)])
 
-    def quantity(name: str, unit: str, prior: float, require: float, fixed: bool = False) -> Quantity:
-        sigma = config.prior(name, 0.0 if fixed else prior)
-        return Quantity(name, unit, sigma, prior, config.require.get(name, require))
-
-    def nuisance(name: str, unit: str, prior: float, require: float, fixed: bool = False) -> Quantity:
-        return replace(quantity(name, unit, prior, require, fixed), nuisance=True)
-
-    def rotation(key: int, name: str, prior: float, fixed: bool) -> Parameter:
-        triple = tuple(nuisance(f"{name}_{axis}", "rad", prior, 1e-2, fixed) for axis in "xyz")
-        return Parameter(key, triple, rotation_vector_coordinates)
+    def nuisance(spec: ParameterSpec, fixed: bool = False) -> tuple[Quantity, ...]:
+        return tuple(replace(q, nuisance=True) for q in quantities(spec, config, fixed))
 
     triads, priors = {}, {}
     for name in TRIADS if field is not None else TRIADS[:2]:
-        unit, bias_prior, bias_require = _BIAS[name]
-        frame = () if camera else _FRAME
-        plain = [
-            quantity(entry, "1", _GAIN_PRIOR, _GAIN_REQUIRE, entry in frame) for entry in triad_names(name)[:9]
-        ] + [quantity(entry, unit, bias_prior, bias_require) for entry in triad_names(name)[9:]]
+        numbers = {q.name: q for spec in TRIAD_SPECS[name] for q in quantities(spec, config)}
+        for entry in () if camera else _FRAME:
+            if entry in numbers and entry not in config.priors:
+                numbers[entry] = replace(numbers[entry], prior_sigma=0.0)
+        plain = [numbers[entry] for entry in triad_names(name)]
         triads[name] = _triad_parameter(TRIAD_KEYS[name], plain, getattr(config.section(CubeConfig).raw, name))
         priors[name] = prior_sigmas(Parameter(0, tuple(plain)))
     rotations: list[Parameter] = []
     said = None
     if camera:
-        rotations.append(rotation(MOUNT_KEY, "camera_mount", 5e-3, not reference))
-        rotations += [rotation(tag_key(tag), f"tag_{tag}", 3e-3, tag == tags[0]) for tag in tags]
+        rotations.append(Parameter(MOUNT_KEY, nuisance(MOUNT, not reference), rotation_vector_coordinates))
+        for tag in tags:
+            own = replace(TAG, axes=tuple(axis.replace("*", str(tag)) for axis in TAG.axes))
+            rotations.append(Parameter(tag_key(tag), nuisance(own, tag == tags[0]), rotation_vector_coordinates))
         tilt = [q if reference else replace(q, prior_sigma=0.0) for q in quantities(TILT, config)]
-        heading = nuisance("reference_heading", "rad", 1e-2, 1e-2, not reference)
-        said = Parameter(SAID_KEY, (*tilt, heading))
+        said = Parameter(SAID_KEY, (*tilt, *nuisance(HEADING, not reference)))
     field_parameter = None
     if field is not None:
-        modelled = [
-            replace(nuisance(name, "T", stated(config, FIELD), 1e-6), prior_mean=float(mean))
-            for name, mean in zip(FIELD.names, field, strict=True)
-        ]
-        field_parameter = Parameter(FIELD_KEY, tuple(modelled))
+        about = replace(FIELD, prior=stated(config, FIELD), data_sheet="")
+        modelled = tuple(replace(q, prior_mean=float(m)) for q, m in zip(nuisance(about), field, strict=True))
+        field_parameter = Parameter(FIELD_KEY, modelled)
     return Parameters(
         triads=triads,
         priors=priors,
@@ -224,14 +241,14 @@ def cube_parameters(
         said=said,
         field=field_parameter,
         field_model=field,
-        sensitivity=assumptions.parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
-        curvature=assumptions.parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
+        sensitivity=parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
+        curvature=parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
         lens=_lens(config) if camera else None,
         slopes=_slopes(config) if thermometer else {},
     )
 
 
-def is_stated(assumption: Assumption, config: Config) -> bool:
+def is_stated(assumption: ParameterSpec, config: Config) -> bool:
     """Whether the config says anything of it."""
     layout = config.section(CubeConfig).covariance
     if layout is not None and layout.camera and set(CAMERA_NUMBERS) >= set(assumption.names):
@@ -242,7 +259,7 @@ def is_stated(assumption: Assumption, config: Config) -> bool:
 
 def _slopes(config: Config) -> dict[str, Parameter]:
     """Those over temperature that are not all fixed."""
-    found = {name: assumptions.parameter(SLOPE_KEYS[name], (each,), config) for name, each in TEMPERATURE.items()}
+    found = {name: parameter(SLOPE_KEYS[name], (each,), config) for name, each in TEMPERATURE.items()}
     return {name: parameter for name, parameter in found.items() if parameter is not None}
 
 
@@ -254,16 +271,6 @@ def _lens(config: Config) -> Parameter | None:
         for q in quantities(each, config)
     ]
     return Parameter(LENS_KEY, tuple(free)) if any(q.prior_sigma for q in free) else None
-
-
-def _check_names(config: Config, tags: Sequence[int]) -> None:
-    """Raise InputError for priors or requirements of unknown parameters, whatever the recording holds."""
-    known = [entry for name in TRIADS for entry in triad_names(name)]
-    known += [f"{name}_{axis}" for name in ("camera_mount", *(f"tag_{tag}" for tag in tags)) for axis in "xyz"]
-    known += tag_place_names(config)
-    known += ["reference_heading", *(name for each in (*ASSUMPTIONS, FIELD) for name in each.names)]
-    check_names(config.priors, known, "priors")
-    check_names(config.require, known, "require")
 
 
 def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConversion | None) -> Parameter:

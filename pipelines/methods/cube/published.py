@@ -21,9 +21,8 @@ from alidade.factors import so3
 from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem, Residuals
-from alidade.pipelines.methods.cube.data import CubeData, local_field, recorded
-from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses
-from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, local_field, recorded
+from alidade.pipelines.methods.cube.static_poses import StaticPoses, static_poses
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.settings import Config
 

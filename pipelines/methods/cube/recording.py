@@ -2,25 +2,240 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import datetime
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, Self, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from alidade.pipelines.estimation.noise import Noise
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.cube.data import Array, CubeData
-from alidade.pipelines.methods.cube.parameters import TEMPERATURE
-from alidade.pipelines.methods.cube.sightings import read_camera, read_sightings
-from alidade.pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
-from alidade.pipelines.methods.cube.units import Readings, check_units
-from alidade.pipelines.methods.place import read_place
+from alidade.pipelines.methods.noise import stated
+from alidade.pipelines.methods.place import field_at, read_place
+from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import (
     SLOWEST_GYRO_S,
     check_overlap,
+    nanoseconds,
 )
+from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.streams import StreamReader
-from alidade.pipelines.recording.topics import IMAGE, IMU, MAG, wanted
-from alidade.pipelines.settings import Config
+from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.streams import StreamReader, Temperature
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, TEMPERATURE, Need, Setting, Topic, wanted
+from alidade.pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
+from alidade.pipelines.vision.camera import Camera
+
+if TYPE_CHECKING:
+    from alidade.pipelines.vision.camera import Camera
+
+
+REFERENCE_FIX = Topic("reference_fix", "/reference/fix", (messages.NAV_SAT_FIX,))
+REFERENCE_IMU = Topic("reference_imu", "/reference/imu", (messages.IMU,))
+# Of a covariance in decimal digits, the negative share that is rounding.
+_ROUNDING = 1e-5
+
+TAG_DETECTIONS = Topic("tag_detections", "/tag_detections", (messages.TAG_DETECTIONS,))
+
+
+class RawConversion(Section):
+    """Nominal conversion of counts: (raw - offset) * scale."""
+
+    scale: Sigma  # SI per count
+    offset: float = 0.0  # counts
+
+
+class Raw(Section):
+    """Conversions of the sensors that record counts."""
+
+    accel: RawConversion | None = None
+    gyro: RawConversion | None = None
+    mag: RawConversion | None = None
+
+
+class LayoutCovariance(Section):
+    """What cube-layout knows of its tags: covariance of rotation (rad) and position (m) of each, six numbers a tag."""
+
+    tags: list[int]  # ids in order
+    camera: bool = False  # whether its focal length (a share) and centre (px) follow after the tags
+    rows: list[str]  # the lower triangle, each row its numbers with blanks between them
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        needed = 6 * len(self.tags) + 3 * self.camera
+        if len(self.rows) != needed:
+            what = f"{len(self.tags)} tags{' and a camera' if self.camera else ''}"
+            raise ValueError(f"{what} need {needed} rows, there are {len(self.rows)}")
+        if np.linalg.eigvalsh(self.matrix).min(initial=0.0) < -_ROUNDING * np.diag(self.matrix).max(initial=0.0):
+            raise ValueError("rows are no covariance: a combination of the numbers has a negative variance")
+        return self
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(6 n, 6 n), of a layout with camera (6 n + 3, 6 n + 3)."""
+        out = np.zeros((len(self.rows), len(self.rows)))
+        for i, row in enumerate(self.rows):
+            try:
+                numbers = [float(number) for number in row.split()]
+            except ValueError as error:
+                raise ValueError(f"row {i + 1} holds something that is no number: {row[:40]!r}") from error
+            if len(numbers) != i + 1:
+                raise ValueError(f"row {i + 1} of a lower triangle has {i + 1} numbers, not {len(numbers)}")
+            out[i, : i + 1] = out[: i + 1, i] = numbers
+        return out
+
+
+class RefinedCamera(Section):
+    """What cube-layout found of the camera, which goes before the numbers of its CameraInfo."""
+
+    focal: Annotated[tuple[Sigma, Sigma], Field(strict=False)]  # px
+    centre: Annotated[tuple[float, float], Field(strict=False)]  # px
+    distortion: list[float]  # coefficients of CameraInfo's model
+
+
+class CubeConfig(Board, MethodSection):
+    """The cube: its tags and how well they are known, the camera on the reference, counts, date."""
+
+    key: ClassVar[str] = "cube"
+
+    camera_rotation: Quaternion | None = None  # BRC, camera on the reference: w, x, y, z
+    raw: Raw = Raw()  # of sensors that record counts
+    date: Date | None = None  # of the field model, as at the top level
+    covariance: LayoutCovariance | None = None  # as cube-layout writes it
+    camera: RefinedCamera | None = None  # as cube-layout --refine-camera writes it
+
+
+def field_date(config: Config) -> datetime.date | None:
+    """Date for the field model, at the top or under `cube`."""
+    return config.date or config.section(CubeConfig).date
+
+
+TOPICS = (IMU, MAG, REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, IMAGE, CAMERA_INFO, TEMPERATURE)
+_TAGS = Setting("cube.tags in the config", lambda config: bool(config.section(CubeConfig).tags))
+_METHOD = Setting("`method: cube` in the config", lambda config: config.method == "cube")
+REQUIREMENTS: tuple[Need, ...] = (
+    ((IMU,),),
+    # Pictures alone could be of anything. Without camera the turns between poses and gravity serve; the config has to
+    # say that this is meant.
+    ((TAG_DETECTIONS, CAMERA_INFO), (IMAGE, CAMERA_INFO, REFERENCE_IMU), (IMAGE, CAMERA_INFO, _TAGS), (_METHOD,)),
+)
+
+
+# Of gyro, accelerometer and magnetometer, in this order.
+DENSITIES = ("gyro_density", "accel_density", "mag_density")
+
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Tags in the camera's pictures.
+
+    Attributes:
+        t: (F,) s, stamps of the pictures.
+        frame: (M,) index of the picture of each tag seen.
+        ids: (M,) tag ids.
+        corners: (M, 4, 2) px, in the AprilTag library's order; integer coordinates are pixel centres.
+        covariance: (M, 4, 2, 2) px^2, or None when nobody measured it.
+    """
+
+    t: Array
+    frame: NDArray[np.int64]
+    ids: NDArray[np.int64]
+    corners: Array
+    covariance: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class CubeData:
+    """What a cube session measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+
+    imu_t (N,), gyro (N, 3), accel (N, 3): the device's, as recorded, rad/s and m/s^2 or counts. mag_t (L,), mag (L, 3):
+    T or counts; None when it has none. reference_t (R,), reference_wxyz (R, 4): attitude nRB of the reference in
+    East-North-Up, unit; None without one. reference_cov (R, 3, 3) rad^2, about the axes of n; None if unknown.
+    latitude, longitude, rad, height, m above the ellipsoid: of the reference; None if unknown. camera, sightings: None
+    without a camera. gyro_density, accel_density, mag_density: from the covariances of the messages, in the unit
+    recorded per sqrt(Hz), None if they have none. dropped: reason -> messages. temperature: of gyro and
+    accelerometer, None where nobody measures it.
+    """
+
+    epoch_ns: int
+    imu_t: Numbers
+    gyro: Vectors
+    accel: Vectors
+    mag_t: Numbers | None = None
+    mag: Vectors | None = None
+    reference_t: Numbers | None = None
+    reference_wxyz: Quaternions | None = None
+    reference_cov: Covariances | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    height: float = 0.0
+    camera: Camera | None = None
+    sightings: Sightings | None = None
+    gyro_density: float | None = None
+    accel_density: float | None = None
+    mag_density: float | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+    temperature: Temperature | None = None
+
+    @cached_property
+    def computed(self) -> dict[tuple[str, str], object]:
+        """What functions made by `computed_once` have found in these data: (function, config) -> result."""
+        return {}
+
+
+def computed_once(compute: Callable[[CubeData, Config], _Result]) -> Callable[[CubeData, Config], _Result]:
+    """A function of data and config that finds its result once for each config; the data keep it."""
+
+    @wraps(compute)
+    def call(data: CubeData, config: Config) -> _Result:
+        key = compute.__name__, config.model_dump_json()
+        if key not in data.computed:
+            data.computed[key] = compute(data, config)
+        return cast(_Result, data.computed[key])
+
+    return call
+
+
+def nominal(values: Array, conversion: RawConversion | None) -> Array:
+    """Counts converted as the config's `raw` says, in SI; what is recorded in SI as it is."""
+    return values if conversion is None else (values - conversion.offset) * conversion.scale
+
+
+def recorded(values: Array, conversion: RawConversion | None) -> Array:
+    """The inverse of `nominal`."""
+    return values if conversion is None else values / conversion.scale + conversion.offset
+
+
+def local_field(data: CubeData, config: Config) -> Array:
+    """The World Magnetic Model where the reference is, (3,) T in n, on the config's date or that of the stamps.
+
+    Raises InputError when the model does not hold there and then. `data` has latitude and longitude.
+    """
+    assert data.latitude is not None
+    assert data.longitude is not None
+    return field_at(data.latitude, data.longitude, data.height, data.epoch_ns, field_date(config))
+
+
+def stated_density(name: str, data: CubeData, config: Config, *families: str) -> Noise:
+    """One of DENSITIES as the config, the messages or nobody states it, in nominal SI, of some families."""
+    sensor = name.removesuffix("_density")
+    density: float | None = getattr(data, name)
+    conversion: RawConversion | None = getattr(config.section(CubeConfig).raw, sensor)
+    message = density if density is None or conversion is None else density * conversion.scale
+    return stated(name, config, message, families)
+
+
+def noise_densities(data: CubeData, config: Config) -> tuple[float, ...]:
+    """Of gyro, accelerometer and magnetometer as stated, nominal SI per sqrt(Hz)."""
+    return tuple(stated_density(name, data, config).stated for name in DENSITIES)
+
 
 # rad^2; no reference is as good.
 _LEAST_VARIANCE = 1e-11
@@ -36,6 +251,9 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     Raises InputError when a topic is unusable (alidade.pipelines.recording.checks) or in an implausible unit, when the
     topics have no time in common, and with pictures when there is no static pose or no tag in any.
     """
+    from alidade.pipelines.methods.cube.tags import read_camera, read_sightings
+    from alidade.pipelines.methods.cube.units import Readings, check_units
+
     reader = StreamReader(recording, dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic(IMU)
     imu = reader.samples(name, recording.imu(name), "gyro", "accel", least=3, slowest_s=SLOWEST_GYRO_S)
@@ -81,7 +299,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         accel_density=accel_density,
         mag_density=mag_density,
         dropped=reader.dropped,
-        temperature=temperature.read(reader, config, tuple(TEMPERATURE.values()), imu.t),
+        temperature=temperature.read(reader, config, (temperature.GYRO_SLOPE, temperature.ACCEL_SLOPE), imu.t),
     )
     if data.camera is None:
         return data
@@ -98,3 +316,86 @@ def _reference(reader: StreamReader, topic: str) -> tuple[Array, Array, Array | 
     t, wxyz, cov = reader.attitude(topic, _LEAST_VARIANCE, least=1)
     known = (np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0).all()
     return t, wxyz, cov if known else None
+
+
+Array = NDArray[np.float64]
+
+
+def write_cube(
+    path: Path | str,
+    data: CubeData,
+    truth: Mapping[str, float] | None = None,
+    config_yaml: str | None = None,
+    pictures: Iterable[bytes] | None = None,
+) -> None:
+    """Write a cube session under the default topic names, with its truth and config as attachments.
+
+    Stamps are rounded to ns. With pictures (JPEG files, one for each frame of the sightings, in their order) these are
+    written instead of the detections. read_cube gives the same data back if the first sample is the one at t = 0.
+    """
+    epoch = data.epoch_ns
+
+    def covariance(t: Array, density: float | None) -> Array:
+        return (0.0 if density is None else density**2 / float(np.median(np.diff(t)))) * np.eye(3)
+
+    topics: dict[str, series.Topic] = {
+        IMU.name: series.ImuSeries(
+            nanoseconds(data.imu_t, epoch),
+            data.gyro,
+            data.accel,
+            gyro_cov=covariance(data.imu_t, data.gyro_density),
+            accel_cov=covariance(data.imu_t, data.accel_density),
+            frame_id="imu",
+        )
+    }
+    if data.mag_t is not None and data.mag is not None:
+        cov = covariance(data.mag_t, data.mag_density)
+        topics[MAG.name] = series.MagneticSeries(
+            nanoseconds(data.mag_t, epoch), data.mag, field_cov=cov, frame_id="imu"
+        )
+    if data.reference_t is not None and data.reference_wxyz is not None:
+        n = len(data.reference_t)
+        topics[REFERENCE_IMU.name] = series.ImuSeries(
+            nanoseconds(data.reference_t, epoch),
+            np.zeros((n, 3)),
+            wxyz=data.reference_wxyz,
+            wxyz_cov=np.zeros((3, 3)) if data.reference_cov is None else data.reference_cov,
+            frame_id="reference",
+        )
+    start = np.array([epoch])
+    if data.latitude is not None and data.longitude is not None:
+        latitude, longitude = np.rad2deg([data.latitude, data.longitude])
+        topics[REFERENCE_FIX.name] = series.FixSeries(
+            start, np.array([latitude]), np.array([longitude]), np.array([data.height]), frame_id="reference"
+        )
+    if data.camera is not None and data.sightings is not None:
+        topics[CAMERA_INFO.name] = _info_message(data.camera, epoch)
+        topics |= _pictures_or_tags(data.sightings, epoch, pictures)
+    topics |= temperature.topics(data.temperature, epoch)
+    write_session(path, topics, attached(truth, config_yaml))
+
+
+def _info_message(camera: Camera, epoch_ns: int) -> series.CameraInfo:
+    return series.CameraInfo(
+        epoch_ns,
+        camera.width,
+        camera.height,
+        camera.distortion_model,
+        camera.coefficients,
+        camera.K,
+        np.eye(3),
+        np.hstack([camera.K, np.zeros((3, 1))]),
+        frame_id="camera",
+    )
+
+
+def _pictures_or_tags(seen: Sightings, epoch_ns: int, pictures: Iterable[bytes] | None) -> dict[str, series.Topic]:
+    t_ns = nanoseconds(seen.t, epoch_ns)
+    if pictures is not None:
+        return {IMAGE.name: series.ImageSeries(t_ns, pictures, format="jpeg", frame_id="camera")}
+    m = len(seen.ids)
+    zero = np.zeros(m, dtype=np.int64)
+    found = series.DetectionSeries(
+        t_ns, seen.frame, seen.ids, seen.corners, zero, np.zeros(m), np.full(m, "tag36h11"), frame_id="camera"
+    )
+    return {TAG_DETECTIONS.name: found}

@@ -9,9 +9,8 @@ import numpy as np
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.cube.data import CubeData
-from alidade.pipelines.methods.cube.poses import StaticPoses
-from alidade.pipelines.methods.cube.topics import REFERENCE_IMU, CubeConfig
+from alidade.pipelines.methods.cube.recording import REFERENCE_IMU, CubeConfig, CubeData
+from alidade.pipelines.methods.cube.static_poses import StaticPoses
 from alidade.pipelines.settings import Config
 
 # Messages that scatter by more than this many times their stated variance are those of a reference that moved.

@@ -17,21 +17,22 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity, magnetic_field
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import stated
-from alidade.pipelines.methods.cube.data import CubeData, Sightings
+from alidade.pipelines.estimation.parameters import stated
+from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.cube.faces import FACES
 from alidade.pipelines.methods.cube.motion import drawn_motion
 from alidade.pipelines.methods.cube.parameters import (
-    ASSUMPTIONS,
     CENTRE,
     CUBE,
     FOCAL,
+    NUISANCE,
     SENSITIVITY,
     SQUARE,
     TEMPERATURE,
     TILT,
     is_stated,
 )
+from alidade.pipelines.methods.cube.recording import CubeData, Sightings
 from alidade.pipelines.methods.cube.scenario import (
     EPOCH_NS,
     FORWARD,
@@ -89,7 +90,7 @@ class _World:
         self.scenario = scenario
         # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
         self.rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-        assumed = known(ASSUMPTIONS, scenario.temperature)
+        assumed = known(NUISANCE, scenario.temperature)
         self.effects = true_values(assumed, scenario.sensors, scenario.effects, rng_of_sensors)
         config = Config(sensors=scenario.sensors or Sensors())
         for assumption in (FOCAL, CENTRE):
@@ -302,3 +303,6 @@ class _World:
                 for axis, x in zip("xyz", vector, strict=True)
             }
         return truth
+
+
+SIMULATOR = Simulator(scenario=CubeScenario, simulate=simulated, randomised=True)

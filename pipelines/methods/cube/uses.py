@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 
 from alidade.pipelines.diagnostics.use import Truth, Use
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.cube.data import nominal, recorded
 from alidade.pipelines.methods.cube.parameters import CUBE, SQUARE
-from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.recording import CubeConfig, nominal, recorded
 from alidade.pipelines.methods.uses import along, raw_of, triad_uses
 from alidade.pipelines.settings import Config
 
 
-def uses(true: Truth, config: Config) -> Sequence[Use]:
+def uses(true: Truth, config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
     """Heading, rate and specific force."""
     raw = config.section(CubeConfig).raw
 

@@ -10,7 +10,7 @@ import numpy as np
 from alidade.pipelines.estimation.linear import linear_factor
 from alidade.pipelines.estimation.priors import vector_about
 from alidade.pipelines.estimation.problem import Array, Factor
-from alidade.pipelines.methods.cube.poses import StaticPoses
+from alidade.pipelines.methods.cube.static_poses import StaticPoses
 
 # A gyro bias that does not walk still does so by this much, rad/s, for the sake of the arithmetic.
 _STEADY = 1e-8

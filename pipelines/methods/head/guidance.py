@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from alidade.factors import so3
 from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
+from alidade.pipelines.diagnostics.fault_models import AXES, DataFault, FaultModel
+from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.scenario import sways
 
 # Turns of a head and of the platform it sits in count from these angles on, rad.
 _NOD, _MANOEUVRE = np.deg2rad(10.0), np.deg2rad(5.0)
@@ -22,3 +28,86 @@ def checklist(data: HeadData, _: Config) -> Sequence[ChecklistItem]:
         platform = turned(data.platform_t, data.platform_gyro)
         found += swayed("platform", platform, _MANOEUVRE, "turn the platform about its", "platform")
     return found
+
+
+# The sway added.
+_SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}
+
+
+def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+    """In words, and the changed scenario."""
+    for who, key in (("head", "head"), ("platform", "platform")):
+        for words, motion in sways(scenario[key], _SWAY):
+            yield f"the {who}: {words}", {**scenario, key: motion}
+
+
+# A platform's rate, taken for a bias, wanders by this much, rad/s/sqrt(s): an aircraft's manoeuvres.
+_MANOEUVRES = 0.3
+
+
+def _inverted(data: HeadData, config: Config) -> tuple[HeadData, Config]:
+    """Attitudes hRc where cRh is wanted; their errors turn with them."""
+    covariance = data.vision_cov
+    if covariance is not None:
+        R = so3.matrix(data.vision_wxyz)
+        covariance = R @ covariance @ np.swapaxes(R, 1, 2)
+    return replace(data, vision_wxyz=so3.inverse(data.vision_wxyz), vision_cov=covariance), config
+
+
+def _reordered(data: HeadData, config: Config, order: tuple[int, ...]) -> tuple[HeadData, Config]:
+    """The components of vision's quaternions in another order; what was said of their errors is none of these."""
+    return replace(data, vision_wxyz=data.vision_wxyz[:, order], vision_cov=None), config
+
+
+def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
+    """Helmet and platform the other way round; nobody has read force and temperature in the platform."""
+    if data.platform_t is None or data.platform_gyro is None:
+        return None
+    swapped = replace(
+        data,
+        head_t=data.platform_t,
+        head_gyro=data.platform_gyro,
+        gyro_density=data.platform_gyro_density,
+        head_force=None,
+        temperature=None,
+        platform_t=data.head_t,
+        platform_gyro=data.head_gyro,
+        platform_gyro_density=data.gyro_density,
+    )
+    return swapped, config
+
+
+def _moving(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
+    """A bias free to follow the rate of a platform that nobody measured."""
+    if data.platform_t is not None:
+        return None
+    noise = config.noise.model_copy(update={"gyro_bias_walk": _MANOEUVRES})
+    return data, config.model_copy(update={"noise": noise})
+
+
+FAULTS = FaultModel(
+    streams={
+        "head_t": ("head_gyro", "head_force"),
+        "platform_t": ("platform_gyro",),
+        "vision_t": ("vision_wxyz", "vision_cov"),
+        "truth_t": ("truth_wxyz",),
+    },
+    signs={"head_gyro": ("helmet gyro", AXES), "platform_gyro": ("platform gyro", AXES)},
+    faults=(
+        DataFault(
+            "the attitudes of vision are inverted: they map the camera's frame to the markers', not back", _inverted
+        ),
+        DataFault(
+            "the quaternions of vision are given as x, y, z, w where w, x, y, z is meant",
+            partial(_reordered, order=(3, 0, 1, 2)),
+        ),
+        DataFault(
+            "the quaternions of vision are given as w, x, y, z where x, y, z, w is meant",
+            partial(_reordered, order=(1, 2, 3, 0)),
+        ),
+        DataFault("the topics of helmet and platform IMU are swapped", _swapped),
+        DataFault("the platform moves, and no topic tells how: record /platform/imu", _moving, fallback=True),
+    ),
+)
+
+GUIDANCE = Guidance(checklist=checklist, variations=candidates)

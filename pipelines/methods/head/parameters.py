@@ -1,45 +1,72 @@
-"""What the head method calibrates and what it assumes: names, priors and accuracies of the contract."""
+"""Parameters of the head method: mounts, gyro bias, time offset, and errors of the sensors."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import gtsam
 
 from alidade.factors.earth import EARTH_RATE
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import (
-    Assumption,
+from alidade.pipelines.estimation.parameters import (
+    CLOCK_SKEW,
+    ParameterSpec,
+    check_parameters,
+    g_sensitivity,
+    gyro_bias,
     gyro_errors,
+    gyro_scale,
     parameter,
     quantities,
-    scale_assumptions,
-    sensitivity_assumption,
-    temperature_assumption,
+    scalar,
+    time_offset,
 )
-from alidade.pipelines.estimation.problem import Parameter, Quantity, rotation_vector_coordinates
+from alidade.pipelines.estimation.problem import Parameter, rotation_vector_coordinates
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
-from alidade.pipelines.settings import Config, check_names
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.settings import Config
 
-BIAS, HELMET, CAMERA, OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "time_offset"
+HELMET = ParameterSpec(
+    "helmet_mount",
+    "rad",
+    0.35,
+    "Rotation markers to helmet IMU (vRh), {axis} of the rotation vector.",
+    require=1e-2,
+    rotation="vRh",
+)
+CAMERA = ParameterSpec(
+    "camera_mount",
+    "rad",
+    0.35,
+    "Rotation platform to camera (cRb), {axis} of the rotation vector.",
+    require=1e-2,
+    rotation="cRb",
+)
+BIAS, OFFSET = gyro_bias(0.05, 2e-3), time_offset(0.05, 5e-3)
 
 # The grades of real-sensor data sheets, one sigma: MEMS gyros, uncalibrated, and a platform's of 10 deg/h.
-SCALE = scale_assumptions("gyro", "gyro", 1e-2)
-SENSITIVITY = sensitivity_assumption("gyro", "gyro", 1e-4)
-TEMPERATURE = temperature_assumption("gyro", "rad/s", 1e-4)
-PLATFORM_BIAS = Assumption(tuple(f"platform_bias_{axis}" for axis in "xyz"), "rad/s", "platform_gyro", "bias", 5e-5)
-PLATFORM_SCALE = scale_assumptions("platform", "platform_gyro", 1e-2)
-CLOCK_SKEW = Assumption(("clock_skew",), "", "clock", "skew", 1e-4)
-VISION_SCALE = Assumption(("vision_scale",), "", "camera", "scale", 3e-3)
-# Half the square of 10 ms, what impulse responses of trackers and gyros differ by.
-VISION_FILTER = Assumption(("vision_filter",), "s^2", "camera", "filter", 5e-5)
-PICTURES = (CLOCK_SKEW, VISION_SCALE, VISION_FILTER)
-ASSUMPTIONS = (
-    *(*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE),
-    *(CLOCK_SKEW, VISION_SCALE, TEMPERATURE, VISION_FILTER),
+SCALE = gyro_scale("gyro", "gyro", 1e-2)
+SENSITIVITY = g_sensitivity(1e-4)
+PLATFORM_BIAS = ParameterSpec(
+    "platform_bias", "rad/s", 5e-5, "Platform gyro bias about {axis}.", "platform_gyro.bias", per_recording=True
 )
+PLATFORM_SCALE = gyro_scale("platform", "platform_gyro", 1e-2, of="Platform gyro")
+VISION_SCALE = scalar("vision_scale", "", 3e-3, "Scale error of the angles measured by vision.", "camera.scale")
+# Half the square of 10 ms, what impulse responses of trackers and gyros differ by.
+VISION_FILTER = scalar(
+    "vision_filter",
+    "s^2",
+    5e-5,
+    "Low-pass of vision: half the second moment of its impulse response, less the gyro's.",
+    "camera.filter",
+)
+PICTURES = (CLOCK_SKEW, VISION_SCALE, VISION_FILTER)
+NUISANCE = (
+    *(*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE),
+    *(CLOCK_SKEW, VISION_SCALE, GYRO_SLOPE, VISION_FILTER),
+)
+PARAMETERS = (BIAS, HELMET, CAMERA, OFFSET, *NUISANCE)
 
 
 @dataclass(frozen=True)
@@ -66,7 +93,7 @@ class HeadParameters:
         cls,
         config: Config,
         platform: bool,
-        drivers: Sequence[Assumption],
+        drivers: Sequence[ParameterSpec],
         stamp_sigma: float = 0.0,
         all_around: bool = False,
     ) -> HeadParameters:
@@ -77,7 +104,7 @@ class HeadParameters:
         Args:
             config: priors, data sheets, accuracies wanted.
             platform: whether there is a platform gyro.
-            drivers: SENSITIVITY and TEMPERATURE, in this order, where the helmet's IMU measures their causes.
+            drivers: SENSITIVITY and GYRO_SLOPE, in this order, where the helmet's IMU measures their causes.
             stamp_sigma: s, how well the stamps are known.
             all_around: whether vision shows the helmet turned by half a turn: no scale of its angles but 1 is
                 continuous there, so that it is fixed unless the config says something of it.
@@ -89,32 +116,19 @@ class HeadParameters:
                 f"skew: {figure:g}}}}} instead"
             )
 
-        def quantity(name: str, unit: str, scale: float, require: float, fixed: bool, extra: float) -> Quantity:
-            prior = config.prior(name, 0.0 if fixed else scale)
-            return Quantity(name, unit, prior, scale, config.require.get(name, require), extra)
-
-        def triple(
-            name: str, unit: str, scale: float, require: float, fixed: bool = False, extra: float = 0.0
-        ) -> tuple[Quantity, ...]:
-            return tuple(quantity(f"{name}_{axis}", unit, scale, require, fixed, extra) for axis in "xyz")
-
-        bias = triple(BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)
-        mounts = triple(HELMET, "rad", 0.35, 1e-2), triple(CAMERA, "rad", 0.35, 1e-2, fixed=not platform)
-        offset = quantity(OFFSET, "s", 0.05, 5e-3, False, stamp_sigma)
         unscaled = all_around or config.vision.kind == "mocap"
         if unscaled and "scale" not in config.sensors.camera.model_fields_set:
             config = config.model_copy(update={"priors": {"vision_scale": 0.0, **config.priors}})
-        assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
-        known = [q.name for q in (*bias, *mounts[0], *mounts[1], offset, *assumed)]
-        check_names(config.priors, known, "priors")
-        check_names(config.require, known, "require")
-
+        check_parameters(PARAMETERS, config)
+        mounts = quantities(HELMET, config), quantities(CAMERA, config, fixed=not platform)
         clock = parameter(_key("T"), PICTURES, config)
         return cls(
-            bias=Parameter(FIRST_BIAS, bias),
+            bias=Parameter(FIRST_BIAS, quantities(BIAS, config, extra_sigma=0.0 if platform else EARTH_RATE)),
             helmet=Parameter(_key("H"), mounts[0], rotation_vector_coordinates),
             camera=Parameter(_key("C"), mounts[1], rotation_vector_coordinates),
-            picture=Parameter(_key("T"), (offset, *(clock.quantities if clock else ()))),
+            picture=Parameter(
+                _key("T"), (*quantities(OFFSET, config, extra_sigma=stamp_sigma), *(clock.quantities if clock else ()))
+            ),
             gyro=gyro_errors(_key("G"), SCALE, drivers, config),
             platform=parameter(_key("P"), (PLATFORM_BIAS, *PLATFORM_SCALE), config) if platform else None,
         )

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors import so3
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.head import parameters
-from alidade.pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_ATTITUDE, VISION_ATTITUDE, HeadConfig
-from alidade.pipelines.recording import series
+from alidade.pipelines.methods.noise import typical
+from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import (
     check_overlap,
     nanoseconds,
@@ -22,11 +25,28 @@ from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
-from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
-from alidade.pipelines.settings import Config
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, TEMPERATURE, Need, Setting, Topic, wanted
+from alidade.pipelines.settings import Board, Config, MethodSection
 from alidade.pipelines.vision.camera import camera_of
 
-Array = NDArray[np.float64]
+HEAD_IMU = Topic("head_imu", "/head/imu", messages.RATES)
+PLATFORM_IMU = Topic("platform_imu", "/platform/imu", messages.RATES)
+VISION_ATTITUDE = Topic("vision_attitude", "/vision/attitude", messages.ATTITUDES)
+TRUTH_ATTITUDE = Topic("truth_attitude", "/truth/attitude", messages.ATTITUDES)
+
+
+class HeadConfig(MethodSection):
+    """The helmet."""
+
+    key: ClassVar[str] = "head"
+
+    board: Board | None = None  # tags on the helmet
+
+
+TOPICS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE, IMAGE, CAMERA_INFO, TEMPERATURE)
+_BOARD = Setting("head.board in the config", lambda config: config.section(HeadConfig).board is not None)
+REQUIREMENTS: tuple[Need, ...] = (((HEAD_IMU,),), ((VISION_ATTITUDE,), (IMAGE, CAMERA_INFO, _BOARD)))
+
 
 _NUMBERS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE)
 # rad^2; no tracker on a helmet is as good. Drivers that know nothing write 1e-12, say.
@@ -113,7 +133,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
         head_force,
         reader.dropped,
         recording.stamp_sigma_s,
-        temperature.read(reader, config, (parameters.TEMPERATURE,), head.t),
+        temperature.read(reader, config, (temperature.GYRO_SLOPE,), head.t),
     )
 
 
@@ -186,3 +206,49 @@ def _vision(reader: StreamReader, topic: str) -> tuple[Array, Array, Array | Non
             f"(and {len(bad) - 1} more); all zeros would mean that it is unknown"
         )
     return t, wxyz, cov
+
+
+# Cameras that look for tags deliver fewer attitudes a second.
+_FAST_HZ = 80.0
+# rad; so measured, motion capture at 25 Hz has 7e-5 to 5e-4 (six BROAD trials), with .5 deg of noise added 7e-3.
+_TINY = 1e-3
+_MOCAP = re.compile(r"mocap|vicon|optitrack|qualisys|motion_?capture", re.IGNORECASE)
+# Fourth differences of white noise have so many times its variance: the binomial of 8 over 4.
+_FOURTH = 70.0
+# They are looked at so many at a time, three axes each, and noise is that of the quietest of these, but for a few.
+_FEW, _QUIET = 25, 0.05
+
+
+def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
+    """The kind that rate, covariance, noise, type or name suggest, with the reason; nothing where none does."""
+    if "kind" in config.vision.model_fields_set:
+        return ()
+    name = config.topic(VISION_ATTITUDE)
+    if not wanted(recording, config, VISION_ATTITUDE):
+        return ("vision: {kind: pnp} (attitudes are measured in pictures of tags)",)
+    try:
+        poses = recording.poses(name)
+    except InputError:
+        return ()
+    if _MOCAP.search(name):
+        return (f"vision: {{kind: mocap}} (the name {name})",)
+    if name in recording.topics and recording.topics[name].type == messages.ODOMETRY:
+        return (f"vision: {{kind: vio}} ({name} is odometry)",)
+    order = np.argsort(poses.t_ns, kind="stable")
+    steps = np.diff(poses.t_ns[order])
+    rate = 1e9 / float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    # Drivers that know nothing state next to nothing.
+    noise = max(typical(poses.cov, 3, 4, 5) or 0.0, white_angle(poses.wxyz[order]))
+    if rate < _FAST_HZ and noise >= _TINY:
+        return ()
+    return (f"vision: {{kind: mocap}} ({rate:.3g} attitudes/s on {name}, noise {np.rad2deg(noise):.2g} deg)",)
+
+
+def white_angle(wxyz: Array) -> float:
+    """Noise of attitudes (n, 4), rad per axis, where they turn least: fourth differences have motion in them, too."""
+    turns = so3.log(so3.multiply(so3.inverse(wxyz[:-1]), wxyz[1:]))
+    fourth = np.diff(turns, 3, axis=0)
+    if len(fourth) < _FEW:
+        return np.inf
+    pieces = np.array_split(fourth, len(fourth) // _FEW)
+    return float(np.quantile([robust_sigma(piece) for piece in pieces], _QUIET)) / _FOURTH**0.5

@@ -8,8 +8,8 @@ true attitude at the end of every interval, with no integration error.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Self
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,17 @@ from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import dump_yaml
-from alidade.pipelines.methods.head.parameters import ASSUMPTIONS
-from alidade.pipelines.methods.head.pictures import HeadPictures, draw
+from alidade.pipelines.methods import Simulator
+from alidade.pipelines.methods.head.parameters import NUISANCE
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
-from alidade.pipelines.settings import SensorSheets
+from alidade.pipelines.settings import Board, SensorSheets, Tag
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
 from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
 from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 
@@ -37,6 +39,91 @@ Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Fraction = Annotated[float, Field(ge=0.0, lt=1.0)]
 Vector = tuple[float, float, float]
+
+# The head's sway goes round in no common period, Hz.
+_SWAY_HZ = (0.31, 0.23, 0.17)
+# Off the middle of the picture, px, as principal points are.
+_OFF_CENTRE = (3.4, -2.7)
+
+
+def _board(*tags: tuple[float, float, float, float]) -> Board:
+    """Tags of 45 mm at (x, y), m, leaning back by angles about x and y, deg.
+
+    They face -z of the board: its axes are the camera's when it faces the camera upright, so that mounts are small.
+    """
+    facing = so3.exp([np.pi, 0.0, 0.0])
+    out = {}
+    for i, (x, y, about_x, about_y) in enumerate(tags):
+        w, *v = so3.multiply(so3.exp(np.deg2rad([about_x, about_y, 0.0])), facing).tolist()
+        out[i] = Tag(size=0.045, rotation=(w, v[0], v[1], v[2]), position=(x, y, 0.0))
+    return Board(tags=out)
+
+
+class HeadPictures(BaseModel):
+    """The camera, its pictures, the tag board and where it is: a pinhole camera with plumb_bob distortion."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    width: Annotated[int, Field(gt=0)] = 640
+    height: Annotated[int, Field(gt=0)] = 480
+    focal_px: Positive = 620.0
+    distortion: list[float] = [-0.22, 0.09, 8e-4, -5e-4, 0.0]  # k1 k2 p1 p2 k3
+    blur_px: NotNegative = 0.7  # sigma
+    grey_noise: NotNegative = 2.0  # sigma, grey levels of 255
+    format: Literal["png", "jpeg"] = "jpeg"
+    board: Board = _board(
+        (-0.032, -0.032, 12, -12), (0.032, -0.032, 12, 12), (-0.032, 0.032, 0, 0), (0.032, 0.032, 0, 0)
+    )
+    position_m: Vector = (0.0, 0.0, 0.34)  # of the board's origin in the camera's frame, on average
+    sway_m: Vector = (0.015, 0.01, 0.02)  # amplitude about that
+
+
+def draw(
+    settings: HeadPictures, t: Array, t_ns: NDArray[np.int64], cRh: Array, rng: np.random.Generator
+) -> tuple[series.CameraInfo, series.ImageSeries]:
+    """The camera's description and its pictures, drawn one by one as they are taken.
+
+    Args:
+        settings: camera and board.
+        t: (K,) when the pictures are taken, s.
+        t_ns: (K,) their stamps, Unix ns.
+        cRh: (K, 4) the board's attitude at those times.
+        rng: of the sensor's noise.
+
+    Raises:
+        InputError: no camera can have that distortion.
+    """
+    centre = np.array([settings.width - 1.0, settings.height - 1.0]) / 2.0 + _OFF_CENTRE
+    K = np.array([[settings.focal_px, 0.0, centre[0]], [0.0, settings.focal_px, centre[1]], [0.0, 0.0, 1.0]])
+    camera = Camera(settings.width, settings.height, K, "plumb_bob", np.array(settings.distortion))
+    info = series.CameraInfo(
+        t_ns=int(t_ns[0]),
+        width=camera.width,
+        height=camera.height,
+        distortion_model=camera.distortion_model,
+        d=camera.coefficients,
+        k=K,
+        r=np.eye(3),
+        p=np.pad(K, ((0, 0), (0, 1))),
+        frame_id="camera",
+    )
+    position = np.array(settings.position_m) + np.array(settings.sway_m) * np.sin(2.0 * np.pi * t[:, None] * _SWAY_HZ)
+    files = _exposures(settings, camera, cRh, position, rng)
+    return info, series.ImageSeries(t_ns, files, settings.format, "camera")
+
+
+def _exposures(
+    settings: HeadPictures, camera: Camera, cRh: Array, position: Array, rng: np.random.Generator
+) -> Iterator[bytes]:
+    """The files of the pictures."""
+    renderer = Renderer(camera)
+    for attitude, origin in zip(cRh, position, strict=True):
+        quads = [
+            tag_quad(i, tag.size, so3.multiply(attitude, tag.rotation), origin + so3.rotate(attitude, tag.position))
+            for i, tag in settings.board.tags.items()
+        ]
+        picture = expose(renderer.radiance(quads), settings.blur_px, settings.grey_noise, rng)
+        yield encode(picture, settings.format, 92)
 
 
 class HeadNoise(BaseModel):
@@ -99,7 +186,7 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     noise = scenario.noise
-    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     head_t, head_rate = _gyro(scenario, scenario.gyro_rate_hz, scenario.gyro_phase, helmet=True)
     force = _specific_force(scenario, head_t)
     bias = _walking_bias(scenario, len(head_t), rng)
@@ -145,7 +232,7 @@ def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraI
     if scenario.outlier_fraction > 0.0:
         raise InputError("outlier_fraction: pictures are simulated without outliers; leave out --images")
     rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     t, at, cRh = _sights(scenario, effects)
     rng = np.random.default_rng(seed)
     return draw(scenario.pictures, at, nanoseconds(t, EPOCH_NS), cRh, rng)
@@ -267,3 +354,6 @@ def simulated(scenario: HeadScenario, seed: int, images: bool = False) -> Simula
     data, truth = simulate_head(scenario, seed)
     pictures = simulate_pictures(scenario, seed) if images else None
     return Simulated(data, truth, head_config(scenario, images), pictures)
+
+
+SIMULATOR = Simulator(scenario=HeadScenario, simulate=simulated, default_with_images="head_pictures")

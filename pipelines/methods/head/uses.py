@@ -10,6 +10,7 @@ from alidade.factors import so3
 from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.uses import G, gyro_reading
+from alidade.pipelines.settings import Config
 
 _YAW_DEG = np.linspace(-90.0, 90.0, 37)
 _RATE_DEG = 100.0
@@ -17,7 +18,7 @@ _OUTAGE_S = np.linspace(0.0, 60.0, 31)
 _EZ = np.array([0.0, 0.0, 1.0])
 
 
-def uses(noise: Mapping[str, float]) -> Sequence[Use]:
+def uses(_true: Truth, _config: Config, noise: Mapping[str, float]) -> Sequence[Use]:
     """Attitude over head azimuth, and over the time since the last picture."""
     density, walk = noise.get("gyro_density", 0.0), noise.get("gyro_bias_walk", 0.0)
     gained = density**2 * _OUTAGE_S + walk**2 * _OUTAGE_S**3 / 3.0

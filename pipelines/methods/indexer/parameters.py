@@ -1,37 +1,42 @@
-"""What the indexer method calibrates and what it assumes: names, variables, priors and accuracies of the contract."""
+"""Parameters of the indexer method: mounting angles, gyro bias, and errors of gyro, encoders and axes."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from itertools import chain
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
-from alidade.pipelines.estimation.assumptions import (
-    encoder_assumptions,
+from alidade.pipelines.estimation.parameters import (
+    ParameterSpec,
+    check_parameters,
+    encoder_errors,
+    gyro_bias,
+    gyro_scale,
     parameter,
     quantities,
-    scale_assumptions,
+    scalar,
     stamped,
-    temperature_assumption,
 )
-from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
+from alidade.pipelines.estimation.problem import Array, Parameter
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
-from alidade.pipelines.methods.indexer.topics import JOINTS
-from alidade.pipelines.settings import Config, check_names
+from alidade.pipelines.methods.indexer.recording import JOINTS
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.settings import Config
 
-THETA = ("theta_x", "theta_y", "theta_z")
-BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
-EPSILON = ("axis_nonperpendicularity",)
+MOUNT = ParameterSpec("theta", "rad", 0.1, "IMU misalignment about {axis} of the platform.", require=5e-5)
+GYRO_BIAS = gyro_bias(1e-3, 1e-5)
+# Assumed only where the config gives it a prior.
+TILT = scalar("axis_nonperpendicularity", "rad", 1e-2, "Non-perpendicularity of inner and outer axis.")
 
 # What data sheets of navigation-grade sensors state, one sigma: fibre-optic or laser gyros after factory calibration,
 # axes that turn with encoders of some arc seconds.
-SCALE, SKEW = scale_assumptions("gyro", "gyro", 1e-4, 2e-5)
-ONCE_PER_TURN, DELAY = encoder_assumptions(JOINTS, 5e-6, 1e-3)
-TEMPERATURE = temperature_assumption("gyro", "rad/s", 1e-4)
-ASSUMPTIONS = (SCALE, SKEW, ONCE_PER_TURN, DELAY, TEMPERATURE)
+SCALE, SKEW = gyro_scale("gyro", "gyro", 1e-4, 2e-5)
+ONCE_PER_TURN, DELAY = encoder_errors(JOINTS, 5e-6, 1e-3)
+NUISANCE = (SCALE, SKEW, ONCE_PER_TURN, DELAY, GYRO_SLOPE)
+PARAMETERS = (MOUNT, GYRO_BIAS, *NUISANCE, TILT)
+THETA, BIAS, EPSILON = MOUNT.names, GYRO_BIAS.names, TILT.names
 ERRORS, ENCODER = (*SCALE.names, *SKEW.names), (*ONCE_PER_TURN.names, *DELAY.names)
 
 KEYS: dict[str, int] = {
@@ -50,25 +55,13 @@ def indexer_parameters(config: Config, stamp_sigma: float = 0.0, thermometer: bo
     That the axes are not perpendicular is assumed only where the config gives it a prior. `stamp_sigma`, s: how well
     the stamps are known; `thermometer`: whether the IMU's temperature is measured.
     """
-    assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
-    known = [*THETA, *BIAS, *(q.name for q in assumed), *EPSILON]
-    check_names(config.priors, known, "priors")
-    check_names(config.require, known, "require")
-
-    def calibrated(names: Sequence[str], unit: str, scale: float, require: float) -> tuple[Quantity, ...]:
-        return tuple(
-            Quantity(name, unit, config.prior(name, scale), scale, config.require.get(name, require)) for name in names
-        )
-
-    axes = tuple(
-        Quantity(name, "rad", config.prior(name, 0.0), 1e-2, config.require.get(name, math.inf), group="assumption")
-        for name in EPSILON
-    )
+    check_parameters(PARAMETERS, config)
+    axes = tuple(replace(q, group="assumption") for q in quantities(TILT, config, fixed=True))
     found = (
-        Parameter(KEYS["theta"], calibrated(THETA, "rad", 0.1, 5e-5), theta_coordinates),
-        Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", 1e-3, 1e-5)),
+        Parameter(KEYS["theta"], quantities(MOUNT, config), theta_coordinates),
+        Parameter(FIRST_BIAS, quantities(GYRO_BIAS, config)),
         parameter(KEYS["errors"], (SCALE, SKEW), config),
-        parameter(KEYS["temperature"], (TEMPERATURE,), config) if thermometer else None,
+        parameter(KEYS["temperature"], (GYRO_SLOPE,), config) if thermometer else None,
         stamped(parameter(KEYS["encoder"], (ONCE_PER_TURN, DELAY), config), DELAY.names[0], stamp_sigma),
         Parameter(KEYS["epsilon"], axes) if any(q.prior_sigma != 0.0 for q in axes) else None,
     )

@@ -22,7 +22,7 @@ from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.indexer.recording import IndexerData
-from alidade.pipelines.methods.indexer.runs import AxisMotion, Run, axis_motion
+from alidade.pipelines.methods.indexer.windows import AxisMotion, Run, axis_motion
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 Array = NDArray[np.float64]

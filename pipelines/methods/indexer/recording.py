@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.indexer import parameters
-from alidade.pipelines.methods.indexer.topics import INDEXER, JOINTS
-from alidade.pipelines.recording import series
+from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import (
     check_overlap,
     nanoseconds,
@@ -23,8 +22,26 @@ from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
-from alidade.pipelines.recording.topics import FIX, IMU, wanted
-from alidade.pipelines.settings import Config
+from alidade.pipelines.recording.topics import FIX, IMU, TEMPERATURE, Need, Setting, Topic, wanted
+from alidade.pipelines.settings import Config, MethodSection, Quaternion
+
+INDEXER = Topic("indexer", "/indexer/joint_states", (messages.JOINT_STATE,))
+
+# The axes, as the messages name them.
+JOINTS = ("outer_x", "inner_z")
+
+TOPICS = (IMU, INDEXER, FIX, TEMPERATURE)
+_LATITUDE = Setting("latitude_deg in the config", lambda config: config.latitude_deg is not None)
+REQUIREMENTS: tuple[Need, ...] = (((IMU,),), ((INDEXER,),), ((FIX,), (_LATITUDE,)))
+
+
+class IndexerConfig(MethodSection):
+    """The indexer."""
+
+    key: ClassVar[str] = "indexer"
+
+    base_attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)  # nRbase: w, x, y, z
+
 
 Array = NDArray[np.float64]
 
@@ -85,12 +102,16 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
         reader.density(imu_topic, "gyro", imu),
         reader.dropped,
         recording.stamp_sigma_s,
-        temperature.read(reader, config, (parameters.TEMPERATURE,), imu.t),
+        temperature.read(reader, config, (temperature.GYRO_SLOPE,), imu.t),
     )
 
 
 def write_indexer(
-    path: Path | str, data: IndexerData, truth: Mapping[str, float] | None = None, config_yaml: str | None = None
+    path: Path | str,
+    data: IndexerData,
+    truth: Mapping[str, float] | None = None,
+    config_yaml: str | None = None,
+    _pictures: None = None,
 ) -> None:
     """Write an indexer session under the default topic names, with its truth and config as attachments.
 

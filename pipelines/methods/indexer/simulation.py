@@ -19,9 +19,9 @@ from alidade.factors import so3
 from alidade.factors.earth import earth_rate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import dump_yaml
-from alidade.pipelines.methods.indexer.parameters import ASSUMPTIONS
-from alidade.pipelines.methods.indexer.recording import IndexerData
-from alidade.pipelines.methods.indexer.topics import JOINTS
+from alidade.pipelines.methods import Simulator
+from alidade.pipelines.methods.indexer.parameters import NUISANCE
+from alidade.pipelines.methods.indexer.recording import JOINTS, IndexerData
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
@@ -129,7 +129,7 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng = np.random.default_rng(seed)
     rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     drives, duration = _program(scenario)
     phases = rng.uniform(0.0, 2.0 * np.pi, size=(2, 1 + len(scenario.encoder_harmonics_arcsec)))
     gyro_t = _recorded(sample_times(duration, scenario.gyro_rate_hz), drives, scenario)
@@ -294,3 +294,6 @@ def _truth(scenario: IndexerScenario, bias: Array) -> dict[str, float]:
         for axis, value in zip("xyz", vector, strict=True)
     }
     return truth | {"axis_nonperpendicularity": float(scenario.axis_nonperpendicularity_arcsec * ARCSEC)}
+
+
+SIMULATOR = Simulator(scenario=IndexerScenario, simulate=simulated)

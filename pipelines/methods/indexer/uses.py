@@ -12,6 +12,7 @@ from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import passive
 from alidade.pipelines.methods.uses import gyro_reading
+from alidade.pipelines.settings import Config
 
 # The inner axis dwells a minute at 0, 90, 180, 270 deg and goes back the same way; a quarter turn takes 10 s.
 _STEP_S, _DWELL_S, _TURN_S, _HOUR_S = 10.0, 60.0, 10.0, 3600.0
@@ -19,7 +20,7 @@ _QUARTERS = (1.0, 1.0, 1.0, -1.0, -1.0, -1.0)
 _LATITUDE = np.deg2rad(45.0)
 
 
-def uses(noise: Mapping[str, float]) -> Sequence[Use]:
+def uses(_true: Truth, _config: Config, noise: Mapping[str, float]) -> Sequence[Use]:
     """Attitude error over an hour."""
     time, angle, rate = _sequence()
     shown = slice(5, None, 6)

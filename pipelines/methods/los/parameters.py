@@ -1,4 +1,4 @@
-"""What the los method calibrates and what it assumes: names, variables, priors and accuracies of the contract."""
+"""Parameters of the los method: mounting angles, gyro bias, and errors of the sensors."""
 
 from __future__ import annotations
 
@@ -8,48 +8,84 @@ from dataclasses import dataclass
 import gtsam
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import (
-    Assumption,
-    encoder_assumptions,
+from alidade.pipelines.estimation.parameters import (
+    CLOCK_SKEW,
+    ParameterSpec,
+    check_parameters,
+    encoder_errors,
+    g_sensitivity,
+    gyro_bias,
     gyro_errors,
+    gyro_scale,
     parameter,
     quantities,
-    scale_assumptions,
-    sensitivity_assumption,
+    scalar,
     stamped,
-    temperature_assumption,
+    time_offset,
 )
-from alidade.pipelines.estimation.problem import Parameter, Quantity
+from alidade.pipelines.estimation.problem import Parameter
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
-from alidade.pipelines.methods.los.topics import JOINTS
-from alidade.pipelines.settings import Config, check_names
+from alidade.pipelines.methods.los.recording import JOINTS
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.settings import Config
 
-_ANGLES = ("delta_px", "delta_gx", "delta_gy")
-SPLIT = ("delta_pz", "delta_gz")
-BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
-OFFSET = "time_offset"
+
+def _angle(name: str, description: str) -> ParameterSpec:
+    return scalar(name, "rad", 0.1, description, require=1e-3)
+
+
+MOUNT = (
+    _angle("delta_px", "Boresight in elevation: added to the elevation encoder."),
+    ParameterSpec("delta_g{}", "rad", 0.1, "Gyro misalignment about {axis} of the carrier.", axes="xy", require=1e-3),
+)
+AZIMUTH = _angle("delta_z", "Azimuth misalignment, camera minus gyro.")
+# Given both, in place of their difference.
+AZIMUTH_ZEROS = (
+    _angle("delta_pz", "Boresight in azimuth: added to the azimuth encoder."),
+    _angle("delta_gz", "Gyro misalignment about z of the carrier."),
+)
+BIAS = gyro_bias(0.02, 1e-3)
 
 # What data sheets state, one sigma: good MEMS gyros after factory calibration, a camera whose focal length was measured
 # roughly, machined gimbals.
-SCALE = scale_assumptions("gyro", "gyro", 3e-3)
-SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-5)
-TEMPERATURE = temperature_assumption("gyro", "rad/s", 1e-4)
-ROLL = Assumption(("camera_roll",), "rad", "camera", "roll", 1e-2)
-COLLIMATION = Assumption(("collimation",), "rad", "gimbal", "collimation", 1e-3)
-AXES = Assumption(("axis_nonperpendicularity",), "rad", "gimbal", "nonperpendicularity", 1e-3)
-TIME_OFFSET = Assumption((OFFSET,), "s", "clock", "offset", 1e-2)
-CLOCK_SKEW = Assumption(("clock_skew",), "", "clock", "skew", 1e-4)
-LOS_SCALE = Assumption(("los_scale",), "", "camera", "scale", 5e-3)
-TARGET_RATE = Assumption(("target_rate_x", "target_rate_z"), "rad/s", "target", "rate", 1e-5)
-ONCE_PER_TURN, DELAY = encoder_assumptions(JOINTS, 2e-4, 1e-3)
+SCALE = gyro_scale("gyro", "gyro", 3e-3)
+SENSITIVITY = g_sensitivity(2e-5)
+ROLL = scalar("camera_roll", "rad", 1e-2, "Camera roll about the line of sight.", "camera.roll")
+COLLIMATION = scalar(
+    "collimation",
+    "rad",
+    1e-3,
+    "Collimation: line of sight against the normal of the elevation axis.",
+    "gimbal.collimation",
+)
+AXES = scalar(
+    "axis_nonperpendicularity",
+    "rad",
+    1e-3,
+    "Non-perpendicularity of elevation and azimuth axis.",
+    "gimbal.nonperpendicularity",
+)
+TIME_OFFSET = time_offset(1e-2, data_sheet="clock.offset")
+LOS_SCALE = scalar("los_scale", "", 5e-3, "Scale error of the LOS errors (focal length).", "camera.scale")
+TARGET_RATE = ParameterSpec(
+    "target_rate",
+    "rad/s",
+    1e-5,
+    "Drift of the target direction about {axis}.",
+    "target.rate",
+    axes="xz",
+    per_recording=True,
+)
+ONCE_PER_TURN, DELAY = encoder_errors(JOINTS, 2e-4, 1e-3)
 
-# Of the mounting, one by one; and those of alidade.factors.los.SIGHT_ERRORS, in its order.
-MOUNTED, SIGHT = (ROLL, COLLIMATION, AXES), (TIME_OFFSET, CLOCK_SKEW, LOS_SCALE, TARGET_RATE, ONCE_PER_TURN, DELAY)
-ASSUMPTIONS = (*SCALE, SENSITIVITY, *MOUNTED, *SIGHT, TEMPERATURE)
+GIMBAL_ERRORS = (ROLL, COLLIMATION, AXES)
+# Those of alidade.factors.los.SIGHT_ERRORS, in its order.
+TRACKER_ERRORS = (TIME_OFFSET, CLOCK_SKEW, LOS_SCALE, TARGET_RATE, ONCE_PER_TURN, DELAY)
+NUISANCE = (*SCALE, SENSITIVITY, *GIMBAL_ERRORS, *TRACKER_ERRORS, GYRO_SLOPE)
 # The angles by which gyro, gimbal axes and camera are mounted.
-ANGLES = (*_ANGLES, "delta_z", *SPLIT, *(name for each in MOUNTED for name in each.names))
-
-_PRIOR_ANGLE, _PRIOR_BIAS, _REQUIRE = 0.1, 0.02, 1e-3
+ANGLE_SPECS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, *GIMBAL_ERRORS)
+ANGLES = tuple(name for each in ANGLE_SPECS for name in each.names)
+PARAMETERS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, BIAS, *NUISANCE)
 
 
 @dataclass(frozen=True)
@@ -69,12 +105,12 @@ class LosParameters:
     gyro: Parameter | None
 
     @classmethod
-    def of(cls, config: Config, drivers: Sequence[Assumption], stamp_sigma: float = 0.0) -> LosParameters:
+    def of(cls, config: Config, drivers: Sequence[ParameterSpec], stamp_sigma: float = 0.0) -> LosParameters:
         """With the priors in force.
 
         Args:
             config: priors, data sheets, accuracies wanted.
-            drivers: SENSITIVITY and TEMPERATURE, in this order, where the gyro's IMU measures their causes.
+            drivers: SENSITIVITY and GYRO_SLOPE, in this order, where the gyro's IMU measures their causes.
             stamp_sigma: s, how well the stamps are known.
         """
         if config.noise.gyro_scale:
@@ -83,26 +119,16 @@ class LosParameters:
                 f"noise.gyro_scale: los estimates the gyro's scale; write sensors: {{gyro: {{scale: {figure:g}, "
                 f"skew: {figure:g}}}}} instead"
             )
-        assumed = {q.name: q for each in ASSUMPTIONS for q in quantities(each, config)}
-        known = (*_ANGLES, "delta_z", *SPLIT, *BIAS, *assumed)
-        check_names(config.priors, known, "priors")
-        check_names(config.require, known, "require")
-        given = [name for name in SPLIT if name in config.priors]
+        check_parameters(PARAMETERS, config)
+        given = [each.name for each in AZIMUTH_ZEROS if each.name in config.priors]
         if len(given) == 1:
             raise InputError(f"priors: {given[0]} alone; delta_pz and delta_gz are given both, or neither for delta_z")
-
-        def calibrated(names: Sequence[str], unit: str, scale: float) -> tuple[Quantity, ...]:
-            return tuple(
-                Quantity(name, unit, config.prior(name, scale), scale, config.require.get(name, _REQUIRE))
-                for name in names
-            )
-
-        angles = calibrated((*_ANGLES, *(SPLIT if given else ("delta_z",))), "rad", _PRIOR_ANGLE)
-        mounted = tuple(assumed[name] for each in MOUNTED for name in each.names if assumed[name].prior_sigma != 0.0)
+        angles = [q for each in (*MOUNT, *(AZIMUTH_ZEROS if given else (AZIMUTH,))) for q in quantities(each, config)]
+        errors = [q for each in GIMBAL_ERRORS for q in quantities(each, config) if q.prior_sigma != 0.0]
         return cls(
-            angles=Parameter(_key("a"), (*angles, *mounted)),
-            bias=Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", _PRIOR_BIAS)),
-            sight=stamped(parameter(_key("S"), SIGHT, config), OFFSET, stamp_sigma),
+            angles=Parameter(_key("a"), (*angles, *errors)),
+            bias=Parameter(FIRST_BIAS, quantities(BIAS, config)),
+            sight=stamped(parameter(_key("S"), TRACKER_ERRORS, config), TIME_OFFSET.name, stamp_sigma),
             gyro=gyro_errors(_key("G"), SCALE, drivers, config),
         )
 

@@ -13,18 +13,26 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.los import parameters
-from alidade.pipelines.methods.los.topics import GIMBAL, JOINTS, LOS_ERROR
-from alidade.pipelines.recording import series
+from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.faults import drop_frozen
 from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
-from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, TEMPERATURE, Need, Topic, wanted
 from alidade.pipelines.settings import Config
 from alidade.pipelines.vision.camera import camera_of
+
+GIMBAL = Topic("gimbal", "/gimbal/joint_states", (messages.JOINT_STATE,))
+LOS_ERROR = Topic("los_error", "/los/error", (messages.VECTOR,))
+
+# The gimbal's axes, as its messages name them.
+JOINTS = ("azimuth", "elevation")
+
+TOPICS = (IMU, GIMBAL, LOS_ERROR, IMAGE, CAMERA_INFO, TEMPERATURE)
+REQUIREMENTS: tuple[Need, ...] = (((IMU,),), ((GIMBAL,),), ((LOS_ERROR,), (IMAGE, CAMERA_INFO)))
+
 
 Array = NDArray[np.float64]
 
@@ -129,7 +137,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
         force,
         reader.dropped,
         stamp_sigma,
-        temperature.read(reader, config, (parameters.TEMPERATURE,), imu.t),
+        temperature.read(reader, config, (temperature.GYRO_SLOPE,), imu.t),
     )
     check(data, gyro_name, gimbal_name)
     return data

@@ -24,9 +24,9 @@ from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import dump_yaml
-from alidade.pipelines.methods.los.parameters import ASSUMPTIONS
-from alidade.pipelines.methods.los.recording import LosData
-from alidade.pipelines.methods.los.topics import JOINTS
+from alidade.pipelines.methods import Simulator
+from alidade.pipelines.methods.los.parameters import NUISANCE
+from alidade.pipelines.methods.los.recording import JOINTS, LosData
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import SensorSheets
@@ -182,7 +182,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
     """A session and the true values of its parameters (rad, rad/s, s; the bias is its mean over the session)."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     motion = simulate_motion(scenario, effects, rng)
     image_t, cRt = targets(scenario, motion, rng)
     noise = scenario.noise
@@ -213,7 +213,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
 def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np.random.Generator) -> LosMotion:
     """The carrier's sway as the gyro sees it, and what the stabilisation loop makes of that.
 
-    Errors of the sensors by name are all ASSUMPTIONS.
+    Errors of the sensors by name are all NUISANCE.
     """
     rate_hz = scenario.gyro_rate_hz
     gyro_t = sample_times(scenario.duration_s, rate_hz)
@@ -303,7 +303,7 @@ def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraIn
     """The pictures behind the LOS errors of `simulate_los` with the same seed; drawn one by one as they are taken."""
     rng = np.random.default_rng(seed)
     rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     motion = simulate_motion(scenario, effects, rng)
     stamps, cRt = targets(scenario, motion, rng)
     if scenario.losses:
@@ -477,3 +477,6 @@ def _truth(scenario: LosScenario, motion: LosMotion) -> dict[str, float]:
         bias = bias + _earth(scenario, motion.gyro_t)
     truth |= {f"gyro_bias_{axis}": float(b) for axis, b in zip("xyz", bias, strict=True)}
     return {**truth, **motion.effects}
+
+
+SIMULATOR = Simulator(scenario=LosScenario, simulate=simulated, default_with_images="los_images")

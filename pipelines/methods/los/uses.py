@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import passive
 from alidade.pipelines.methods.los.parameters import ONCE_PER_TURN
 from alidade.pipelines.methods.uses import G, gyro_reading
+from alidade.pipelines.settings import Config
 
 _AZIMUTH_DEG = np.linspace(-90.0, 90.0, 37)
 _ELEVATIONS_DEG = (-30.0, 15.0, 60.0)
@@ -21,9 +22,8 @@ _ELEVATION_DEG, _RATE_DEG = 20.0, 10.0
 _FORCE = np.array([[0.0, 0.0, G]])
 
 
-def uses(true: Truth) -> Sequence[Use]:
+def uses(_true: Truth, _config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
     """Pointing over azimuth and elevation, and the LOS rate that stabilisation leaves."""
-    del true
     pointing = Use(
         "pointing",
         "Line of sight against the IMU",

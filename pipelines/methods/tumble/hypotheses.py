@@ -5,4 +5,4 @@ from __future__ import annotations
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 
 # Signs, order and scale of axes are what is calibrated.
-HYPOTHESES = FaultModel(streams={"mag_t": ("mag",), "accel_t": ("accel",), "gyro_t": ("gyro",)}, signs={})
+FAULTS = FaultModel(streams={"mag_t": ("mag",), "accel_t": ("accel",), "gyro_t": ("gyro",)}, signs={})

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import Assumption, parameter
-from alidade.pipelines.estimation.assumptions import stated as sheet
 from alidade.pipelines.estimation.noise import ROUGHLY, Noise
+from alidade.pipelines.estimation.parameters import ParameterSpec, parameter
+from alidade.pipelines.estimation.parameters import stated as sheet
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import stated
@@ -103,7 +103,7 @@ class Sensor:
     rested: bool
     noise: Noise
     drivers: Array | None = None
-    driven: tuple[Assumption, ...] = ()
+    driven: tuple[ParameterSpec, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -368,7 +368,7 @@ def _magnetometer(data: TumbleData, config: Config, field: Array | None, alone: 
         known = 1.0, 0.0, "1"
     else:
         across = sheet(config, FIELD)
-        known = float(np.linalg.norm(field)), STRENGTH_SIGMA if across <= FIELD.sigma else across, "T"
+        known = float(np.linalg.norm(field)), STRENGTH_SIGMA if across <= FIELD.prior else across, "T"
     samples = data.mag_t, data.mag, np.ones(len(data.mag))
     found = _sensor("mag", (data.mag_t, data.mag_density), samples, config, known)
     return found if alone else replace(found, symmetric=False, start=found.start @ entries(True).T)

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors.ellipsoid import entries
-from alidade.pipelines.estimation.assumptions import quantities
+from alidade.pipelines.estimation.parameters import quantities
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 from alidade.pipelines.methods.triads import triad_names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import Assumption, temperature_assumption
+from alidade.pipelines.estimation.parameters import accel_square, temperature_slope
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import read_place
 from alidade.pipelines.recording import series
@@ -26,7 +27,6 @@ from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.recording.streams import Samples, StreamReader, Temperature
 from alidade.pipelines.recording.topics import FIX, IMU, MAG, wanted
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
 
@@ -35,11 +35,11 @@ NO_RATE = "gyro beyond what rad/s can be, not used"
 
 # What a temperature does to the offsets of consumer sensors, one sigma.
 SLOPES = GYRO_SLOPE, ACCEL_SLOPE = (
-    temperature_assumption("gyro", "rad/s", 1e-4),
-    temperature_assumption("accel", "m/s^2", 1e-2),
+    temperature_slope("gyro", "rad/s", 1e-4),
+    temperature_slope("accel", "m/s^2", 1e-2),
 )
 # Three of 1e-4 of what is felt at 1 g: what consumer accelerometers read beside it, along each axis.
-ACCEL_SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel", "square", 3e-5)
+ACCEL_SQUARE = accel_square(3e-5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +141,14 @@ def _gyro(reader: StreamReader, topic: str, imu: series.ImuSeries) -> Samples[se
     return reader.samples(topic, imu, "gyro", may_be_constant=True)
 
 
-def write_tumble(path: Path, simulated: Simulated) -> None:
+def write_tumble(
+    path: Path | str,
+    data: TumbleData,
+    truth: Mapping[str, float] | None = None,
+    config_yaml: str | None = None,
+    _pictures: None = None,
+) -> None:
     """Write simulated data under the default topic names, with truth and config attached."""
-    data: TumbleData = simulated.data
     epoch = data.epoch_ns
 
     def covariance(t: Array, noise: float | None) -> Array:
@@ -170,4 +175,4 @@ def write_tumble(path: Path, simulated: Simulated) -> None:
             np.array([epoch]), place[:1], place[1:], np.array([data.height]), frame_id="gnss"
         )
     topics |= temperature.topics(data.temperature, epoch)
-    write_session(path, topics, attached(simulated.truth, simulated.config))
+    write_session(path, topics, attached(truth, config_yaml))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity, magnetic_field
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.methods.tumble.scenario import (
     EPOCH_NS,
@@ -213,3 +214,6 @@ def _read(nominal: Array, K: Array, b: Array, density: float, rate_hz: float, rn
 def _truth(name: str, K: Array, b: Array, symmetric: bool) -> dict[str, float]:
     gains = {f"{name}_k{i + 1}{j + 1}": float(K[i, j]) for i in range(3) for j in range(3) if i <= j or not symmetric}
     return gains | {f"{name}_b{i + 1}": float(b[i]) for i in range(3)}
+
+
+SIMULATOR = Simulator(scenario=TumbleScenario, simulate=simulated, randomised=True)

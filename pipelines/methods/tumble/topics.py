@@ -7,4 +7,4 @@ from alidade.pipelines.recording.topics import FIX, IMU, MAG, TEMPERATURE, Need,
 TOPICS = (MAG, IMU, FIX, TEMPERATURE)
 _METHOD = Setting("`method: tumble` in the config", lambda config: config.method == "tumble")
 # An accelerometer by itself is in most recordings, and seldom meant.
-NEEDS: tuple[Need, ...] = (((MAG,), (IMU, _METHOD)),)
+REQUIREMENTS: tuple[Need, ...] = (((MAG,), (IMU, _METHOD)),)

@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.earth import EARTH_RATE, earth_rate
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.estimation.assumptions import (
-    Assumption,
-    acting,
-    gyro_errors,
-    quantities,
-    scale_assumptions,
-    sensitivity_assumption,
-)
 from alidade.pipelines.estimation.gyro_chain import GyroChain, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameters import (
+    ParameterSpec,
+    acting,
+    g_sensitivity,
+    gyro_errors,
+    gyro_scale,
+    quantities,
+    scalar,
+)
 from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.estimation.walking_bias import FIRST
@@ -37,9 +38,9 @@ Index = NDArray[np.intp]
 BIAS = tuple(f"gyro_bias_{axis}" for axis in "xyz")
 # The usual grade of consumer gyros, one sigma; and how far from their stamps readings of a magnetometer are taken that
 # is read by itself, beside a gyro whose samples are means over an interval that may end at their stamps.
-SCALE = scale_assumptions("gyro", "gyro", 1e-2)
-SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-4)
-DELAY = Assumption(("mag_delay",), "s", "mag", "delay", 1e-2)
+SCALE = gyro_scale("gyro", "gyro", 1e-2)
+SENSITIVITY = g_sensitivity(2e-4)
+DELAY = scalar("mag_delay", "s", 1e-2, "Magnetometer time delay (true time minus stamp).", "mag.delay")
 ARM = tuple(f"accel_arm_{axis}" for axis in "xyz")
 EARTH = tuple(f"earth_rate_{axis}" for axis in "xyz")
 DELAY_KEY, ARM_KEY, _ERRORS_KEY, _EARTH_KEY = (int(gtsam.symbol(letter, 0)) for letter in "drGe")
@@ -255,7 +256,7 @@ def turning(
     assert data.gyro is not None
     density = sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.gyro_t, data.gyro)
     walk = walking(config)
-    drivers: dict[Assumption, Array] = {}
+    drivers: dict[ParameterSpec, Array] = {}
     if accel is not None and data.accel_t is not None:
         force = [np.interp(data.gyro_t, data.accel_t, axis) for axis in accel.whole.T]
         drivers[SENSITIVITY] = np.stack(force, axis=1)
@@ -275,7 +276,7 @@ def turning(
         walk=walk.used,
         errors=errors,
     )
-    delay = replace(DELAY, sigma=float(np.hypot(DELAY.sigma, 0.5 * np.median(np.diff(data.gyro_t)))))
+    delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, 0.5 * np.median(np.diff(data.gyro_t)))))
     known = tuple(
         Quantity(name, "rad/s", config.prior(name, _BIAS_PRIOR), _BIAS_PRIOR, config.require.get(name, _BIAS_REQUIRE))
         for name in BIAS

@@ -10,9 +10,10 @@ from alidade.pipelines.diagnostics.use import Truth, Use
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE
 from alidade.pipelines.methods.uses import G, gyro_reading, raw_of, triad_uses
+from alidade.pipelines.settings import Config
 
 
-def uses(true: Truth) -> Sequence[Use]:
+def uses(true: Truth, _config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
     """Heading, rate and specific force."""
     return triad_uses(true, _readings)
 

@@ -43,7 +43,7 @@ def test_los_names_the_axis_that_did_not_sway() -> None:
         image_rate_hz=10.0,
     )
     data, _ = simulate_los(scenario, 0)
-    wanted = _wanted(method("los").checklist(data, Config()))
+    wanted = _wanted(method("los").guidance.checklist(data, Config()))
     assert wanted["sway about z"] == "sway the carrier about its z by 2 deg and more"
     assert not wanted["sway about x"]
     assert not wanted["sway about y"]
@@ -55,8 +55,8 @@ def test_head_names_what_did_not_move() -> None:
     assert data.platform_gyro is not None
     still = replace(data, platform_gyro=np.zeros_like(data.platform_gyro))
     moved, wanted = (
-        _wanted(method("head").checklist(data, Config())),
-        _wanted(method("head").checklist(still, Config())),
+        _wanted(method("head").guidance.checklist(data, Config())),
+        _wanted(method("head").guidance.checklist(still, Config())),
     )
     assert not moved["head about x"]
     assert not moved["platform about x"]
@@ -65,7 +65,7 @@ def test_head_names_what_did_not_move() -> None:
 
 def test_indexer_counts_turns_by_position() -> None:
     data, _ = simulate_indexer(IndexerScenario(), 0)
-    assert set(_wanted(method("indexer").checklist(data, Config())).values()) == {""}
+    assert set(_wanted(method("indexer").guidance.checklist(data, Config())).values()) == {""}
     half = data.encoder_t < 0.4 * data.encoder_t[-1]
     early = replace(
         data,
@@ -73,7 +73,7 @@ def test_indexer_counts_turns_by_position() -> None:
         outer=data.outer[half],
         inner=data.inner[half],
     )
-    wanted = _wanted(method("indexer").checklist(early, Config()))
+    wanted = _wanted(method("indexer").guidance.checklist(early, Config()))
     assert not wanted["outer axis, inner one at 0 deg"]
     assert wanted["inner axis, outer one at 180 deg"] == "three whole turns forward and back"
 
@@ -85,7 +85,7 @@ def cube() -> tuple[ChecklistItem, ...]:
     config = load_config(cube_config(scenario).encode())
     few = data.imu_t < 45.0
     first = replace(data, imu_t=data.imu_t[few], gyro=data.gyro[few], accel=data.accel[few])
-    return tuple(method("cube").checklist(first, config))
+    return tuple(method("cube").guidance.checklist(first, config))
 
 
 def test_cube_counts_poses_and_faces(cube: tuple[ChecklistItem, ...]) -> None:

@@ -15,8 +15,8 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Estimate
-from alidade.pipelines.methods.cube.data import CubeData
-from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.model import problem
+from alidade.pipelines.methods.cube.recording import CubeData
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.reports.result import Calibration

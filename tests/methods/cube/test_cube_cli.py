@@ -17,10 +17,9 @@ from ruamel.yaml import YAML
 from alidade.factors import so3
 from alidade.pipelines.applications import cli
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.methods.cube.data import CubeData, Sightings
+from alidade.pipelines.methods.cube.recording import CubeData, Sightings, write_cube
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.cube.writing import write_cube
 from alidade.pipelines.vision.camera import Camera
 
 SCENARIO = CubeScenario(poses=8, static_s=1.5, turn_rad_s=1.5, camera=CubeCamera(rate_hz=5.0))

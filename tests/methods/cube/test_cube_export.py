@@ -13,7 +13,7 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.printing import print_cube, tag_size
-from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.reports.calibration import SavedCalibration
 from alidade.pipelines.reports.export_formats import exported
 

@@ -13,10 +13,9 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.layout import cube_layout, layout_yaml
+from alidade.pipelines.methods.cube.recording import CubeConfig, write_cube
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.cube.topics import CubeConfig
-from alidade.pipelines.methods.cube.writing import write_cube
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.layout import Layout
 from tests.support.browser import fits

@@ -12,12 +12,10 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate
-from alidade.pipelines.methods.cube.data import CubeData
-from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.model import problem
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, LayoutCovariance, write_cube
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.cube.topics import CubeConfig, LayoutCovariance
-from alidade.pipelines.methods.cube.writing import write_cube
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command

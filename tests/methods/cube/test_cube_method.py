@@ -18,11 +18,10 @@ from alidade.pipelines.diagnostics.cross_validation import rms
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.methods.cube.data import CubeData
-from alidade.pipelines.methods.cube.findings import findings
-from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.published import published_estimate
-from alidade.pipelines.methods.cube.recording import read_cube
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, Raw, RawConversion, read_cube
+from alidade.pipelines.methods.cube.report import findings, validate
 from alidade.pipelines.methods.cube.scenario import (
     CubeCamera,
     CubeScenario,
@@ -34,9 +33,7 @@ from alidade.pipelines.methods.cube.scenario import (
     cube_config,
 )
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.cube.static_intervals import static_intervals
-from alidade.pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
-from alidade.pipelines.methods.cube.validation import validate
+from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.methods.static_intervals import find_static_intervals
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config

@@ -10,7 +10,7 @@ import pytest
 
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.methods.cube import static_intervals
+from alidade.pipelines.methods.cube import static_poses as static_intervals
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.vision import pose
 

@@ -13,14 +13,10 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.cube.data import CubeData, Sightings, local_field
-from alidade.pipelines.methods.cube.poses import static_poses
-from alidade.pipelines.methods.cube.recording import read_cube
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, Sightings, local_field, read_cube, write_cube
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.cube.static_intervals import static_intervals
-from alidade.pipelines.methods.cube.topics import CubeConfig
-from alidade.pipelines.methods.cube.writing import write_cube
+from alidade.pipelines.methods.cube.static_poses import static_intervals, static_poses
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.vision.camera import Camera

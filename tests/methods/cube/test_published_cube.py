@@ -11,9 +11,9 @@ from alidade.factors import so3
 from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.data import CubeData, local_field
-from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
+from alidade.pipelines.methods.cube.recording import CubeData, local_field
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 

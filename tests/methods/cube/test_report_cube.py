@@ -14,10 +14,9 @@ from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.sphere_map import described
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.problem import Estimate, Findings
-from alidade.pipelines.methods.cube.data import CubeData
-from alidade.pipelines.methods.cube.figures import cube_plots
-from alidade.pipelines.methods.cube.findings import findings, white_noise
-from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.model import problem
+from alidade.pipelines.methods.cube.recording import CubeData
+from alidade.pipelines.methods.cube.report import cube_plots, findings, white_noise
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.triads import parts_of

@@ -16,7 +16,7 @@ from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
-from alidade.pipelines.methods.head.graph import problem
+from alidade.pipelines.methods.head.model import problem
 from alidade.pipelines.methods.head.recording import write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.simulation.scenario import load_scenario

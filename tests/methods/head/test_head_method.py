@@ -16,10 +16,10 @@ from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.head.graph import problem
+from alidade.pipelines.methods.head.model import problem
 from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.report import validate
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from alidade.pipelines.methods.head.validation import validate
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.scenario import load_scenario
 
@@ -61,6 +61,17 @@ def test_exact_calibration_of_noise_free_data_leaves_nothing() -> None:
         assert one.before.shape == one.after.shape == (len(one.time), 3)
         assert np.rad2deg(peak(one.after)) < 2e-3
         assert np.rad2deg(rms(one.before)) > 0.5
+
+
+def test_validation_applies_gyro_errors_and_clock_drift() -> None:
+    """Before, errors of the gyros' scale and of the clock were left in."""
+    effects = {"gyro_scale_z": 0.03, "gyro_skew_xy": 0.01, "platform_scale_x": 0.02, "clock_skew": 1e-3}
+    data, truth = made(noise=QUIET, effects=effects)
+    assert max(abs(truth[name] - value) for name, value in effects.items()) < 1e-12
+    for one in validate(data, Config(), truth):
+        assert np.rad2deg(peak(one.after)) < 5e-3
+    ignored = validate(data, Config(), {name: value for name, value in truth.items() if name not in effects})
+    assert all(np.rad2deg(peak(one.after)) > 0.1 for one in ignored)
 
 
 def test_bias_alone_shows_in_full_after_a_second() -> None:

@@ -13,10 +13,10 @@ from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.estimation.problem import Array, Attitudes
-from alidade.pipelines.methods.head.graph import _between
+from alidade.pipelines.methods.head.model import _between
 from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.report import carried
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from alidade.pipelines.methods.head.trajectory import carried
 from alidade.pipelines.simulation.scenario import load_scenario
 
 FAST = {axis: [{"amplitude_deg": 25, "frequency_hz": f}] for axis, f in {"yaw": 1, "pitch": 0.8, "roll": 0.7}.items()}

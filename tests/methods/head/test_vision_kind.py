@@ -15,10 +15,9 @@ from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.head.graph import problem
-from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.model import problem
+from alidade.pipelines.methods.head.recording import HeadData, white_angle, write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
-from alidade.pipelines.methods.head.vision_kind import white_angle
 
 KINDS = ("mocap", "pnp", "vio", "other")
 

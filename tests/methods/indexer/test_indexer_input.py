@@ -11,9 +11,9 @@ import pytest
 from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.indexer.graph import problem
-from alidade.pipelines.methods.indexer.recording import IndexerData, read_indexer, write_indexer
-from alidade.pipelines.methods.indexer.runs import axis_motion
+from alidade.pipelines.methods.indexer.model import problem
+from alidade.pipelines.methods.indexer.recording import INDEXER, JOINTS, IndexerData, read_indexer, write_indexer
+from alidade.pipelines.methods.indexer.report import validate
 from alidade.pipelines.methods.indexer.simulation import (
     IndexerNoise,
     IndexerScenario,
@@ -21,8 +21,7 @@ from alidade.pipelines.methods.indexer.simulation import (
     indexer_config,
     simulate_indexer,
 )
-from alidade.pipelines.methods.indexer.topics import INDEXER, JOINTS
-from alidade.pipelines.methods.indexer.validation import validate
+from alidade.pipelines.methods.indexer.windows import axis_motion
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import open_recording

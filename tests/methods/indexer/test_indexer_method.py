@@ -13,14 +13,14 @@ from alidade.factors.chi_square import quantile
 from alidade.factors.indexer import mounting
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import rms
-from alidade.pipelines.estimation.assumptions import pull
+from alidade.pipelines.estimation.parameters import pull
 from alidade.pipelines.estimation.problem import Estimate, Quantity
-from alidade.pipelines.methods.indexer.graph import problem
+from alidade.pipelines.methods.indexer.model import problem
 from alidade.pipelines.methods.indexer.parameters import indexer_parameters
 from alidade.pipelines.methods.indexer.published import published_estimate, thin_shell
 from alidade.pipelines.methods.indexer.recording import read_indexer
+from alidade.pipelines.methods.indexer.report import validate
 from alidade.pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
-from alidade.pipelines.methods.indexer.validation import validate
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.scenario import load_scenario

@@ -9,8 +9,8 @@ import numpy as np
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.display.figure import Plot
-from alidade.pipelines.methods.indexer.figures import indexer_plots
-from alidade.pipelines.methods.indexer.graph import problem
+from alidade.pipelines.methods.indexer.model import problem
+from alidade.pipelines.methods.indexer.report import indexer_plots
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position, indexer_config, simulate_indexer
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.batch import solve_batch

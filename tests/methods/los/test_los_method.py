@@ -14,7 +14,7 @@ from alidade.factors.chi_square import quantile
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
-from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.methods.los.published import recursive_least_squares
 from alidade.pipelines.methods.los.recording import LosData, read_los
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los

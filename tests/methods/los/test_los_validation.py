@@ -9,9 +9,9 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import peak, rms
-from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.model import problem
+from alidade.pipelines.methods.los.report import validate
 from alidade.pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
-from alidade.pipelines.methods.los.validation import validate
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch

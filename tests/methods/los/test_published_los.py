@@ -10,7 +10,7 @@ import pytest
 from alidade.factors.gimbal import GimbalPath
 from alidade.factors.los import LosRateFactor
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.methods.los.published import NAMES, published_estimate, rates, recursive_least_squares
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, simulate_los

@@ -10,8 +10,8 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.display.figure import Plot
-from alidade.pipelines.methods.los.figures import los_plots
-from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.model import problem
+from alidade.pipelines.methods.los.report import los_plots
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.batch import solve_batch

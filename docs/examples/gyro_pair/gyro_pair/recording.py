@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +16,6 @@ from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.recording.streams import StreamReader
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
-from alidade.pipelines.simulation.simulated import Simulated
 from gyro_pair.topics import GYRO_A, GYRO_B, GyroPairConfig
 
 Array = NDArray[np.float64]
@@ -61,12 +61,13 @@ def read_gyro_pair(recording: Recording, config: Config) -> GyroPairData:
     return GyroPairData(reader.epoch_ns, of_a.t, of_a.series.gyro, of_b.t, of_b.series.gyro, *densities, reader.dropped)
 
 
-def write_gyro_pair(path: Path, simulated: Simulated) -> None:
+def write_gyro_pair(
+    path: Path, data: GyroPairData, truth: Mapping[str, float], config: str, _pictures: None = None
+) -> None:
     """Write simulated data under the default topic names, with truth and config attached.
 
     Stamps are rounded to ns. read_gyro_pair gives the same data back if the first sample is the one at t = 0.
     """
-    data: GyroPairData = simulated.data
 
     def imu(t: Array, gyro: Array, density: float | None, frame: str) -> series.ImuSeries:
         variance = 0.0 if density is None else density**2 / np.median(np.diff(t))
@@ -76,4 +77,4 @@ def write_gyro_pair(path: Path, simulated: Simulated) -> None:
         GYRO_A.name: imu(data.a_t, data.a_gyro, data.a_density, "a"),
         GYRO_B.name: imu(data.b_t, data.b_gyro, data.b_density, "b"),
     }
-    write_session(path, topics, attached(simulated.truth, simulated.config))
+    write_session(path, topics, attached(truth, config))

@@ -6,6 +6,7 @@ Log of the exact rotation over its interval, centred on the moment it was taken,
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -15,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import dump_yaml
+from alidade.pipelines.methods import Simulator
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from alidade.pipelines.simulation.simulated import Simulated
 from gyro_pair.recording import GyroPairData
@@ -97,3 +99,6 @@ def _gyro(
 def _config(scenario: GyroPairScenario) -> str:
     """The recording's config, YAML; the noise is told by the messages."""
     return dump_yaml({"method": "gyro_pair", "priors": scenario.priors})
+
+
+SIMULATOR = Simulator(scenario=GyroPairScenario, simulate=simulated, folder=Path(__file__).with_name("scenarios"))

@@ -24,7 +24,7 @@ from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental
-from gyro_pair import GyroPair
+from gyro_pair import METHOD
 from gyro_pair.factor import GyroPairFactor
 from gyro_pair.graph import problem, windows
 from gyro_pair.published import align
@@ -32,7 +32,6 @@ from gyro_pair.recording import GyroPairData
 from gyro_pair.simulation import GyroPairScenario
 
 Array = NDArray[np.float64]
-METHOD = GyroPair()
 RNG = np.random.default_rng(1)
 # Rates low enough for many runs; both gyros as noisy, so that both matter.
 QUICK = {
@@ -154,7 +153,7 @@ def test_one_axis_leaves_the_rotation_about_it() -> None:
 def test_a_wrong_sign_is_named() -> None:
     session = simulated()
     wrong = GyroPairData(**{**vars(session.data), "b_gyro": session.data.b_gyro * [1.0, 1.0, -1.0]})
-    found = find_hypotheses(METHOD.graph, METHOD.hypotheses(), wrong, Config())
+    found = find_hypotheses(METHOD.graph, METHOD.faults, wrong, Config())
     # A mirrored triad is any one axis mirrored and turned.
     labels = [label for each in found for label in (each.evidence["label"], *each.evidence["equivalents"])]
     assert any("sign of the gyro" in label and "wrong" in label for label in labels)
@@ -173,7 +172,7 @@ def test_formulas_undo_what_was_simulated() -> None:
     still = {"density": 1e-9, "bias_walk": 0.0, "turn_on_bias_deg_s": 0.5}
     session = simulated(gyro_a={"rate_hz": 100, **still}, gyro_b={"rate_hz": 100, **still}, time_offset_s=0.0)
     data = session.data
-    found = apply(METHOD.formulas((), Config()), session.truth, {"gyro_b": data.b_gyro, "stamp": data.b_t})
+    found = apply(METHOD.report.formulas((), Config()), session.truth, {"gyro_b": data.b_gyro, "stamp": data.b_t})
     np.testing.assert_allclose(found["gyro_a"], data.a_gyro, atol=1e-6)
     np.testing.assert_allclose(found["time"], data.a_t)
 

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.belief import Belief
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.data import Array, CubeData, Sightings
-from alidade.pipelines.methods.cube.static_intervals import static_intervals
-from alidade.pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig, RefinedCamera
+from alidade.pipelines.estimation.problem import Parameter, Quantity
+from alidade.pipelines.methods.cube.recording import (
+    TAG_DETECTIONS,
+    Array,
+    CubeConfig,
+    CubeData,
+    RefinedCamera,
+    Sightings,
+)
+from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.recording.checks import clean, count
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import IMAGE, wanted
@@ -19,6 +28,7 @@ from alidade.pipelines.vision.camera import camera_of
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.camera import Camera
+
 
 _FAMILIES = ("", "36h11", "tag36h11")
 # More pictures than this share with one id twice are two tags with one id, not a false detection.
@@ -147,3 +157,54 @@ def _sightings(
     count(dropped, f"{topic}: tag seen twice in a picture", int((known & ~once).sum()))
     good = known & once
     return Sightings(t, frame[good], ids[good], corners[good], None if covariance is None else covariance[good])
+
+
+# Of a tag, as cube.covariance has them: rotation, position.
+_NUMBERS = ("x", "y", "z", "px", "py", "pz")
+# Of a camera, likewise.
+CAMERA_NUMBERS = ("camera_focal", "camera_centre_x", "camera_centre_y")
+# The yardstick of a tag's position, m.
+_PRIOR = 1e-3
+
+
+def tag_place_key(tag: int) -> int:
+    """Variable of the correction of a tag's position on the cube, (3,) m."""
+    return int(gtsam.symbol("L", tag))
+
+
+def tag_place_names(config: Config) -> list[str]:
+    """Names of the numbers of `tag_places`."""
+    return [quantity.name for parameter in tag_places(config) for quantity in parameter.quantities]
+
+
+def tag_places(config: Config) -> tuple[Parameter, ...]:
+    """Corrections of all tags' positions, if there is a covariance of the layout; exact where that is silent."""
+    cube = config.section(CubeConfig)
+    if cube.covariance is None:
+        return ()
+
+    def quantity(tag: int, axis: str) -> Quantity:
+        name = f"tag_{tag}_p{axis}"
+        sigma = config.prior(name, _PRIOR if tag in _told(cube) else 0.0)
+        return Quantity(name, "m", sigma, _PRIOR, np.inf, nuisance=True)
+
+    return tuple(Parameter(tag_place_key(tag), tuple(quantity(tag, a) for a in "xyz")) for tag in sorted(cube.tags))
+
+
+def layout_belief(config: Config) -> Belief | None:
+    """What the layout's covariance says of tags and of the camera, but for numbers with a prior given elsewhere."""
+    cube = config.section(CubeConfig)
+    if cube.covariance is None:
+        return None
+    elsewhere = {*config.priors, *(name for belief in config.beliefs for name in belief.names)}
+    of_camera = CAMERA_NUMBERS if cube.covariance.camera else ()
+    names = (*(f"tag_{tag}_{number}" for tag in cube.covariance.tags for number in _NUMBERS), *of_camera)
+    told = {*(f"tag_{tag}_{number}" for tag in _told(cube) for number in _NUMBERS), *of_camera}
+    whole = Belief(names, np.zeros(len(names)), cube.covariance.matrix, "the covariance of the tags' layout")
+    return whole.of(told - elsewhere)
+
+
+def _told(cube: CubeConfig) -> list[int]:
+    """Tags on the cube that the layout's covariance is of; the lowest id is exact."""
+    tags = () if cube.covariance is None else cube.covariance.tags
+    return [tag for tag in tags if tag in cube.tags and tag != min(cube.tags)]

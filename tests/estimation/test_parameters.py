@@ -16,11 +16,11 @@ from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import Assumption, pull, quantities
+from alidade.pipelines.estimation.parameters import ParameterSpec, pull, quantities
 from alidade.pipelines.estimation.problem import Estimate, Quantity
-from alidade.pipelines.methods.head.findings import findings
-from alidade.pipelines.methods.head.graph import problem
+from alidade.pipelines.methods.head.model import problem
 from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
+from alidade.pipelines.methods.head.report import findings
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
@@ -28,7 +28,7 @@ from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 from tests.support.judged import judge
 
-SCALE = Assumption(("gyro_scale_x", "gyro_scale_y"), "", "gyro", "scale", 1e-2)
+SCALE = ParameterSpec("gyro_scale", "", 1e-2, "Scale, {axis}.", "gyro.scale", "xy")
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,7 @@ BRIEF: dict[str, dict[str, float]] = {
 @pytest.mark.parametrize("name", BRIEF)
 def test_a_method_says_which_figures_it_uses(name: str) -> None:
     method = methods.method(name)
-    taken = {f"{sensor}.{figure}" for sensor, figures in method.sheets.items() for figure in figures}
+    taken = {f"{sensor}.{figure}" for sensor, figures in method.data_sheets.items() for figure in figures}
     for scenario in (None, f"{name}_warming", *(("tumble_phone",) if name == "tumble" else ())):
         settings = method.settings(scenario).model_copy(update=BRIEF[name])
         problem = Session.of(method, method.simulate(settings, 0)).problem()

@@ -1,15 +1,12 @@
-"""The cube's own commands."""
+"""Commands for the tag cube: locate its tags, print its faces."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from alidade.pipelines.applications.options import ConfigFile, Json, Quiet
 from alidade.pipelines.errors import InputError
-
-if TYPE_CHECKING:
-    pass
 
 
 def cube_layout(

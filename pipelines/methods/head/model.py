@@ -22,18 +22,20 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.assumptions import acting
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameters import acting
 from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.head.guess import guess, guess_picture_clock
-from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
+from alidade.pipelines.methods.formula import clock_constants
+from alidade.pipelines.methods.head.initial_values import guess, guess_picture_clock
+from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
-from alidade.pipelines.methods.head.trajectory import at_gyro_rate
+from alidade.pipelines.methods.head.report import at_gyro_rate
 from alidade.pipelines.methods.noise import estimated, sampled, stated, typical
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Pictures share a keyframe within this time, s, and keyframes are never farther apart than this, s: increments are
@@ -97,7 +99,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         onward=partial(_onward, config, model),
         unsettled=temperature.unsettled(data.temperature),
         noises=tuple(model.noises.values()),
-        constants=temperature.constants(model.reference),
+        constants=temperature.constants(model.reference) | clock_constants(model.parameters.picture, model.clock.begun),
         keyframes=Keyframes(model.clock, _NEAR),
         layout=LAYOUT,
         marginal_likelihood=True,
@@ -175,7 +177,7 @@ def _prepare(
         platform_density = noises["platform_gyro_density"].used
     reference = temperature.reference(data.temperature) if before is None else before.reference
     warmth = temperature.above(data.temperature, reference, data.head_t)
-    drivers = {SENSITIVITY: data.head_force, TEMPERATURE: warmth}
+    drivers = {SENSITIVITY: data.head_force, GYRO_SLOPE: warmth}
     caused = [each for each, driver in drivers.items() if driver is not None]
     if before is None:
         around = _all_around(data.vision_wxyz)
@@ -358,23 +360,23 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
 
 def _advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
-    strongest = {name.rsplit("_", 1)[0] if name != OFFSET else name for name, w in weights.items() if abs(w) > 0.3}
+    strongest = {name.rsplit("_", 1)[0] if name != OFFSET.name else name for name, w in weights.items() if abs(w) > 0.3}
     platform = swaying("xy", "platform")
-    if {CAMERA, HELMET} <= strongest:
+    if {CAMERA.name, HELMET.name} <= strongest:
         return Motion(
             "turn the platform about two axes while recording",
             platform,
             "camera and helmet mounts trade against each other",
         )
-    if CAMERA in strongest:
+    if CAMERA.name in strongest:
         return Motion(
             "turn the platform about two axes while recording", platform, "the camera mount needs platform motion"
         )
-    if HELMET in strongest:
+    if HELMET.name in strongest:
         return Motion(
             "nod and shake the head", swaying("yz", "helmet"), "the helmet mount needs head motion about two axes"
         )
-    if OFFSET in strongest:
+    if OFFSET.name in strongest:
         return Motion(
             "turn the head back and forth within a second",
             swaying("xyz", "helmet"),

@@ -11,9 +11,15 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.data import CubeData, computed_once, nominal
-from alidade.pipelines.methods.cube.static_intervals import static_intervals
-from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.methods.cube.recording import (
+    CubeConfig,
+    CubeData,
+    computed_once,
+    noise_densities,
+    nominal,
+)
+from alidade.pipelines.methods.static_intervals import find_static_intervals
 from alidade.pipelines.recording.checks import count
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
@@ -21,7 +27,6 @@ if TYPE_CHECKING:
     from alidade.pipelines.vision.pose import BodyPose, TagBody
     from alidade.pipelines.vision.tags import Detections
 
-Array = NDArray[np.float64]
 
 # Corners this many sigmas from the median of their pose are left out of its mean.
 _FAR = 6.0
@@ -253,3 +258,13 @@ def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
         f"{often[worst[0]] + agrees[worst[0]]} static poses; check size, rotation and position in the config "
         f"(cube.tags.{worst[0]}) and that it is glued down"
     )
+
+
+@computed_once
+def static_intervals(data: CubeData, config: Config) -> Array:
+    """Beginnings and ends, (P, 2) s, of the device's static intervals. Raises InputError when there is none."""
+    densities = noise_densities(data, config)
+    root_rate = float(np.median(np.diff(data.imu_t))) ** -0.5
+    raw = config.section(CubeConfig).raw
+    gyro, accel = nominal(data.gyro, raw.gyro), nominal(data.accel, raw.accel)
+    return find_static_intervals(data.imu_t, gyro, accel, densities[0] * root_rate, densities[1] * root_rate)

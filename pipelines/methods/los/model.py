@@ -23,19 +23,28 @@ from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.assumptions import acting
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, as_slice
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameters import acting
 from alidade.pipelines.estimation.priors import rotation_about, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.los.guess import camera, foreseen, guess, guess_picture_clock, initial_attitudes, seen
-from alidade.pipelines.methods.los.parameters import BIAS, OFFSET, SENSITIVITY, SPLIT, TEMPERATURE, LosParameters
-from alidade.pipelines.methods.los.pictures import select_pictures
+from alidade.pipelines.methods.formula import clock_constants
+from alidade.pipelines.methods.los.initial_values import (
+    camera,
+    foreseen,
+    guess,
+    guess_picture_clock,
+    initial_attitudes,
+    seen,
+    select_pictures,
+)
+from alidade.pipelines.methods.los.parameters import AZIMUTH_ZEROS, BIAS, SENSITIVITY, TIME_OFFSET, LosParameters
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.noise import sampled, stated, typical, walking
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
@@ -92,7 +101,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         onward=partial(_onward, config, model) if data.error_cov is None else None,
         unsettled=max(_SETTLED if model.around is None else SMOOTHING, temperature.unsettled(data.temperature)),
         noises=tuple(model.noises.values()),
-        constants=temperature.constants(model.reference),
+        constants=temperature.constants(model.reference) | clock_constants(model.parameters.sight, model.clock.begun),
         keyframes=None if model.parameters.sight is None else Keyframes(model.clock, _NEAR),
         layout=LAYOUT,
     )
@@ -134,7 +143,7 @@ def _prepare(
     keyframes.
     """
     reference = temperature.reference(data.temperature) if before is None else before.reference
-    drivers = {SENSITIVITY: data.force, TEMPERATURE: temperature.above(data.temperature, reference, data.gyro_t)}
+    drivers = {SENSITIVITY: data.force, GYRO_SLOPE: temperature.above(data.temperature, reference, data.gyro_t)}
     caused = [each for each, driver in drivers.items() if driver is not None]
     parameters = LosParameters.of(config, caused, data.stamp_sigma)
     driving = acting(parameters.gyro, drivers)
@@ -350,13 +359,13 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str)
 def _advice(weights: Mapping[str, float]) -> Motion:
     """What would make a weak direction observable."""
     strong = {name for name, weight in weights.items() if abs(weight) > 0.3}
-    if set(SPLIT) <= strong:
+    if {each.name for each in AZIMUTH_ZEROS} <= strong:
         return Motion(
             "ask for delta_z = delta_pz - delta_gz instead",
             why="delta_pz and delta_gz can never be told apart, turning the carrier's frame about the azimuth axis "
             "changes both alike",
         )
-    if OFFSET in strong:
+    if TIME_OFFSET.name in strong:
         return Motion(
             "turn the carrier back and forth within a second or two",
             swaying("xyz", "carrier"),
@@ -378,7 +387,7 @@ def _advice(weights: Mapping[str, float]) -> Motion:
             swaying("z", "carrier"),
             "delta_px trades against delta_gx and delta_gy",
         )
-    if set(BIAS) & strong and not strong - set(BIAS):
+    if set(BIAS.names) & strong and not strong - set(BIAS.names):
         return Motion(
             "record longer with the target in sight, and sway across the line of sight",
             swaying("xz", "carrier"),

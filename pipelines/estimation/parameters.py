@@ -1,0 +1,283 @@
+"""Parameters: what is declared of them, and variables of the graph with the priors in force.
+
+    BIAS = ParameterSpec("gyro_bias", "rad/s", 0.05, "Gyro bias about {axis}.", require=2e-3)
+    quantities(BIAS, config)        # gyro_bias_x, gyro_bias_y, gyro_bias_z
+
+A spec with a data sheet is a nuisance parameter: an error of real sensors that is 0 in a perfect one. What a recording
+determines of it is estimated; what it does not determine enlarges the sigmas of the parameters that it is correlated
+with.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import partial
+
+import numpy as np
+
+from alidade.pipelines.estimation.problem import Array, Findings, Parameter, Quantity
+from alidade.pipelines.settings import Config, check_names
+
+# What is left free has a prior so many times the one in force.
+_FREE = 10.0
+# A sigma of more than this part of its prior's says nothing, one of less than that determines it.
+_UNTOLD = 0.98
+
+# What the names of numbers of one kind differ by.
+_NUMBERS = re.compile(r"(_[xyzenu]{1,2})?(_sin|_cos)?$")
+
+_WORDS = {**dict(zip("123", "xyz", strict=True)), "e": "east", "n": "north", "u": "up", "sin": "sine", "cos": "cosine"}
+
+
+SENSORS = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """Parameters that differ by their axis.
+
+    Attributes:
+        name: what their names begin with, before _AXIS; or with {} where the axis stands.
+        unit: SI.
+        prior: default prior sigma; of a nuisance parameter that of a sensor of the usual grade.
+        description: a sentence for people; {axis} is the ending of the name, {first} and {last} its two halves.
+        data_sheet: sensor and figure under `sensors` in the config, as "gyro.scale"; empty: no nuisance parameter.
+        axes: endings of the names; none: there is one parameter, `name`. A * stands for any number.
+        require: accuracy wanted, one sigma.
+        per_recording: it belongs to a recording; other parameters belong to the device.
+        rotation: the rotation whose rotation vector it is, as "vRh"; empty: it is none.
+    """
+
+    name: str
+    unit: str
+    prior: float
+    description: str
+    data_sheet: str = ""
+    axes: Sequence[str] = "xyz"
+    require: float = math.inf
+    per_recording: bool = False
+    rotation: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, * where any number may stand."""
+        stem = self.name if "{}" in self.name else f"{self.name}_{{}}"
+        return tuple(map(stem.format, self.axes)) or (self.name,)
+
+    @property
+    def sheet(self) -> str:
+        """The sensor's key under `sensors` in the config."""
+        return self.data_sheet.partition(".")[0]
+
+    @property
+    def figure(self) -> str:
+        """The key of the sensor's figure."""
+        return self.data_sheet.partition(".")[2]
+
+    def describe(self, name: str) -> str:
+        """The sentence about one of the parameters."""
+        axis = name.removeprefix(self.name.partition("{}")[0]).removeprefix("_") if self.axes else ""
+        parts = axis.split("_") if "_" in axis else list(axis)
+        words = [_WORDS.get(part, part) for part in parts] or [""]
+        first = " ".join(words[:-1] or words)
+        return self.description.format(axis="".join(words), first=first, last=words[-1])
+
+
+# One parameter.
+scalar = partial(ParameterSpec, axes="")
+
+
+def spec_of(specs: Iterable[ParameterSpec], name: str) -> ParameterSpec | None:
+    """The spec of a parameter; None where there is none."""
+    return next((spec for spec in specs if any(fnmatchcase(name, each) for each in spec.names)), None)
+
+
+def check_parameters(specs: Iterable[ParameterSpec], config: Config, more: Sequence[str] = ()) -> None:
+    """Raise InputError if the config has a prior or a requirement of an unknown parameter.
+
+    `more` are names of parameters that stand for a * of the specs.
+    """
+    known = [*(name for spec in specs for name in spec.names if "*" not in name), *more]
+    check_names(config.priors, known, "priors")
+    check_names(config.require, known, "require")
+
+
+def gyro_scale(
+    sensor: str, sheet: str, sigma: float, skew_sigma: float | None = None, of: str = "Gyro"
+) -> tuple[ParameterSpec, ParameterSpec]:
+    """The six numbers of a gyro's S, in the order of factors.gyro: measured = (I + S) w; skew as scale if not given."""
+    skew_sigma = sigma if skew_sigma is None else skew_sigma
+    return (
+        ParameterSpec(f"{sensor}_scale", "", sigma, f"{of} scale-factor error, {{axis}}.", f"{sheet}.scale"),
+        ParameterSpec(
+            f"{sensor}_skew",
+            "",
+            skew_sigma,
+            f"{of} non-orthogonality {{axis}} (half the angle error).",
+            f"{sheet}.skew",
+            axes=("xy", "xz", "yz"),
+        ),
+    )
+
+
+def g_sensitivity(sigma: float) -> ParameterSpec:
+    """The nine numbers of a gyro's G, by rows: measured = w + G f."""
+    return ParameterSpec(
+        "gyro_g",
+        "rad/s/(m/s^2)",
+        sigma,
+        "Gyro g-sensitivity: reading about {first} due to specific force along {last}.",
+        "gyro.g_sensitivity",
+        axes=tuple(f"{row}{column}" for row in "xyz" for column in "xyz"),
+    )
+
+
+def temperature_slope(sensor: str, unit: str, sigma: float) -> ParameterSpec:
+    """The three slopes of a sensor's bias over its temperature, `unit`/K."""
+    return ParameterSpec(
+        f"{sensor}_temperature",
+        f"{unit}/K",
+        sigma,
+        f"Temperature slope of the {SENSORS[sensor]} bias, {{axis}}.",
+        f"{sensor}.temperature",
+    )
+
+
+CLOCK_SKEW = scalar("clock_skew", "", 1e-4, "Clock drift, camera against gyro.", "clock.skew", per_recording=True)
+
+
+def gyro_bias(prior: float, require: float) -> ParameterSpec:
+    """Bias of a gyro, rad/s."""
+    return ParameterSpec("gyro_bias", "rad/s", prior, "Gyro bias about {axis}.", require=require, per_recording=True)
+
+
+def time_offset(prior: float, require: float = math.inf, data_sheet: str = "") -> ParameterSpec:
+    """Time offset of pictures, s."""
+    text = "Camera time offset (exposure minus stamp, on the gyro's clock)."
+    return scalar("time_offset", "s", prior, text, data_sheet, require=require, per_recording=True)
+
+
+def accel_square(sigma: float) -> ParameterSpec:
+    """The three square terms of an accelerometer that reads u + square u^2."""
+    return ParameterSpec(
+        "accel_square", "s^2/m", sigma, "Accelerometer quadratic nonlinearity, {axis}.", "accel.square", axes="123"
+    )
+
+
+def encoder_errors(joints: Sequence[str], once_per_turn: float, delay: float) -> tuple[ParameterSpec, ParameterSpec]:
+    """Sine and cosine of each encoder's error once a turn, rad, and the delay of their readings, s; one sigma."""
+    return (
+        ParameterSpec(
+            "encoder",
+            "rad",
+            once_per_turn,
+            "Encoder error once per turn, {first} axis, {last} term.",
+            "encoder.once_per_turn",
+            axes=tuple(f"{joint}_{part}" for joint in joints for part in ("sin", "cos")),
+        ),
+        scalar("encoder_delay", "s", delay, "Encoder time delay (true time minus stamp).", "encoder.delay"),
+    )
+
+
+def kind(name: str) -> str:
+    """What a parameter is about: its name without axes, and without sine and cosine."""
+    return _NUMBERS.sub("", name)
+
+
+def quantities(
+    spec: ParameterSpec, config: Config, fixed: bool = False, extra_sigma: float = 0.0
+) -> tuple[Quantity, ...]:
+    """Quantities with the priors in force: the config's `priors`, else its `sensors`, else the default.
+
+    Args:
+        spec: of the parameters.
+        config: priors, data sheets, accuracies wanted.
+        fixed: whether the default prior of a parameter without data sheet is 0.
+        extra_sigma: as Quantity has it.
+    """
+    sheet = stated(config, spec)
+
+    def quantity(name: str) -> Quantity:
+        require = config.require.get(name, spec.require)
+        prior = config.prior(name, 0.0 if fixed else sheet)
+        if not spec.data_sheet:
+            return Quantity(name, spec.unit, prior, spec.prior, require, extra_sigma)
+        usual = sheet or spec.prior
+        prior = _FREE * usual if prior is None else prior
+        return Quantity(name, spec.unit, prior, usual, require, group="assumption", sheet=spec.data_sheet)
+
+    return tuple(map(quantity, spec.names))
+
+
+def parameter(key: int, specs: Sequence[ParameterSpec], config: Config) -> Parameter | None:
+    """One variable of several specs; None if all are fixed, so that the graph can do without."""
+    all_of_them = tuple(q for spec in specs for q in quantities(spec, config))
+    return Parameter(key, all_of_them) if any(q.prior_sigma for q in all_of_them) else None
+
+
+def gyro_errors(
+    key: int, scale: Sequence[ParameterSpec], drivers: Sequence[ParameterSpec], config: Config
+) -> Parameter | None:
+    """One variable of a gyro's errors, see factors.gyro: S and, in this order, what of its drivers is not all fixed."""
+    return parameter(key, (*scale, *(each for each in drivers if parameter(key, (each,), config))), config)
+
+
+def acting(errors: Parameter | None, drivers: Mapping[ParameterSpec, Array | None]) -> Array | None:
+    """Those of a gyro's drivers that its errors act on, side by side, (N, d): of (N, 3) and (N,); None: none."""
+    names = {q.name for q in errors.quantities} if errors else set()
+    found = [driver for each, driver in drivers.items() if driver is not None and each.names[0] in names]
+    alone = len(found) == 1 and found[0].ndim == 2
+    return found[0] if alone else np.column_stack(found) if found else None
+
+
+def stamped(parameter: Parameter | None, name: str, sigma: float) -> Parameter | None:
+    """The variable with the sigma of stamps, s, where log times stand in for them, in one of its numbers: a delay.
+
+    How late log times are nobody knows: that is part of what the delay may be, and of what it may be off.
+    """
+
+    def known(q: Quantity) -> Quantity:
+        if q.name != name or not q.prior_sigma:
+            return q
+        return replace(q, prior_sigma=math.hypot(q.prior_sigma, sigma), extra_sigma=sigma)
+
+    return parameter and replace(parameter, quantities=tuple(map(known, parameter.quantities)))
+
+
+def fixed_without_force(spec: ParameterSpec, config: Config, topic: str) -> Findings:
+    """The row of `fixed_assumptions` of a g-sensitivity that an Imu without acceleration gives no hold on."""
+    if parameter(0, (spec,), config) is None:
+        return {}
+    names = f"{spec.names[0]} to {spec.names[-1]}"
+    return {"fixed_assumptions": [{"parameters": names, "value": 0.0, "why": f"{topic} has no acceleration"}]}
+
+
+def pull(quantity: Quantity, value: float, sigma: float, inflation: float = 1.0) -> float | None:
+    """How far the recording takes an assumption from its prior, in sigmas of what it could; None if it says nothing.
+
+    With s = sigma / inflation, p the prior's sigma and V = sigma^2 - (s^2 / p)^2 what comes from elsewhere than from
+    the prior, the estimate's change from the prior has the variance (p - s^2 / p)^2 + V; for white noise p^2 - s^2.
+
+    Args:
+        quantity: the assumption.
+        value, sigma: its estimate.
+        inflation: by what sigma is larger because noise is coloured.
+    """
+    prior, white = quantity.prior_sigma or 0.0, sigma / inflation
+    if white > _UNTOLD * prior or prior == 0.0:
+        return None
+    elsewhere = sigma**2 - (white**2 / prior) ** 2
+    return (value - quantity.prior_mean) / math.sqrt((prior - white**2 / prior) ** 2 + elsewhere)
+
+
+def stated(config: Config, spec: ParameterSpec) -> float:
+    """The figure in force, one sigma: the config's `sensors`, else the usual grade's."""
+    sheet = getattr(config.sensors, spec.sheet, None)
+    if sheet is None or spec.figure not in sheet.model_fields_set:
+        return spec.prior
+    figure: float | None = getattr(sheet, spec.figure)
+    return _FREE * spec.prior if figure is None else figure

@@ -1,0 +1,371 @@
+"""How a head result is applied. Frames: v helmet IMU, h markers, c camera, b platform. Methods page, section 3."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.diagnostics.cross_validation import Validation
+from alidade.pipelines.display.figure import COLORS, PALE, Figure, Plot
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.parameters import fixed_without_force
+from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Findings
+from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.methods import Report, temperature
+from alidade.pipelines.methods.formula import Formula, apply, gyro_rate, picture_time, symmetric_text, vector_text
+from alidade.pipelines.methods.head.parameters import (
+    CAMERA,
+    HELMET,
+    OFFSET,
+    PLATFORM_BIAS,
+    PLATFORM_SCALE,
+    SCALE,
+    SENSITIVITY,
+)
+from alidade.pipelines.methods.head.recording import HEAD_IMU, HeadData
+from alidade.pipelines.methods.head.uses import uses
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import Config
+
+_S, _PLATFORM_S = (tuple(name for each in scale for name in each.names) for scale in (SCALE, PLATFORM_SCALE))
+_DRIVERS = SENSITIVITY.names, GYRO_SLOPE.names
+_MOUNTS = *HELMET.names, *CAMERA.names
+
+
+def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
+    """Mounts, rates, attitude and time, with the errors of gyros and clock that are among the parameters."""
+    return [
+        Formula("markers to helmet IMU", "vRh", "Exp(helmet_mount)", ()),
+        Formula("platform to camera", "cRb", "Exp(camera_mount)", ()),
+        Formula("rate of the helmet, rad/s in v", "w_iv", *gyro_rate(parameters, _S, *_DRIVERS)),
+        *_platform_rate(parameters),
+        Formula(
+            "attitude of the helmet on the platform from a camera measurement cRh",
+            "bRv",
+            "inverse(cRb) * cRh * inverse(vRh)",
+            ("cRh",),
+        ),
+        Formula(
+            "time of that attitude on the gyro's clock, s", "time", picture_time({*parameters, OFFSET.name}), ("stamp",)
+        ),
+    ]
+
+
+def _platform_rate(parameters: Collection[str]) -> list[Formula]:
+    """The platform's rate where errors of its gyro are among the parameters."""
+    if not any(name in parameters for name in (*PLATFORM_BIAS.names, *_PLATFORM_S)):
+        return []
+    rate = f"platform_gyro - {vector_text(PLATFORM_BIAS.names, parameters)}"
+    if any(name in parameters for name in _PLATFORM_S):
+        rate = f"inverse({symmetric_text(_PLATFORM_S, parameters)}) * ({rate})"
+    return [Formula("rate of the platform, rad/s in b", "w_ib", rate, ("platform_gyro",))]
+
+
+def findings(data: HeadData, config: Config, _: Estimate) -> Findings:
+    """Rows of `fixed_assumptions`: those that the recording gives no hold on, and why."""
+    return {} if data.head_force is not None else fixed_without_force(SENSITIVITY, config, config.topic(HEAD_IMU))
+
+
+_AXES = "xyz"
+
+
+def head_plots(data: HeadData, calibration: Calibration) -> list[Plot]:
+    """Attitude bRv with what vision says of it, and their differences; nothing without a trajectory."""
+    attitudes = calibration.estimate.attitudes
+    if attitudes is None or len(attitudes.time) < 2:
+        return []
+    order = np.argsort(attitudes.time, kind="stable")
+    attitudes = Attitudes(attitudes.time[order], attitudes.wxyz[order])
+    seen = _from_vision(data, calibration, attitudes)
+    plots = [_attitude(attitudes, seen), _difference(attitudes, seen)]
+    error = _against_truth(data, calibration, attitudes, seen)
+    return [error, *plots] if error else plots
+
+
+def _from_vision(data: HeadData, calibration: Calibration, attitudes: Attitudes) -> Attitudes:
+    """bRv by each vision frame alone, with the mounts and the clock found."""
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+
+    time = _picture_times(data, values)
+    inside = _inside(attitudes, time)
+    known = dict.fromkeys(_MOUNTS, 0.0) | values
+    chosen = [each for each in formulas(known) if each.inputs in ((), ("cRh",))]
+    return Attitudes(time[inside], apply(chosen, known, {"cRh": data.vision_wxyz[inside]})["bRv"])
+
+
+def _attitude(attitudes: Attitudes, seen: Attitudes) -> Plot:
+    out = Figure("rotation vector of bRv, deg", height=360)
+    fused, vision = _vectors(attitudes.wxyz), _vectors(seen.wxyz)
+    for i, axis in enumerate(_AXES):
+        out.points(seen.time, vision[:, i], f"vision {axis}", COLORS[i], 3, alpha=0.45)
+    for i, axis in enumerate(_AXES):
+        out.line(attitudes.time, fused[:, i], f"fused {axis}", COLORS[i])
+    return Plot(
+        "Attitude of the helmet on the platform",
+        "Lines: attitude bRv from gyros and vision together. Points: from vision alone, turned by the mounts found.",
+        out,
+    )
+
+
+def _difference(attitudes: Attitudes, seen: Attitudes) -> Plot:
+    delta = _delta(attitudes, seen)
+    spread = robust_sigma(delta)
+    out = Figure("vision minus fused, deg")
+    for i, axis in enumerate(_AXES):
+        out.points(seen.time, delta[:, i], axis, COLORS[i], 3)
+    out.y_range = (-6.0 * max(spread, 1e-3), 6.0 * max(spread, 1e-3))
+    return Plot(
+        "Vision against the fused attitude",
+        f"Difference about the axes of the helmet IMU: {spread:.3g} deg per axis (standard deviation, from the "
+        "median); outliers lie outside the axis.",
+        out,
+    )
+
+
+def _against_truth(data: HeadData, calibration: Calibration, attitudes: Attitudes, seen: Attitudes) -> Plot | None:
+    if data.truth_t is None or data.truth_wxyz is None or len(data.truth_t) < 2:
+        return None
+    truth = Attitudes(data.truth_t, data.truth_wxyz)
+    without = ""
+    if _camera_mount_unknown(calibration):
+        turn = _constant_turn(truth, attitudes)
+        seen, attitudes = (Attitudes(a.time, so3.multiply(turn, a.wxyz)) for a in (seen, attitudes))
+        without = " less its constant part on the platform's side, which is the camera mount that is not known"
+    errors = {"vision alone": _error(truth, seen), "fused": _error(truth, attitudes)}
+    out = Figure("attitude error, deg")
+    for (name, (time, angle)), color in zip(errors.items(), (PALE, COLORS[1]), strict=True):
+        out.points(time, angle, name, color, 3)
+    said = ", ".join(f"{name} {float(np.sqrt((angle**2).mean())):.3g} deg RMS" for name, (_, angle) in errors.items())
+    return Plot("Attitude against the truth", f"Angle between attitude and truth{without}: {said}.", out)
+
+
+def _camera_mount_unknown(calibration: Calibration) -> bool:
+    verdicts = calibration.verdicts
+    return any(verdicts.get(f"camera_mount_{axis}") in ("weak", "unobservable") for axis in _AXES)
+
+
+def _constant_turn(truth: Attitudes, attitudes: Attitudes) -> Array:
+    """The rotation (4,) that, on the left of the attitudes, brings them nearest to the truth (Markley 2007)."""
+    inside = _inside(truth, attitudes.time)
+    at = so3.interpolate(truth.time, truth.wxyz, attitudes.time[inside])
+    turns = so3.multiply(at, so3.inverse(attitudes.wxyz[inside]))
+    return np.linalg.eigh(turns.T @ turns)[1][:, -1]
+
+
+def _inside(attitudes: Attitudes, time: Array) -> NDArray[np.bool_]:
+    return (time >= attitudes.time[0]) & (time <= attitudes.time[-1])
+
+
+def _error(truth: Attitudes, attitudes: Attitudes) -> tuple[Array, Array]:
+    """Times within the truth's, and the angles to it there, deg."""
+    inside = _inside(truth, attitudes.time)
+    some = Attitudes(attitudes.time[inside], attitudes.wxyz[inside])
+    return some.time, np.linalg.norm(_delta(truth, some), axis=1)
+
+
+def _delta(attitudes: Attitudes, others: Attitudes) -> Array:
+    """Rotation vectors, deg, from the attitudes, taken at the others' times, to the others."""
+    at = so3.interpolate(attitudes.time, attitudes.wxyz, others.time)
+    return np.rad2deg(so3.log(so3.multiply(so3.inverse(at), others.wxyz)))
+
+
+def _vectors(wxyz: Array) -> Array:
+    """Rotation vectors, deg."""
+    return np.rad2deg(so3.log(wxyz))
+
+
+# How long the gyros carry the attitude, s, and how far from that frames may lie.
+_SPAN, _SLACK = 1.0, 0.25
+# A window that neither way explains, this many times worse than is usual, ends or begins with a vision outlier.
+_OUTLYING = 5.0
+
+
+@dataclass(frozen=True)
+class _Applied:
+    """Mounts, gyros without their errors, and times of the pictures on their clock (n,), s, by a calibration."""
+
+    vRh: Array
+    cRb: Array
+    helmet: GyroPath
+    platform: GyroPath | None
+    time: Array
+
+    @classmethod
+    def of(cls, data: HeadData, values: Mapping[str, float]) -> _Applied:
+        """From parameter values; those not there are zero."""
+        known = dict.fromkeys(_MOUNTS, 0.0) | dict(values)
+        mounts = apply([each for each in formulas(known) if not each.inputs], known, {})
+        helmet, platform = helmet_gyro(data, known), _platform_gyro(data, known)
+        return cls(mounts["vRh"], mounts["cRb"], helmet, platform, _picture_times(data, known))
+
+
+def _picture_times(data: HeadData, values: Mapping[str, float]) -> Array:
+    """Times of the pictures on the gyro's clock, (n,) s."""
+    return apply(formulas(values)[-1:], {"first_stamp": data.vision_t[0], **values}, {"stamp": data.vision_t})["time"]
+
+
+def validate(data: HeadData, config: Config, values: Mapping[str, float]) -> tuple[Validation, ...]:
+    """Errors of attitudes carried on by the gyros, against vision and, where it is known, against the truth.
+
+    Args:
+        data: the session.
+        config: of the session.
+        values: calibrated parameters by name, those of calibration.yaml.
+
+    Raises:
+        InputError: no two vision frames about a second apart within the gyros' record.
+    """
+    ways = [_Applied.of(data, each) for each in ({}, values)]
+    start, stop = _windows(data, ways)
+    carried = [_carried_on(data, way, start, stop) for way in ways]
+    seen = data.vision_wxyz[stop]
+    by_vision = [
+        _rotation_error(so3.compose(way.cRb, bRv, way.vRh), seen) for way, bRv in zip(ways, carried, strict=True)
+    ]
+    time = data.vision_t[stop]
+    out = [_validation("against vision", time, by_vision, _vision_noise(data, config, start, stop))]
+    if data.truth_t is not None and data.truth_wxyz is not None:
+        at = [way.time[stop] for way in ways]
+        inside = (np.minimum(*at) >= data.truth_t[0]) & (np.maximum(*at) <= data.truth_t[-1])
+        truth = [so3.interpolate(data.truth_t, data.truth_wxyz, t[inside]) for t in at]
+        by_truth = [_rotation_error(bRv[inside], true) for bRv, true in zip(carried, truth, strict=True)]
+        if inside.any():
+            out.append(_validation("against the truth", time[inside], by_truth))
+    return tuple(out)
+
+
+def _windows(data: HeadData, ways: Sequence[_Applied]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Vision frames from which and to which attitudes are carried, all of them within the gyros' record."""
+    t = data.vision_t
+    start = np.arange(len(t))
+    after = np.clip(np.searchsorted(t, t + _SPAN), 1, len(t) - 1)
+    stop = np.where(t[after] - t - _SPAN < t + _SPAN - t[after - 1], after, after - 1)
+    gyros = [g for g in (data.head_t, data.platform_t) if g is not None]
+    first, last = max(g[0] for g in gyros), min(g[-1] for g in gyros)
+    use = (np.abs(t[stop] - t - _SPAN) <= _SLACK) & (t + _SPAN <= t[-1])
+    for way in ways:
+        use &= (way.time >= first) & (way.time[stop] <= last)
+    if not use.any():
+        raise InputError("vision: no two frames about 1 s apart within the gyros' record; validation needs some")
+    return start[use], stop[use]
+
+
+def _carried_on(data: HeadData, way: _Applied, start: NDArray[np.intp], stop: NDArray[np.intp]) -> Array:
+    """bRv at the frames `stop`, (n, 4), from vision at the frames `start` and the gyros in between."""
+    t0, t1 = way.time[start], way.time[stop]
+    bRv = so3.compose(so3.inverse(way.cRb), data.vision_wxyz[start], so3.inverse(way.vRh))
+    bRv = so3.multiply(bRv, way.helmet.increments(t0, t1).wxyz)
+    return bRv if way.platform is None else so3.multiply(so3.inverse(way.platform.increments(t0, t1).wxyz), bRv)
+
+
+def _rotation_error(predicted: Array, measured: Array) -> Array:
+    return so3.log(so3.multiply(so3.inverse(predicted), measured))
+
+
+def _validation(against: str, time: Array, errors: Sequence[Array], note: str = "") -> Validation:
+    """Without the windows that vision outliers spoil, which are the same before and after."""
+    lengths = np.minimum(*(np.linalg.norm(e, axis=1) for e in errors))
+    good = lengths <= _OUTLYING * np.median(lengths)
+    spoilt = int((~good).sum())
+    notes = [note, f"{spoilt} of {len(good)} windows left out for vision outliers" if spoilt else ""]
+    before, after = (e[good] for e in errors)
+    name = f"attitude after 1 s on gyros, {against}"
+    return Validation(name, "rad", time[good], before, after, "; ".join(filter(None, notes)))
+
+
+def _vision_noise(data: HeadData, config: Config, start: NDArray[np.intp], stop: NDArray[np.intp]) -> str:
+    """What the noise of the two vision frames alone makes of the error."""
+    if config.noise.vision_attitude is not None:
+        variance = 6.0 * config.noise.vision_attitude**2
+    elif data.vision_cov is not None:
+        trace = np.trace(data.vision_cov, axis1=1, axis2=2)
+        variance = float((trace[start] + trace[stop]).mean())
+    else:
+        return ""
+    return f"noise of the two vision frames makes up {np.rad2deg(np.sqrt(variance)):.2g} deg RMS"
+
+
+CARDS = {
+    "Mounts": (
+        ("Markers to helmet IMU", "deg", ("helmet_mount_x", "helmet_mount_y", "helmet_mount_z")),
+        ("Platform to camera", "deg", ("camera_mount_x", "camera_mount_y", "camera_mount_z")),
+    ),
+    "Helmet gyro": (
+        ("Bias", "deg/s", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+        ("Scale error", "%", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
+    ),
+    "Timing and camera": (
+        ("Delay of the pictures", "ms", ("time_offset",)),
+        ("Clock skew", "ppm", ("clock_skew",)),
+        ("Scale of vision's angles", "%", ("vision_scale",)),
+    ),
+}
+REPORT = Report(
+    uses=uses,
+    cards=CARDS,
+    formulas=formulas,
+    findings=findings,
+    figures=head_plots,
+    validate=validate,
+)
+
+
+def at_gyro_rate(data: HeadData, attitudes: Attitudes, values: Mapping[str, float]) -> Attitudes:
+    """bRv at each sample of the helmet's gyro from the first of the attitudes to the last; see `carried`."""
+    if not len(attitudes.time):
+        return attitudes
+    at = data.head_t[(data.head_t >= attitudes.time.min()) & (data.head_t <= attitudes.time.max())]
+    return Attitudes(at, carried(data, attitudes, values, at))
+
+
+def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], at: Array) -> Array:
+    """Attitudes bRv (n, 4) at times on the gyro's clock, carried by the gyros from those before and after.
+
+    Args:
+        data: the recording.
+        attitudes: bRv that are known, one at least, within the gyros' records.
+        values: parameters by name, of which the gyros' errors are applied.
+        at: (n,) s; before the first and after the last attitude they are carried from that one alone.
+    """
+    time, first = np.unique(attitudes.time, return_index=True)
+    helmet, platform = helmet_gyro(data, values), _platform_gyro(data, values)
+    both = np.concatenate([time, at])
+    P = helmet.attitude(both)
+    Q = so3.identity(len(both)) if platform is None else platform.attitude(both)
+    C = so3.compose(Q[: len(time)], attitudes.wxyz[first], so3.inverse(P[: len(time)]))
+    if len(time) > 1:
+        C = so3.interpolate(time, C, np.clip(at, time[0], time[-1]))
+    return so3.compose(so3.inverse(Q[len(time) :]), np.broadcast_to(C, (len(at), 4)), P[len(time) :])
+
+
+def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:
+    """The helmet's gyro by its formula in calibration.yaml; errors whose cause was not measured stay in it."""
+    measured: dict[str, Array | None] = {"gyro": data.head_gyro, "accel": data.head_force, "temperature": None}
+    if data.temperature is not None:
+        values = {temperature.FIRST: data.temperature.first, **values}
+        measured["temperature"] = data.temperature.above(0.0, data.head_t)
+    causes = {SENSITIVITY: measured["accel"], GYRO_SLOPE: measured["temperature"]}
+    unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
+    known = {name: value for name, value in values.items() if name not in unknown}
+    return GyroPath(data.head_t, _rate("w_iv", known, measured))
+
+
+def _platform_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath | None:
+    """The platform's gyro less its errors; None at rest."""
+    if data.platform_t is None or data.platform_gyro is None:
+        return None
+    known = any(each.name == "w_ib" for each in formulas(values))
+    rate = _rate("w_ib", values, {"platform_gyro": data.platform_gyro}) if known else data.platform_gyro
+    return GyroPath(data.platform_t, rate)
+
+
+def _rate(name: str, values: Mapping[str, float], measured: Mapping[str, Array | None]) -> Array:
+    """A rate (n, 3) by its formula, rad/s."""
+    own = next(each for each in formulas(values) if each.name == name)
+    return apply([own], values, {each: measured[each] for each in own.inputs})[name]

@@ -1,0 +1,250 @@
+"""How an indexer result is applied. Frames: n level, b base, t platform, m IMU on it. Methods page, section 2."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from itertools import cycle
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.factors.gyro import symmetric
+from alidade.factors.indexer import IndexerAverageFactor, mounting
+from alidade.pipelines.diagnostics.cross_validation import Validation
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.methods import Report
+from alidade.pipelines.methods.formula import Formula, axis_angles, gyro_rate
+from alidade.pipelines.methods.indexer.model import carrier
+from alidade.pipelines.methods.indexer.parameters import (
+    BIAS,
+    DELAY,
+    ENCODER,
+    EPSILON,
+    ERRORS,
+    ONCE_PER_TURN,
+    THETA,
+    several,
+)
+from alidade.pipelines.methods.indexer.published import half_differences
+from alidade.pipelines.methods.indexer.recording import IndexerConfig, IndexerData
+from alidade.pipelines.methods.indexer.uses import uses
+from alidade.pipelines.methods.indexer.windows import AxisMotion, Group, axis_motion, groups_of
+from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import Config
+
+_JOINT_NAMES = ("outer", "inner")
+
+
+def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
+    """Mounting, rate and attitude, with the errors of gyro, encoders and axes that are among the parameters."""
+    angles = axis_angles(_JOINT_NAMES, ONCE_PER_TURN.names, DELAY.names[0], parameters)
+    outer, inner = [angle.name for angle in angles] or _JOINT_NAMES
+    rate, inputs = gyro_rate(parameters, ERRORS, (), GYRO_SLOPE.names)
+    tilt = "Exp(axis_nonperpendicularity ey) * " if "axis_nonperpendicularity" in parameters else ""
+    return [
+        Formula(
+            "platform to IMU, Rx(a) = transpose(Exp(a ex)), Ry and Rz likewise",
+            "mRt",
+            "Rx(theta_x) * Ry(theta_y) * Rz(theta_z)",
+            (),
+        ),
+        Formula("rate of the platform, rad/s", "w_it", f"inverse(mRt) * ({rate})", inputs),
+        *angles,
+        Formula(
+            "platform to base, from the encoders' angles",
+            "bRt",
+            f"Exp({outer} ex) * {tilt}Exp({inner} ez)",
+            ("outer", "inner"),
+        ),
+        Formula(
+            "attitude of the carrier from that of the IMU",
+            "nRb",
+            "nRm * mRt * inverse(bRt)",
+            ("outer", "inner", "nRm"),
+        ),
+    ]
+
+
+_ARCSEC = np.rad2deg(1.0) * 3600.0
+_AXES = "xyz"
+
+
+def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
+    """The method's own figures; those that the recording has no data for are left out."""
+    config = calibration.config
+    estimate = calibration.estimate
+    values = calibration.problem.numbers(estimate)
+    turning = [g for g in groups_of(data, config, axis_motion(data)) if g.position is not None]
+    plots = [_misfit(turning, values), _contributions(turning, values)]
+    half = _half_differences(data, values)
+    if half is not None:
+        plots.insert(0, half)
+    if data.attitude is not None:
+        plots.insert(0, _attitude(data, config, values))
+    return plots
+
+
+def _angles(values: dict[str, float]) -> Array:
+    return np.array([values.get(name, 0.0) for name in THETA])
+
+
+def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | None:
+    """Direction of each position's half difference across its axis, before and after turning it by theta."""
+    try:
+        found = half_differences(data)
+    except InputError:
+        return None
+    out = Figure("across the axis, arcsec", x_title="position")
+    rows: list[list[float]] = []
+    for name, theta, color in (
+        ("as measured", np.zeros(3), COLORS[6]),
+        ("compensated", _angles(values), COLORS[0]),
+    ):
+        labels, across = [], []
+        for half in found:
+            in_t = so3.rotate(mounting(theta), half.rate) / np.linalg.norm(half.rate) * _ARCSEC
+            for axis in (1, 2) if half.axis == "outer" else (0, 1):
+                labels.append(f"{half.position} {_AXES[axis]}t")
+                across.append(float(in_t[axis]))
+        out.x_labels = tuple(labels)
+        out.bars(across, name, color, (len(rows), 2))
+        rows.append(across)
+    return Plot(
+        "Half differences",
+        "Half the difference of the forward and the backward mean rate: components across the axis in the platform's "
+        f"frame. After compensation the largest is {np.abs(rows[1]).max():.3g} arcsec.",
+        out,
+    )
+
+
+def _misfit(turning: list[Group], values: dict[str, float]) -> Plot:
+    """Mean gyro less prediction over each turn or move, as an angle of the axis."""
+    out = Figure("gyro less encoders, arcsec")
+    time, error = misfit(turning, values)
+    for i, axis in enumerate(_AXES):
+        out.points(time, error[:, i] * _ARCSEC, f"{axis}t", COLORS[i], 6)
+    return Plot(
+        "Misfit by turn",
+        "Mean rate of each turn or move less what encoders, earth and calibration say, over the rate: the angle by "
+        "which the axis seems to be off.",
+        out,
+    )
+
+
+def _contributions(turning: list[Group], values: dict[str, float]) -> Plot:
+    """Share of each position in what is known of the angles."""
+    information: dict[str, Array] = {}
+    for group in turning:
+        n = len(group.gyro)
+        factor = IndexerAverageFactor.of(group.gyro, group.rates, 1.0, 0.0)
+        bias = [values.get(name, 0.0) for name in BIAS]
+        by_theta = factor(*(np.tile(block, (n, 1)) for block in (_angles(values), bias)))[1]()[0].reshape(-1, 3)
+        position = f"{group.run.axis}, other at {round(np.rad2deg(group.run.other)) % 360} deg"
+        information[position] = information.get(position, np.zeros(3)) + (by_theta**2).sum(axis=0)
+    total = np.sum(list(information.values()), axis=0)
+    out = Figure("share, %", x_title="", x_labels=THETA)
+    below, left = np.zeros(len(THETA)), np.arange(len(THETA)) - 0.4
+    for (position, own), color in zip(information.items(), cycle(COLORS)):
+        share = 100.0 * own / np.maximum(total, 1e-300)
+        out.boxes(left, left + 0.8, below, below + share, position, color)
+        below = below + share
+    return Plot(
+        "What each position says",
+        "Share of the turns and moves about each axis, the other axis standing at an angle, in the information on the "
+        "mounting angles by gyro noise alone.",
+        out,
+    )
+
+
+def _attitude(data: IndexerData, config: Config, values: dict[str, float]) -> Plot:
+    """Error of the carrier's attitude put out, before and after compensation."""
+    found = validate(data, config, values)[0]
+    out = Figure("attitude error, deg", y_scale="log")
+    said = []
+    for name, error, color in (("before", found.before, COLORS[6]), ("after", found.after, COLORS[0])):
+        angle = np.rad2deg(np.linalg.norm(error, axis=1))
+        out.line(found.time, angle, name, color)
+        rms = float(np.sqrt((angle**2).mean()))
+        said.append(f"{name} compensation {rms:.4g} deg ({3600.0 * rms:.3g} arcsec) RMS")
+    out.levels(0.005, dash="dashed", name="published claim")
+    return Plot("Attitude output", "Angle between nRb put out and the base's attitude: " + ", ".join(said) + ".", out)
+
+
+def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> list[Validation]:
+    """Errors without and with a calibration: of the attitude put out, where there is one, and of the turns' mean rates.
+
+    The carrier's attitude is nRb = nRm mRt tRb(outer, inner), without calibration mRt = identity and perpendicular
+    axes; the carrier is the indexer's base and stands still at the config's `indexer.base_attitude`.
+
+    Args:
+        data: the session, with the attitude nRm that the INS puts out, or without.
+        config: of the session.
+        values: calibrated parameters by name; those not named are zero.
+
+    Raises:
+        InputError: the axes hardly turn.
+    """
+    motion = axis_motion(data)
+    turning = [g for g in groups_of(data, config, motion) if g.position is not None]
+    time, before = misfit(turning, {})
+    after = misfit(turning, values)[1]
+    found = [Validation("axis by mean rates, turn by turn", "rad", time, before, after)]
+    if data.attitude is not None:
+        rows = np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))
+        bRn = so3.inverse(np.array(config.section(IndexerConfig).base_attitude))
+        errors = [so3.log(so3.multiply(bRn, _carrier(data, motion, rows, some))) for some in ({}, values)]
+        claim = "the publication claims 0.005 deg over an hour"
+        found.insert(0, Validation("attitude put out", "rad", data.gyro_t[rows], errors[0], errors[1], claim))
+    return found
+
+
+def _carrier(data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], values: Mapping[str, float]) -> Array:
+    """The carrier's attitude at gyro samples, by calibrated parameters."""
+    epsilon = float(several(values, EPSILON)[0])
+    return carrier(data, motion, rows, several(values, THETA), epsilon, several(values, ENCODER))
+
+
+def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array, Array]:
+    """Ends (n,) of the groups, s, and their mean rates less what encoders and earth say, over the rate, (n, 3) in t.
+
+    Args:
+        groups: in which an axis turns.
+        values: parameters by name; those not named are zero.
+    """
+    tRm, bias, gain = (
+        mounting(several(values, THETA)),
+        several(values, BIAS),
+        np.eye(3) + symmetric(several(values, ERRORS)),
+    )
+    epsilon, encoder = several(values, EPSILON), several(values, ENCODER)
+    slope = several(values, GYRO_SLOPE.names)
+    errors = []
+    for group in groups:
+        share = np.diff(group.rates.edges) / group.duration
+        fixed, cosine, sine = np.moveaxis(group.rates.parts(encoder), 1, 0)
+        expected = share @ (fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
+        warmth = group.warmth(values.get(FIRST))
+        drift = bias if warmth is None else bias + share @ warmth * slope
+        found = so3.rotate(tRm, np.linalg.solve(gain, group.mean_gyro - drift))
+        errors.append((found - expected) / np.linalg.norm(expected))
+    return np.array([float(g.rates.edges[-1]) for g in groups]), np.array(errors).reshape(-1, 3)
+
+
+CARDS = {
+    "IMU on the indexer": (("Mounting", "", ("theta_x", "theta_y", "theta_z")),),
+    "Gyro": (
+        ("Bias", "", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+        ("Scale error", "ppm", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
+    ),
+}
+REPORT = Report(
+    uses=uses,
+    cards=CARDS,
+    formulas=formulas,
+    figures=indexer_plots,
+    validate=validate,
+)

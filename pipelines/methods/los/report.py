@@ -1,0 +1,332 @@
+"""How a los result is applied. Frames: m gyro (IMU), b carrier, l line of sight. Methods page, section 1."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.factors.gimbal import SMOOTHING, GimbalPath, command
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.diagnostics.cross_validation import Validation
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.display.units import rounded
+from alidade.pipelines.estimation.parameters import fixed_without_force
+from alidade.pipelines.estimation.problem import Array, Estimate, Findings
+from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.methods import Report
+from alidade.pipelines.methods.formula import Formula, apply, axis_angles, gyro_rate, picture_time
+from alidade.pipelines.methods.los.initial_values import (
+    camera,
+    carried_errors,
+    los_direction,
+    los_error,
+    select_pictures,
+)
+from alidade.pipelines.methods.los.parameters import (
+    ANGLES,
+    DELAY,
+    ONCE_PER_TURN,
+    SCALE,
+    SENSITIVITY,
+    TIME_OFFSET,
+)
+from alidade.pipelines.methods.los.recording import JOINTS, LosData
+from alidade.pipelines.methods.los.uses import uses
+from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
+from alidade.pipelines.recording.topics import IMU
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
+
+_LEFT, _MIDDLE = ("camera_roll", "collimation"), "axis_nonperpendicularity"
+S = tuple(name for each in SCALE for name in each.names)
+DRIVERS = SENSITIVITY.names, GYRO_SLOPE.names
+
+
+def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
+    """Mounting, rate, camera and clock, with the errors of the sensors that are among the parameters."""
+    angles = axis_angles(JOINTS, ONCE_PER_TURN.names, DELAY.names[0], parameters)
+    azimuth, elevation = [angle.name for angle in angles] or JOINTS
+    rate, inputs = gyro_rate(parameters, S, *DRIVERS)
+    turns = {
+        "camera_roll": "Ry(camera_roll)",
+        "collimation": "Rz(collimation)",
+        "": f"Rx({elevation} + delta_px)",
+        "axis_nonperpendicularity": "Ry(axis_nonperpendicularity)",
+    }
+    camera = [turn for name, turn in turns.items() if not name or name in parameters]
+    found = [
+        Formula(
+            "IMU to carrier, Rx(a) = transpose(Exp(a ex)), Ry and Rz likewise",
+            "M",
+            "Rz(delta_z) * Rx(-delta_gx) * Ry(-delta_gy)",
+            (),
+        ),
+        Formula("rate of the carrier, rad/s", "w_b", f"M * ({rate})", inputs),
+        *angles,
+        Formula("carrier to line of sight", "lRb", " * ".join([*camera, f"Rz({azimuth})"]), JOINTS),
+        Formula("a direction d_b of the carrier in the line-of-sight frame", "d_l", "lRb * d_b", (*JOINTS, "d_b")),
+    ]
+    if "delta_pz" in parameters:
+        found.insert(0, Formula("azimuth zero", "delta_z", "delta_pz - delta_gz", ()))
+    if "los_scale" in parameters:
+        found.append(
+            Formula(
+                "LOS error, rad, from the one measured",
+                "los_error",
+                "measured_error / (1 + los_scale)",
+                ("measured_error",),
+            )
+        )
+    if TIME_OFFSET.name in parameters or "clock_skew" in parameters:
+        found.append(Formula("time of a picture on the gyro's clock, s", "time", picture_time(parameters), ("stamp",)))
+    return found
+
+
+def findings(data: LosData, config: Config, _: Estimate) -> Findings:
+    """Rows of `fixed_assumptions`: those that the recording gives no hold on, and why."""
+    return {} if data.force is not None else fixed_without_force(SENSITIVITY, config, config.topic(IMU))
+
+
+_AXES = ("phx", "phz")
+_MRAD = 1e3
+_URAD = 1e6
+# What is left is shown out to so many times its usual size; outliers lie beyond.
+_SHOWN = 6.0
+
+
+def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
+    """LOS error measured and predicted, and their difference with and without the mounting angles."""
+    config = calibration.config
+    estimate = calibration.estimate
+    values = calibration.problem.numbers(estimate)
+    sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
+    margin = SMOOTHING if TIME_OFFSET.name in values else 0.0
+    rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), margin)
+    time, measured = data.image_t[rows], data.error[rows]
+    chains = np.split(np.arange(len(rows)), np.flatnonzero(starts)[1:])
+    unmounted = {name: value for name, value in values.items() if name not in ANGLES}
+    gyro = GyroPath(data.gyro_t, rates(data, values))
+    with_angles, without = (
+        np.concatenate([_predicted(data, gyro, time[chain], measured[chain], v) for chain in chains])
+        for v in (values, unmounted)
+    )
+    return [
+        _measured_and_predicted(time, measured[:, :2], with_angles),
+        _left(time, measured[:, :2] - without, measured[:, :2] - with_angles),
+    ]
+
+
+def _predicted(data: LosData, gyro: GyroPath, time: Array, measured: Array, values: Mapping[str, float]) -> Array:
+    """phx, phz (n, 2) of one target's pictures as carried on from the first, rad."""
+    names = tuple(name for name in ANGLES if name in values)
+    at = taken(data, time, values)
+    cRm = camera(angles(data, at, values), np.array([values[name] for name in names]), names)
+    scale = np.array([1.0 + values.get("los_scale", 0.0)] * 2 + [1.0])
+    target_rate = np.array([values.get("target_rate_x", 0.0), 0.0, values.get("target_rate_z", 0.0)])
+    return scale[:2] * carried_errors(at, cRm, measured / scale, gyro, target_rate)
+
+
+def _measured_and_predicted(time: Array, measured: Array, predicted: Array) -> Plot:
+    out = Figure("LOS error, mrad")
+    for i, axis in enumerate(_AXES):
+        out.points(time, _MRAD * measured[:, i], f"{axis} measured", COLORS[i], 3, alpha=0.45)
+        out.line(time, _MRAD * predicted[:, i], f"{axis} predicted", COLORS[i])
+    reach = 1.2 * _MRAD * max(float(np.abs(predicted).max()), _SHOWN * float(robust_sigma(measured - predicted)))
+    middle = _MRAD * float(np.median(measured))
+    out.y_range = (middle - reach, middle + reach)
+    return Plot(
+        "LOS error measured and predicted",
+        "Points: where the camera saw the target. Lines: where it should be by gyro, gimbal and calibration alone, "
+        "from the first picture of a target on.",
+        out,
+    )
+
+
+def _left(time: Array, without: Array, compensated: Array) -> Plot:
+    out = Figure("measured less predicted, µrad")
+    for i, axis in enumerate(_AXES):
+        out.points(time, _URAD * without[:, i], f"{axis}, mounting angles zero", COLORS[4 + 2 * i], 3)
+    for i, axis in enumerate(_AXES):
+        out.points(time, _URAD * compensated[:, i], f"{axis}, mounting angles found", COLORS[i], 3)
+    spread = [_URAD * robust_sigma(errors) for errors in (without, compensated)]
+    reach = _SHOWN * max(*spread, 1.0)
+    out.y_range = (-reach, reach)
+    return Plot(
+        "What gyro, gimbal and calibration leave of the LOS error",
+        f"phx is the angle to the target below, phz to the right. Per axis {rounded(spread[0], 3)} µrad with the "
+        f"mounting angles zero, {rounded(spread[1], 3)} µrad with those found (standard deviations, from the median). "
+        "The gyro's noise adds up from a target's first picture on, so what is left may wander; it should not follow "
+        "the sway.",
+        out,
+    )
+
+
+# The replayed gimbal feeds back on its own commands; each pass is better by the carrier's sway, about a tenth.
+_PASSES = 6
+# Pictures further from the median of so many neighbours than so many times what is usual are outliers.
+_NEIGHBOURS, _OUTLYING = 9, 8.0
+
+
+def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tuple[Validation, ...]:
+    """LOS error since each target was found, before and after compensation; once more without its steady drift.
+
+    Args:
+        data: the session.
+        config: of the session.
+        values: calibrated parameters by name, SI; those not there are zero.
+
+    Raises:
+        InputError: too few pictures within the records of gyro and gimbal.
+    """
+    sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
+    rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), 0.0)
+    chains = np.split(rows, np.flatnonzero(starts)[1:])
+    good = [chain[_near_neighbours(data.error[chain, :2])] for chain in chains]
+    spoilt = len(rows) - sum(len(chain) for chain in good)
+    pairs = [(data.error[chain, :2], _replayed(data, chain, values)) for chain in good]
+    before, after = ([errors - errors[0] for errors in series] for series in zip(*pairs, strict=True))
+    times = [data.image_t[chain] for chain in good]
+    left_out = f"{spoilt} of {len(rows)} LOS errors left out as outliers" if spoilt else ""
+    bias = "a gyro bias that has changed since the calibration is still in it"
+    drifting = Validation(
+        "line of sight",
+        "rad",
+        np.concatenate(times),
+        np.concatenate(before),
+        np.concatenate(after),
+        "; ".join(filter(None, [bias, left_out])),
+        micro=True,
+    )
+    steady = Validation(
+        "line of sight, steady drift removed",
+        "rad",
+        np.concatenate(times),
+        np.concatenate([_without_drift(t, e) for t, e in zip(times, before, strict=True)]),
+        np.concatenate([_without_drift(t, e) for t, e in zip(times, after, strict=True)]),
+        left_out,
+        micro=True,
+    )
+    return drifting, steady
+
+
+def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float]) -> Array:
+    """phx, phz (n, 2) of one target's pictures with the gimbal driven by compensated commands since the first."""
+    t = data.image_t[chain]
+    inside = (data.gyro_t > t[0]) & (data.gyro_t < t[-1])
+    at = np.concatenate([t[:1], data.gyro_t[inside], t[-1:]])
+    gyro, true = (
+        np.stack([np.interp(at, data.gyro_t, each) for each in samples.T], axis=1)
+        for samples in (data.gyro, rates(data, values))
+    )
+    gimbal = GimbalPath(data.gimbal_t, data.gimbal)
+    recorded = gimbal.at(at)
+    px = values.get("delta_px", 0.0)
+    rate = so3.rotate(_carrier_from_gyro(values), true)
+    uncompensated = command(gyro, recorded)
+    extra = np.zeros_like(recorded)
+    for _ in range(_PASSES):
+        difference = command(rate, recorded + extra + [0.0, px]) - uncompensated
+        steps = 0.5 * np.diff(at)[:, None] * (difference[1:] + difference[:-1])
+        extra = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    was = gimbal.at(t)
+    would = was + np.stack([np.interp(t, at, extra[:, k]) for k in range(2)], axis=1)
+    cRc = so3.multiply(_camera_attitude(would, px), so3.inverse(_camera_attitude(was, px)))
+    return los_error(so3.rotate(cRc, los_direction(data.error[chain])))
+
+
+def _carrier_from_gyro(values: Mapping[str, float]) -> Array:
+    """M = Rz(dz) Rx(-gx) Ry(-gy), (4,), passive Rx, Ry, Rz."""
+    dz = values.get("delta_z", values.get("delta_pz", 0.0) - values.get("delta_gz", 0.0))
+    gx, gy = values.get("delta_gx", 0.0), values.get("delta_gy", 0.0)
+    return so3.compose(so3.exp([0.0, 0.0, -dz]), so3.exp([gx, 0.0, 0.0]), so3.exp([0.0, gy, 0.0]))
+
+
+def _camera_attitude(gimbal: Array, px: float) -> Array:
+    """cRb = Rx(eps + px) Rz(eta), (n, 4)."""
+    zero = np.zeros(len(gimbal))
+    lift = so3.exp(np.stack([-gimbal[:, 1] - px, zero, zero], axis=1))
+    return so3.multiply(lift, so3.exp(np.stack([zero, zero, -gimbal[:, 0]], axis=1)))
+
+
+def _near_neighbours(error: Array) -> NDArray[np.bool_]:
+    """Which LOS errors (n, 2) lie near the median of those around them."""
+    if len(error) < _NEIGHBOURS:
+        return np.ones(len(error), dtype=bool)
+    half = _NEIGHBOURS // 2
+    padded = np.pad(error, ((half, half), (0, 0)), mode="reflect", reflect_type="odd")
+    around = np.lib.stride_tricks.sliding_window_view(padded, _NEIGHBOURS, axis=0)
+    off = np.linalg.norm(error - np.median(around, axis=2), axis=1)
+    return np.asarray(off <= _OUTLYING * np.median(off))
+
+
+def _without_drift(t: Array, error: Array) -> Array:
+    """Errors less the straight line fitted to them."""
+    line = np.stack([np.ones_like(t), t - t.mean()], axis=1)
+    return np.asarray(error - line @ np.linalg.lstsq(line, error)[0])
+
+
+# Samples of the gyro worked on together.
+_BLOCK = 100_000
+
+
+def rates(data: LosData, values: Mapping[str, float]) -> Array:
+    """True rates (N, 3) at the gyro's samples, rad/s; errors whose cause was not measured stay in them."""
+    warm = None if data.temperature is None or FIRST not in values else data.temperature.above(0.0, data.gyro_t)
+    causes = {SENSITIVITY: data.force, GYRO_SLOPE: warm}
+    unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
+    known = {name: value for name, value in values.items() if name not in unknown}
+    formula, out = Formula("rate, rad/s in m", "w_m", *gyro_rate(known, S, *DRIVERS)), np.empty_like(data.gyro)
+    inputs = {"gyro": data.gyro, "accel": data.force, "temperature": warm}
+    for begin in range(0, len(out), _BLOCK):
+        some = slice(begin, begin + _BLOCK)
+        measured = {name: given[some] for name in formula.inputs if (given := inputs[name]) is not None}
+        out[some] = apply([formula], known, measured)["w_m"]
+    return out
+
+
+def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:
+    """When pictures were taken (n,), s, no further than gyro and gimbal were recorded."""
+    skew = values.get("clock_skew", 0.0) * (stamps - data.image_t[0])
+    delay = values.get("encoder_delay", 0.0)
+    first = max(data.gyro_t[0], data.gimbal_t[0] + delay)
+    last = min(data.gyro_t[-1], data.gimbal_t[-1] + delay)
+    return np.clip(stamps + values.get("time_offset", 0.0) - skew, first, last)
+
+
+def angles(data: LosData, at: Array, values: Mapping[str, float]) -> Array:
+    """Angles of azimuth and elevation (n, 2), rad, at true times."""
+    read = GimbalPath(data.gimbal_t, data.gimbal).at(at - values.get("encoder_delay", 0.0))
+    s, c = np.array([values.get(name, 0.0) for name in ONCE_PER_TURN.names]).reshape(2, 2).T
+    return np.asarray(read - s * np.sin(read) - c * np.cos(read))
+
+
+CARDS = {
+    "Mounting": (
+        ("Camera on the gimbal, elevation", "deg", ("delta_px",)),
+        ("IMU on the carrier", "deg", ("delta_gx", "delta_gy", "delta_gz")),
+        ("Azimuth, camera minus IMU", "deg", ("delta_z", "delta_pz")),
+    ),
+    "Gyro and timing": (
+        ("Gyro bias", "deg/h", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+        ("Delay of the pictures", "ms", ("time_offset",)),
+        ("Delay of the encoders", "ms", ("encoder_delay",)),
+    ),
+    "Gimbal geometry": (
+        ("Axes and camera", "deg", ("axis_nonperpendicularity", "collimation", "camera_roll")),
+        ("Scale of the LOS error", "%", ("los_scale",)),
+    ),
+}
+REPORT = Report(
+    uses=uses,
+    cards=CARDS,
+    formulas=formulas,
+    findings=findings,
+    figures=los_plots,
+    validate=validate,
+    residual_names={
+        "los": ("phx, angle to the target below", "phz, angle to the target to the right", "roll of the picture")
+    },
+)
