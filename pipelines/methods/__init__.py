@@ -141,14 +141,17 @@ class Method:
         self.write_data(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
 
     def settings(self, scenario: str | None = None, images: bool = False) -> Any:
-        """The simulator's settings of a scenario, by name or file; None: the default scenario.
+        """The simulator's settings of a scenario, by name or file; None: the default scenario, or the
+        model's defaults where it has no file.
 
         Raises InputError when there is no such scenario, or when it does not fit the model.
         """
-        from alidade.pipelines.simulation.scenario import load_scenario
+        from alidade.pipelines.simulation.scenario import load_scenario, shipped
 
-        simulator = self.require_simulator()
-        return load_scenario(simulator.scenario, scenario or self.default_scenario(images), simulator.folder)
+        simulator, default = self.require_simulator(), self.default_scenario(images)
+        if scenario is None and default not in shipped(simulator.folder):
+            return simulator.scenario()
+        return load_scenario(simulator.scenario, scenario or default, simulator.folder)
 
     @property
     def scenario(self) -> type[BaseModel]:

@@ -107,9 +107,9 @@ def test_compare_with_halves(command: Command, folder: Path, tmp_path: Path) -> 
 
 
 def test_plan_finds_the_second_axis(command: Command, folder: Path, tmp_path: Path) -> None:
-    """The scenario is one that the distribution brings, by its name."""
-    better = tmp_path / "better.yaml"
-    done = command(folder, "plan", "gyro_pair", "--scenario", "gyro_pair_one_axis", "--out", str(better), code=3)
+    one_axis, better = tmp_path / "one_axis.yaml", tmp_path / "better.yaml"
+    one_axis.write_text("motion: {yaw: [{amplitude_deg: 60, frequency_hz: 0.3}]}")
+    done = command(folder, "plan", "gyro_pair", "--scenario", str(one_axis), "--out", str(better), code=3)
     assert "The body: sway by 20 deg" in done.out
     command(folder, "plan", "gyro_pair", "--scenario", str(better), "--quiet")
 
@@ -134,10 +134,17 @@ def test_montecarlo_of_the_nominal_scenario(command: Command, folder: Path, tmp_
 def test_what_it_cannot_do_is_one_line(command: Command, folder: Path) -> None:
     done = command(folder, "simulate", "gyro_pair", "--images", "--out", "x.mcap", "--quiet", code=2)
     assert done.err == "alidade: gyro_pair has no camera: leave out --images\n"
-    assert (
-        "gyro_pair_one_axis"
-        in command(folder, "simulate", "gyro_pair", "--scenario", "one_axis", "--out", "x.mcap", "--quiet", code=2).err
-    )
+
+
+def test_config_has_its_noise(command: Command, folder: Path, tmp_path: Path) -> None:
+    """`noise.gyro_b_density` is a key that the method brings."""
+    (tmp_path / "config.yaml").write_text("noise: {gyro_b_density: 4.0e-3}")
+    (tmp_path / "wrong.yaml").write_text("noise: {gyro_c_density: 4.0e-3}")
+    calibrate = ("calibrate", "s.mcap", "--out", str(tmp_path / "r"), "--quiet", "--config")
+    done = command(folder, *calibrate, str(tmp_path / "config.yaml"))
+    assert "times the message's value" in done.out, "the level is not that of the residuals"
+    asked = command(folder, *calibrate, str(tmp_path / "wrong.yaml"), code=2)
+    assert "unknown key noise.gyro_c_density" in asked.err
 
 
 def test_no_shared_file_knows_it() -> None:
