@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 _SHORTEST = 16
 # No gyro at rest has more white noise, rad/s/sqrt(Hz): cheap consumer parts have .05 deg/s/sqrt(Hz), 9e-4.
 _MOST_GYRO_DENSITY = 3e-3
+# Readings that differ by less are one value, SI: no sensor's noise is as small, and its square is lost in rounding.
+_LEAST_SPREAD = 1e-15
 _UNITS = {"gyro": "rad/s", "accel": "m/s^2", "mag": "T"}
 
 
@@ -175,7 +177,7 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
         axes = {}
         for axis, letter in enumerate("xyz"):
             columns = [piece[:, axis] for piece in pieces]
-            if any(np.ptp(column) > 0.0 for column in columns):
+            if any(np.ptp(column) > _LEAST_SPREAD for column in columns):
                 axes[letter] = axis_noise(columns, interval)
             else:
                 notes.append(f"{part}: axis {letter} reads the same value whenever it is at rest")

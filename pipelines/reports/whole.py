@@ -136,14 +136,11 @@ def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:
             f"{out_dir}: another process has written its results there since this one began; those of this one are "
             "not written: give another folder"
         )
-    last.unlink(missing_ok=True)
-    written = []
-    for name in names:
-        if (part / name).exists():
-            os.replace(part / name, out_dir / name)
-            written.append(out_dir / name)
-        else:
-            (out_dir / name).unlink(missing_ok=True)
+    for name in reversed(names):  # all of them, the last first: at no time do files of two writers stand together
+        (out_dir / name).unlink(missing_ok=True)
+    made = [name for name in names if (part / name).exists()]
+    for name in made:
+        os.replace(part / name, out_dir / name)
     if claimed is not None:
         _claimed[out_dir.absolute()] = last.stat().st_mtime_ns
-    return tuple(written)
+    return tuple(out_dir / name for name in made)

@@ -285,3 +285,14 @@ def test_a_real_imu_on_a_table(shared_data: Path) -> None:
             assert low < white.value < high
     # Something in the room turns at 23.5 Hz.
     assert all(abs(axis.lines[0].hz - 23.5) < 0.2 for axis in accel.axes.values())
+
+
+@pytest.mark.parametrize("size", [5e-324, 1e-160, 1e-20])
+def test_readings_that_differ_by_less_than_any_noise_are_one_value(size: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    t, _, accel = device(rng, 60.0)
+    imu = series.ImuSeries(stamps(t), size * rng.integers(-3, 4, accel.shape), accel)
+    write_session(tmp_path / "s.mcap", {"/imu": imu})
+    study = noise_of(tmp_path / "s.mcap")
+    assert [sensor.kind for sensor in study.sensors] == ["accel"]
+    assert sum("reads the same value whenever it is at rest" in note for note in study.notes) == 3
