@@ -291,7 +291,7 @@ def test_a_real_imu_on_a_table(shared_data: Path) -> None:
 def test_readings_that_differ_by_less_than_any_noise_are_one_value(size: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     t, _, accel = device(rng, 60.0)
-    imu = series.ImuSeries(stamps(t), size * rng.integers(-3, 4, accel.shape), accel)
+    imu = series.ImuSeries(stamps(t), np.asarray(size * rng.integers(-3, 4, accel.shape), dtype=float), accel)
     write_session(tmp_path / "s.mcap", {"/imu": imu})
     study = noise_of(tmp_path / "s.mcap")
     assert [sensor.kind for sensor in study.sensors] == ["accel"]

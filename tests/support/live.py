@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -40,14 +40,15 @@ class Bridge:
     Args:
         whole: what it plays.
         speed: how fast.
-        drop_at: share of the messages after which it hangs up, and comes back.
+        drop_at: shares of the messages after which it hangs up, and comes back.
         also: topics that nobody is expected to ask for.
     """
 
     def __init__(
-        self, whole: list[Message], speed: float, drop_at: float | None = None, also: tuple[str, ...] = ()
+        self, whole: list[Message], speed: float, drop_at: Sequence[float] = (), also: tuple[str, ...] = ()
     ) -> None:
-        self._whole, self._speed, self._drop_at, self._also = whole, speed, drop_at, also
+        self._whole, self._speed, self._also = whole, speed, also
+        self._drops = {int(share * len(whole)) for share in drop_at}
         self._context = foxglove.Context()
         self._channels: dict[str, Any] = {}
         for schema, channel, _, _ in whole:
@@ -100,11 +101,10 @@ class Bridge:
                 time.sleep(0.1)
 
     def _play(self) -> None:
-        drop = None if self._drop_at is None else int(self._drop_at * len(self._whole))
         for i, (_, channel, log_ns, data) in enumerate(paced(self._whole, self._speed, self._ready)):
             if self._over.is_set():
                 return
-            if i == drop:
+            if i in self._drops:
                 self._server.stop()
                 self._ready.clear()
                 self.subscribed.clear()

@@ -187,7 +187,7 @@ def test_a_ros_1_bag_is_followed_killed_and_resumed_when_it_is_closed(tmp_path: 
 
 def test_a_bridge_that_hangs_up_and_comes_back(whole: Path, config: Path, tmp_path: Path) -> None:
     said: list[str] = []
-    with Bridge(messages(whole), 8.0, drop_at=0.5) as bridge:
+    with Bridge(messages(whole), 8.0, drop_at=[0.5]) as bridge:
         kept = tmp_path / "kept"
         calibration, views, _ = follow(
             source_of(bridge.url, kept, said.append), Settings(config=config), lambda: bridge.is_over
