@@ -27,7 +27,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Attempts, Gate
+from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, MAX_CONNECTIONS, Attempts, Gate
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.protocol import to_json
 from alidade.pipelines.display.units import human_unit, to_digits_of
@@ -113,6 +113,8 @@ class LivePage:
                 log_level="critical",
                 lifespan="off",
                 ws="none",
+                # So many are taken in at once, and counted before the next: all that wait would exhaust the open files.
+                backlog=MAX_CONNECTIONS,
                 timeout_graceful_shutdown=1,
             )
         )

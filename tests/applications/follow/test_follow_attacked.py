@@ -6,6 +6,7 @@ import base64
 import http.client
 import json
 import os
+import resource
 import socket
 import threading
 import time
@@ -40,7 +41,7 @@ from alidade.pipelines.recording.recording import open_recording
 
 connect: Any = websockets().sync.client.connect
 serve: Any = websockets().sync.server.serve
-IDLE = 300
+IDLE, BURST = 300, 450
 
 
 def _view() -> View:
@@ -152,6 +153,26 @@ def test_idle_connections_keep_nobody_out_and_end(host: str, monkeypatch: pytest
         time.sleep(1.3)
         assert len(page._gate) == 0
         assert all(map(_is_closed, idle))
+
+
+def test_a_burst_of_connections_leaves_files_to_open(caplog: pytest.LogCaptureFixture) -> None:
+    """More wait to be taken in than this process may have files open."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    page = LivePage(lambda _: None, "127.0.0.1", 0)
+    page._socket.listen(2 * BURST)
+    with ExitStack() as stack:
+        for _ in range(BURST):
+            stack.enter_context(socket.create_connection(("127.0.0.1", _port(page))))
+        used = max(map(int, os.listdir("/proc/self/fd")))
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (used + 5 * MAX_CONNECTIONS, limits[1]))
+            with page:
+                for _ in range(10):
+                    assert _get(_port(page))[0] == 200
+                assert len(page._gate) <= MAX_PER_ADDRESS
+            assert not caplog.records, "nothing was refused for want of files"
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def test_a_stream_outlives_idle_connections() -> None:
