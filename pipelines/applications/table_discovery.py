@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 # What the names of three columns along x, y and z begin with or are, lower case; `gx` is a gyro's as often as not.
 _WORDS = {
     "gyro": r"gyr|angular.?(vel|rate)|omega|rotation.?rate|^w(?=_|$)|^g(?=_|$)|ang.?vel|\brate",
-    "accel": r"acc|^a(?=_|$)|specific.?force|^f(?=_|$)",
+    "accel": r"acc|^a(?=_|$)|specific.?force|^f(?=_|$)|^g.?f(?=_|$|orce)",
     "field": r"mag|^m(?=_|$)|^b(?=_|$)|^h(?=_|$)|field",
 }
 _LINEAR = re.compile(r"lin|free|user|without.?g|gravity|acceleration.?no.?g")
@@ -246,7 +246,9 @@ class _Table:
         for name, columns in _along_axes(self._form.names):
             name = name or self.path.stem.lower()  # x, y, z alone: the file is named after the sensor
             kind = next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
-            if kind == "accel" and (_LINEAR.search(name) or self._lacks_gravity(columns)):
+            # ROS calls linear acceleration what has gravity in it.
+            is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
+            if is_linear or (kind == "accel" and self._lacks_gravity(columns)):
                 self.doubts.append(f"{self.path.name}: {self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
             elif kind and kind not in out:
                 out[kind] = columns

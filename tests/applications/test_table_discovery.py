@@ -88,6 +88,16 @@ CASES = {
         (48.0 * DIRECTIONS,),
         {"/mag": {"rate": 100.0, "field": ["mx", "my", "mz"], "units": {"field": "uT"}}},
     ),
+    "accelerations with gravity by the name that ROS has for them": (
+        "time,linear_acceleration.x,linear_acceleration.y,linear_acceleration.z",
+        (SECONDS, 9.8 * DIRECTIONS),
+        {"/imu": {"time": "time", "accel": [f"linear_acceleration.{axis}" for axis in "xyz"]}},
+    ),
+    "forces in units of gravity": (
+        "time,gFx,gFy,gFz",
+        (SECONDS, DIRECTIONS),
+        {"/imu": {"time": "time", "accel": ["gFx", "gFy", "gFz"], "units": {"accel": "g"}}},
+    ),
     "a pose": (
         "timestamp,qw,qx,qy,qz",
         (1.79e9 + SECONDS, np.tile([0.5, 0.5, 0.5, 0.5], (N, 1))),
