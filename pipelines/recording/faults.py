@@ -27,6 +27,8 @@ _CLIPPED, _QUANTA = 3, 20.0
 # height within its length before and after. Off a smooth top they fall by 8 times, and off three samples of a noisy one
 # by more: the longest plateau has so many.
 _NEAR_END, _BRIEFLY, _FALL, _PLATEAU = 0.02, 1.0, 24.0, 6
+# Ranges begin at 2 g and .8 gauss. Gravity, or the earth's field, that lingers along an axis is at the end of none.
+_SMALLEST_RANGE = {"m/s^2": 15.0, "T": 8e-5}
 # Readings of two devices in turn: one differs from the next by so many times what it does from the next but one. Of
 # noise both are alike, of motion the second is larger.
 _ALTERNATE, _ALTERNATE_SAMPLES = 3.0, 100
@@ -52,7 +54,9 @@ def drop_faults(
     _check_one_device(topic, values, unit)
     spikes = np.stack([_spikes(column) for column in values.T], axis=1)
     rest = np.where(spikes, np.nan, values)
-    clipped, frozen = (np.stack([find(t, column) for column in rest.T], axis=1) for find in (_clipped, _frozen))
+    smallest = _SMALLEST_RANGE.get(unit, 0.0)
+    clipped = np.stack([_clipped(t, column, smallest) for column in rest.T], axis=1)
+    frozen = np.stack([_frozen(t, column) for column in rest.T], axis=1)
     return _without(topic, t, values, {"spike": spikes, CLIPPED: clipped, _STUCK: frozen}, dropped, unit)
 
 
@@ -157,10 +161,10 @@ def _frozen(t: Array, x: Array, most: float = _MOST_REPEATED) -> Mask:
     return out if out.mean() < most else np.zeros(len(x), dtype=bool)
 
 
-def _clipped(t: Array, x: Array) -> Mask:
-    """Samples at the end of the range: runs of its very reading, and plateaus that wander."""
+def _clipped(t: Array, x: Array, smallest: float) -> Mask:
+    """Samples at the end of the range, which is not below the smallest: runs of its very reading, wandering plateaus."""
     out = _at_end(x)
-    return out | _on_plateau(t, x, out) | _on_plateau(t, -x, out)
+    return out | ((_on_plateau(t, x, out) | _on_plateau(t, -x, out)) & (np.abs(x) >= smallest))
 
 
 def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
