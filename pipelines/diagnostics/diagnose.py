@@ -18,9 +18,9 @@ from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate
 from alidade.pipelines.estimation.robust import robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
-# Measured noises whose default is no guess, and how many times it is none any more: blurred and distant tags scatter by
-# two or three times it; attitudes by 3.5 deg, seven times it, serve nobody.
-_NO_NOISE = {"corner_px": 5.0, "vision_attitude": 7.0}
+# How many times its default is no noise any more: blurred and distant tags scatter by two or three times it; attitudes
+# that scatter by 3.5 deg serve nobody; no gyro has more than 3e-3 rad/s/sqrt(Hz).
+_NO_NOISE = {"corner_px": 5.0, "vision_attitude": 7.0, "gyro_density": 60.0}
 # Kinds about the residuals, as opposed to priors and requirements.
 _RESIDUAL = ("not_converged", "misfit", "noise", "correlation", "rejection")
 

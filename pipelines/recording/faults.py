@@ -162,7 +162,7 @@ def _frozen(t: Array, x: Array, most: float = _MOST_REPEATED) -> Mask:
 
 
 def _clipped(t: Array, x: Array, smallest: float) -> Mask:
-    """Samples at the end of the range, which is not below the smallest: runs of its very reading, wandering plateaus."""
+    """Samples at the end of the range, none below the smallest: runs of its very reading, and plateaus that wander."""
     out = _at_end(x)
     return out | ((_on_plateau(t, x, out) | _on_plateau(t, -x, out)) & (np.abs(x) >= smallest))
 

@@ -135,7 +135,7 @@ class StreamReader:
         return samples.rows(sound)
 
     def gyro(self, topic: str, least: int = 2, may_be_constant: bool = False) -> Samples[ImuSeries]:
-        """Samples of an Imu topic with usable rates, rad/s.
+        """Samples of an Imu topic with usable rates, rad/s; a reading that the driver repeats is used once.
 
         `may_be_constant`: a parked platform may read zero throughout, by a simulator or a driver that cuts off noise.
         """
@@ -146,6 +146,7 @@ class StreamReader:
             least=least,
             slowest_s=SLOWEST_GYRO_S,
             may_be_constant=may_be_constant,
+            may_be_held=True,
         )
         checks.check_gyro(topic, samples.t, samples.series.gyro)
         return samples

@@ -18,7 +18,11 @@ from tests.support.builders import make_calibration
 
 @pytest.mark.parametrize(
     ("noise", "scale", "told"),
-    [("corner_px", 4.0, 0), ("corner_px", 6.0, 1), ("vision_attitude", 6.0, 0), ("vision_attitude", 8.0, 1)],
+    [
+        *(("corner_px", 4.0, 0), ("corner_px", 6.0, 1)),
+        *(("vision_attitude", 6.0, 0), ("vision_attitude", 8.0, 1)),
+        *(("gyro_density", 50.0, 0), ("gyro_density", 70.0, 1)),
+    ],
 )
 def test_what_scatters_by_many_times_its_default_does_not_fit(noise: str, scale: float, told: int) -> None:
     calibration = make_calibration()

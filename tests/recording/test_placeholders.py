@@ -77,10 +77,12 @@ def test_a_held_reading_is_used_once() -> None:
 def test_a_held_reading_is_not_one_at_the_end_of_the_range(tmp_path: Path) -> None:
     turn = np.linspace(0.0, 20.0, 125)[:, None] + [0.0, 1.0, 2.0]
     held = np.repeat(3e-5 * np.sin(turn) + 1e-7 * RNG.normal(size=(125, 3)), 8, axis=0)
-    write_session(tmp_path / "s.mcap", {"/mag": series.MagneticSeries(T_NS, held)}, {})
+    imu = series.ImuSeries(T_NS, 1e4 * held, np.full(3, np.nan))
+    write_session(tmp_path / "s.mcap", {"/mag": series.MagneticSeries(T_NS, held), "/imu": imu}, {})
     reader = StreamReader(open_recording(tmp_path / "s.mcap"), {})
     np.testing.assert_array_equal(reader.magnetic_field("/mag").series.field, held[::8])
-    assert reader.dropped == {"/mag: repeats the reading before, used once": 875}
+    np.testing.assert_array_equal(reader.gyro("/imu").series.gyro, 1e4 * held[::8])
+    assert reader.dropped == {f"/{topic}: repeats the reading before, used once": 875 for topic in ("mag", "imu")}
 
 
 def test_quaternions_of_zeros_are_a_body_that_was_not_seen() -> None:

@@ -256,7 +256,9 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
 
     reader = StreamReader(recording, dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic(IMU)
-    imu = reader.samples(name, recording.imu(name), "gyro", "accel", least=3, slowest_s=SLOWEST_GYRO_S)
+    imu = reader.samples(
+        name, recording.imu(name), "gyro", "accel", least=3, slowest_s=SLOWEST_GYRO_S, may_be_held=True
+    )
     raw = config.section(CubeConfig).raw
     sensors = [
         Readings(name, imu.t, imu.series.accel, raw.accel),
