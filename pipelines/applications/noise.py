@@ -20,7 +20,7 @@ from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import clean
 from alidade.pipelines.recording.even import even_pieces
 from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.plausibility import implausible, is_there
+from alidade.pipelines.recording.plausibility import implausible, is_there, measured_once
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config
 
@@ -169,8 +169,9 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
         )
     for kind, values in samples.items():
         part = f"{name} {kind}"
+        rows = measured_once(part, values, dropped)
         # At rest a coarse sensor may read one value, which is noted below.
-        sound = drop_faults(part, t, values, dropped, _UNITS[kind], may_stand=True)
+        sound = rows[drop_faults(part, t[rows], values[rows], dropped, _UNITS[kind], may_stand=True)]
         pieces, interval, filled = _pieces(t[sound], values[sound], rests)
         if not pieces:
             raise InputError(f"topic {part}: too many samples are missing in the {len(rests)} static intervals")

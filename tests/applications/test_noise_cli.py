@@ -199,6 +199,19 @@ def test_gaps_lost_samples_and_nan(tmp_path: Path) -> None:
         assert white.value == pytest.approx(GYRO, rel=0.03)
 
 
+def test_readings_that_a_driver_holds_are_measured_once(tmp_path: Path) -> None:
+    t, gyro, _ = device(np.random.default_rng(4), 60.0)
+    session = series.ImuSeries(stamps(grid(4 * len(t), 0.0025)), np.repeat(gyro, 4, axis=0))
+    write_session(tmp_path / "s.mcap", {"/imu": session})
+    study = noise_of(tmp_path / "s.mcap")
+    (found,) = study.sensors
+    assert found.rate_hz == pytest.approx(100.0)
+    assert f"/imu gyro: repeats the reading before, used once: {3 * len(t)}" in study.notes
+    for axis in found.axes.values():
+        (white,) = (c for c in axis.fit.coefficients if c.name == "N")
+        assert white.value == pytest.approx(GYRO, rel=0.03)
+
+
 def test_several_gyros_keep_their_names(tmp_path: Path, alidade: Command) -> None:
     topics = {}
     for i, name in enumerate(("/head/imu", "/platform/imu", "/spare")):
