@@ -286,9 +286,9 @@ def compare(
 @app.command()
 def follow(
     source: Annotated[
-        str,
+        str | None,
         typer.Argument(metavar="SOURCE", help="File or folder being written, ws://host:port, or - (standard input)."),
-    ],
+    ] = None,
     method: _MethodName = None,
     config: ConfigFile = None,
     window: _Window = "1",
@@ -310,6 +310,10 @@ def follow(
         str, typer.Option(help="Address of the live page; 0.0.0.0 opens it to the network (token in the URL).")
     ] = "127.0.0.1",
     page_port: Annotated[int, typer.Option(help="Port of --page.")] = 8766,
+    replay: Annotated[
+        Path | None, typer.Option(help="In place of SOURCE: a finished MCAP file, played as if it were recorded now.")
+    ] = None,
+    speed: Annotated[float, typer.Option(help="Of --replay, times real time.")] = 1.0,
     record: Annotated[
         Path | None, typer.Option(help="Folder that keeps what arrives by ws:// or -; a later run appends.")
     ] = None,
@@ -323,15 +327,20 @@ def follow(
     """
     from alidade.pipelines.applications.follow.follow import follow as run
     from alidade.pipelines.applications.follow.follower import Settings
+    from alidade.pipelines.errors import InputError
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import write_results
 
+    if (source is None) == (replay is None):
+        raise InputError("follow: give a SOURCE, or a finished recording with --replay")
+    source = source or str(replay)
     folder = out or _beside(Path(_file_name(source)), "incremental")
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
     page_at = (host, page_port) if page else None
-    calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or ())
+    pace = None if replay is None else speed
+    calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or (), pace)
     written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 

@@ -12,7 +12,7 @@ from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.config import configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
-from alidade.pipelines.display.units import format_estimate
+from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
@@ -65,7 +65,7 @@ class Validated:
             return "Whether the calibration holds is not known: the recording does not say."
         steps = self.held.steps
         if self.verdict == "holds":
-            return f"The calibration holds: none of {len(steps)} parameters differs by more than chance."
+            return f"The calibration holds: {len(steps)} of {len(steps)} parameters unchanged, to {self._resolution}."
         found = [
             f"{step.name} changed by {format_estimate(self.held.quantities[step.name], step.size, step.sigma)}"
             for step in steps
@@ -74,6 +74,16 @@ class Validated:
         what = "; ".join(found) or "all parameters together, none by more than chance for itself"
         small = "" if self.held.matters or not found else " That is less than what is required of them."
         return f"The calibration does not hold: {what}.{small}"
+
+    @property
+    def _resolution(self) -> str:
+        """The largest change that would not be noticed, by unit, of the device's parameters first."""
+        assert self.held is not None
+        largest: dict[str, float] = {}
+        for step in self.held.steps:
+            unit, factor = human_unit(self.held.quantities[step.name])
+            largest[unit] = max(largest.get(unit, 0.0), factor * self.held.changes.limit * step.sigma)
+        return ", ".join(f"{rounded(size)} {unit}".strip() for unit, size in largest.items())
 
     @property
     def notes(self) -> list[str]:

@@ -118,7 +118,8 @@ def interval_bar(interval: Interval) -> str:
         if interval.require
         else f'<path class="none" d="M2 8.5H{width - 2:.0f}"/>'
     )
-    bar = f'<rect class="bar" x="{width / 2 - reach:.1f}" y="4" width="{2 * reach:.1f}" height="9" rx="1"/>'
+    middle = width / 2 + min(max(interval.offset * scale, -half), half)
+    bar = f'<rect class="bar" x="{middle - reach:.1f}" y="4" width="{2 * reach:.1f}" height="9" rx="1"/>'
     over = f'<path class="over" d="M3 8.5l4-3v6zM{width - 3:.0f} 8.5l-4-3v6z"/>' if reach > width / 2 - 1 else ""
     truth = ""
     if interval.error is not None:

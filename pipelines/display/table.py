@@ -37,11 +37,13 @@ class Interval:
         sigma: standard deviation.
         require: the one required; None: none is.
         error: value less truth, where that is known.
+        offset: of the value from the middle.
     """
 
     sigma: float
     require: float | None = None
     error: float | None = None
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)

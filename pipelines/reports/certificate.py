@@ -342,17 +342,20 @@ def _found_table(rows: Sequence[Row], readable: Sequence[_Readable], before: Pat
 
 
 def _summary(result: Result, rows: Sequence[Row], missing: Sequence[str]) -> Summary:
-    """Whether the item is within its limits, or, where none are stated, the status of the calibration."""
-    steps = (f"Still to be stated, in the file given with `--fields`: {', '.join(missing)}.",) if missing else ()
+    """What is not stated; else whether the item is within its limits, or the status where it has none."""
+    if missing:
+        text = f"{len(missing)} fields are not stated: {', '.join(missing)}."
+        steps = ("State them in the file given with `--fields`.",)
+        return Summary("Is the certificate complete?", "incomplete", "fixed", text, (), steps)
     statements = [row.conformity for row in rows if row.conformity]
     tone: Tone = "good" if result.status == "calibrated" else "warn"
     if not statements:
         text = f"The status of the calibration is {result.status}; no limits are stated to compare the item with."
-        return Summary("Is the item calibrated?", result.status, tone, text, (), steps)
+        return Summary("Is the item calibrated?", result.status, tone, text)
     within, count = statements.count("conforms"), len(statements)
     answer = "yes" if within == count else "no" if "does not conform" in statements else "no statement"
     text = f"{within} of {count} parameters with limits conform; the status of the calibration is {result.status}."
-    return Summary("Is the item within its limits?", answer, tone if answer == "yes" else "bad", text, (), steps)
+    return Summary("Is the item within its limits?", answer, tone if answer == "yes" else "bad", text)
 
 
 def _readable(row: Row, result: Result) -> _Readable:

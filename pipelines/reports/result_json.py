@@ -259,6 +259,17 @@ class ChangesResult(_Record):
     rates: dict[str, RateResult]  # kind of parameter: how far it walks
 
 
+class UseResult(_Record):
+    """A use of the calibration with the 95 % bound of its error."""
+
+    name: str  # heading, rate, force, pointing, stabilisation, attitude, outage, navigation
+    unit: str  # of the numbers
+    before: float  # 95 % bound without calibration
+    after95: float  # 95 % bound with it
+    required: float | None  # the same if parameters only just met their requirements
+    at: str  # operating point, in words
+
+
 class Result(_Record):
     """result.json; null where the solver has no such figure."""
 
@@ -286,6 +297,8 @@ class Result(_Record):
     measurements: list[MeasurementResult] | None  # the twenty that matter most
     findings: list[dict[str, object]]  # kind, severity and evidence, the most severe first
     tables: dict[str, list[dict[str, object]]]  # the method's own
+    uses: list[UseResult] = []  # error in use, before and after
+    applied: list[str] = []  # parameters that the formulas apply
     second_best: SecondResult | None = None  # where there is another solution that is nearly as likely
     constants: dict[str, float] | None = None  # that formulas need beside the parameters
     recordings: list[PartResult] | None = None  # of a joint calibration
@@ -369,6 +382,18 @@ def result(calibration: Calibration) -> Result:
             "constants": c.problem.constants or None,
             "recordings": c.recordings or None,
             "changes": c.changes and {"level": c.changes.level, "steps": _steps(c), "rates": c.changes.rates},
+            "uses": [
+                {
+                    "name": found.use.name,
+                    "unit": found.use.unit,
+                    "before": found.before,
+                    "after95": found.after,
+                    "required": found.figure(lambda band: band.allowed) or None,
+                    "at": found.use.label,
+                }
+                for found in c.uses
+            ],
+            "applied": c.applied,
             "truth": None if c.truth is None else truth_errors(c),
         }
     )

@@ -14,7 +14,8 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from alidade.pipelines.display.table import Column, Table
+from alidade.pipelines.display.table import Cell, Column, Table
+from alidade.pipelines.display.units import rounded
 from alidade.pipelines.errors import printable
 from alidade.pipelines.reports.report import Block, Bullets, Code, Report, Tables
 
@@ -89,7 +90,8 @@ def _print_blocks(title: str, blocks: Sequence[Block]) -> None:
 
 def print_table(table: Table) -> None:
     """Print a table; groups of columns that the terminal is too narrow for follow below, the other columns repeated."""
-    groups = {head.group: [i for i, each in enumerate(table.heads) if each.group == head.group] for head in table.heads}
+    shown = [i for i, head in enumerate(table.heads) if head.kind != "drawing"]
+    groups = {head.group: [i for i in shown if table.heads[i].group == head.group] for head in table.heads}
     shared = groups.pop("", [])
     parts: list[list[int]] = [[]]
     for group in groups.values():
@@ -97,10 +99,10 @@ def print_table(table: Table) -> None:
             parts.append([])
         parts[-1] += group
     for part in parts:
-        shown = _rich(table, sorted([*shared, *part]))
+        drawn = _rich(table, sorted([*shared, *part]))
         if not any(head.kind == "prose" for head in table.heads):
-            shown.width = _width(shown)  # no number is broken or left out, however narrow the terminal
-        console.print(shown, soft_wrap=True)
+            drawn.width = _width(drawn)  # no number is broken or left out, however narrow the terminal
+        console.print(drawn, soft_wrap=True)
         console.print()
     if groups and table.caption:
         say(table.caption)
@@ -114,6 +116,7 @@ def _rich(table: Table, columns: Sequence[int]) -> RichTable:
         justify: Literal["left", "right"] = "right" if i and head.kind == "number" else "left"
         out.add_column(head.head, justify=justify, no_wrap=head.kind != "prose", overflow="fold")
     for row in table.cells:
+        row = row if len(row) > 1 else (*row, *(Cell(""),) * (len(table.heads) - 1))
         out.add_row(*(RichText(printable(row[i].text, _MAX_LINE), COLOURS.get(row[i].tone, "")) for i in columns))
     return out
 
@@ -231,6 +234,19 @@ def _print_verdict(calibration: Calibration, name: bool) -> None:
     _print_directions(() if published else calibration.directions)
     for note in calibration.notes:
         say(f"  note: {note}")
+    for line in _uses(calibration) if not name else ():
+        say(f"  {line}")
+
+
+def _uses(calibration: Calibration) -> list[str]:
+    """Error before and after calibration, a line a use."""
+    uses = calibration.uses
+    width = max((len(found.use.label) for found in uses), default=0)
+    return [
+        f"{found.use.label:{width}}  {rounded(found.before, 3)} {found.use.unit} before, "
+        f"{'± ' if found.use.signed else ''}{rounded(found.after)} {found.use.unit} after (95 %)"
+        for found in uses
+    ]
 
 
 def _print_directions(directions: Sequence[Finding]) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from alidade.pipelines.diagnostics.cross_validation import Validation, peak, rms
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
-from alidade.pipelines.display.table import Cell, Column, Table
+from alidade.pipelines.display.table import Cell, Column, Interval, Table
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.html import render_html
@@ -77,12 +77,15 @@ def _changes(validated: Validated) -> tuple[Block, ...]:
         numbers = (step.size, step.sigma, validated.held.changes.limit * step.sigma)
         change, sigma, threshold = (to_digits_of(factor * x, factor * step.sigma) for x in numbers)
         name = Cell(step.name, method(validated.calibration.method).describe(step.name))
-        rows.append((name, change, sigma, threshold, unit))
+        beyond = abs(step.size) > validated.held.changes.limit * step.sigma
+        drawn = Interval(step.sigma, 0.5 * validated.held.changes.limit * step.sigma, offset=step.size)
+        bar = Cell("", interval=drawn, tone="bad" if beyond else "good")
+        rows.append((name, change, sigma, threshold, unit, bar))
     caption = (
         "Change: this recording's estimate less the calibration's. Threshold: beyond it a change is significant "
-        "(p = 0.05 for all parameters together)."
+        "(p = 0.05 for all parameters together). Bar: change ± 2 sigma, dark, between the thresholds, light."
     )
-    columns = ("parameter", "change", "sigma", "threshold", Column("unit", "text"))
+    columns = ("parameter", "change", "sigma", "threshold", Column("unit", "text"), Column("", "drawing"))
     return (Table("", caption, columns, tuple(rows), "changes", most_rows=None),) if rows else ()
 
 

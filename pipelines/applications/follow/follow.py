@@ -16,7 +16,7 @@ from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.page import LivePage
 from alidade.pipelines.applications.follow.screen import Screen
 from alidade.pipelines.applications.follow.serve import LiveServer
-from alidade.pipelines.applications.follow.sources import source_of
+from alidade.pipelines.applications.follow.sources import Replay, source_of
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.terminal import console
 
@@ -31,6 +31,7 @@ def follow(
     on_stderr: bool = False,
     page_at: tuple[str, int] | None = None,
     origins: Sequence[str] = (),
+    speed: float | None = None,
 ) -> Calibration:
     """Follow a recording until it ends, shown in the terminal, with a port served on it, and on a page.
 
@@ -45,6 +46,7 @@ def follow(
         on_stderr: show it there, for standard output is a program's.
         page_at: host and port of the page; None: there is none.
         origins: pages of other sites that may read what the server serves.
+        speed: replay a finished recording at so many times its own; None: follow one that is being made.
     """
     with ExitStack() as stack:
         server = None if port is None else stack.enter_context(LiveServer(port, origins))
@@ -75,7 +77,8 @@ def follow(
             if page in watching and page is not None:
                 page.say(sentence)
 
-        source = stack.enter_context(source_of(what, record, say))
+        made = source_of(what, record, say) if speed is None else Replay(Path(what), speed, record, say)
+        source = stack.enter_context(made)
         calibration = Follower(source, settings, show, say, stopped.is_set).follow()
         if page in watching and page is not None:
             page.end(calibration)

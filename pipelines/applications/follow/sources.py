@@ -20,8 +20,11 @@ from alidade.pipelines.applications.follow.spool import RETRY_PERIOD_S, Spool
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.mcap_records import MAGIC
 from alidade.pipelines.recording.opening import Where, is_closed, parts_in
+from alidade.pipelines.recording.recording import open_recording
 
 _PIECE = 1 << 16
+# A replay writes so often, s, and no less than so many bytes.
+_REPLAY_PERIOD_S, _REPLAY_PIECE = 0.05, 1 << 10
 # Names of the files in which a stream is written down.
 _PART = re.compile(r"live_(\d+)\.mcap")
 
@@ -148,6 +151,40 @@ class StandardInput(Stream):
             while out.is_full and not self._over.is_set():  # whoever writes into the pipe waits
                 time.sleep(RETRY_PERIOD_S)
                 out.flush()
+
+
+class Replay(Stream):
+    """A finished MCAP file, written anew as fast as it was recorded, so that it grows as a live one does.
+
+    Args:
+        path: of the file.
+        speed: how many times as fast.
+        folder: where it is written; None: a temporary one.
+        say: is told what goes wrong.
+
+    Raises:
+        InputError: it is no MCAP file, or the speed is not above zero.
+    """
+
+    def __init__(self, path: Path, speed: float, folder: Path | None, say: Callable[[str], None]) -> None:
+        if not speed > 0.0:
+            raise InputError(f"--speed {speed:g}: has to be above 0")
+        self._seconds = open_recording(path).duration_s / speed
+        self._content = path.read_bytes() if path.is_file() else b""
+        if not self._content.startswith(MAGIC):
+            raise InputError(f"--replay {path}: is no MCAP file; `follow` takes folders while they are being written")
+        super().__init__(path.name, folder, say)
+
+    def _write(self, out: Spool) -> None:
+        start, content = time.monotonic(), memoryview(self._content)
+        pieces = max(1, min(-(-len(content) // _REPLAY_PIECE), round(self._seconds / _REPLAY_PERIOD_S)))
+        size = -(-len(content) // pieces)
+        for i in range(pieces):
+            due = start + self._seconds * (i + 1) / pieces
+            if self._over.wait(max(0.0, due - time.monotonic())):
+                return
+            out.write(content[i * size : (i + 1) * size])
+            out.flush()
 
 
 def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] = print) -> Source:

@@ -8,6 +8,7 @@ import os
 import re
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -20,7 +21,7 @@ from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import LiveServer
-from alidade.pipelines.applications.follow.sources import Source, StandardInput, source_of
+from alidade.pipelines.applications.follow.sources import Replay, Source, StandardInput, source_of
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Quantity
@@ -269,3 +270,25 @@ def test_the_server_serves_many_and_outlives_who_goes() -> None:
             assert json.loads(status[13:])["time_s"] == 3.0
         with pytest.raises(InputError, match="no server can be started there"):
             LiveServer(int(server.url.rpartition(":")[2]))
+
+
+def test_a_finished_recording_is_replayed_as_if_it_were_made_now(whole: Path, tmp_path: Path) -> None:
+    """Written anew at the pace at which it was recorded; the result is that of the file."""
+    seen: list[float] = []
+    started = time.monotonic()
+    with Replay(whole, 8.0, tmp_path / "kept", lambda _: None) as source:
+        settings = Settings(patience=10.0)
+        calibration = Follower(source, settings, lambda view: seen.append(view.time), print, lambda: False).follow()
+    assert 12.0 / 8.0 <= time.monotonic() - started < 30.0
+    (kept,) = (tmp_path / "kept").iterdir()
+    assert kept.read_bytes() == whole.read_bytes()
+    (once,) = calibrate(whole, ["incremental"])
+    np.testing.assert_allclose(calibration.estimate.values, once.estimate.values, atol=1e-3)
+    assert len(seen) > 2
+
+
+def test_what_cannot_be_replayed_is_refused_in_one_line(whole: Path, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("t,x\n0,1\n1,2\n")
+    for path, speed, message in ((whole, 0.0, "--speed 0"), (tmp_path / "none.mcap", 1.0, "none.mcap")):
+        with pytest.raises(InputError, match=message):
+            Replay(path, speed, None, print)
