@@ -262,11 +262,11 @@ class ChangesResult(_Record):
 class UseResult(_Record):
     """A use of the calibration with the 95 % bound of its error."""
 
-    name: str  # heading, rate, force, pointing, stabilisation, attitude, outage, navigation
+    name: str  # such as heading
     unit: str  # of the numbers
     before: float  # 95 % bound without calibration
     after95: float  # 95 % bound with it
-    required: float | None  # the same if parameters only just met their requirements
+    required: float | None  # at the requirements
     at: str  # operating point, in words
 
 
