@@ -63,6 +63,7 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     for key in config.topics.keys() - known:
         where = str(override) if _has(more, ("topics", key)) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
+    config = config.of(str(override) if override is not None else f"attachment {ATTACHMENT}")
     return config if belief is None else config.believing(belief)
 
 

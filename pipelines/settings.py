@@ -314,6 +314,18 @@ class Config(Section):
     altitude_m: float | None = None  # above the ellipsoid
     date: Date | None = None  # of the field model; default: the stamps
     _belief: Belief | None = PrivateAttr(None)
+    _origin: str = PrivateAttr("")
+
+    @property
+    def origin(self) -> str:
+        """The file that the keys are from, or what stands in for one; empty where nobody says."""
+        return self._origin
+
+    def of(self, origin: str) -> Config:
+        """The same config, of a file."""
+        out = self.model_copy()
+        out._origin = origin
+        return out
 
     def prior(self, name: str, default: float | None) -> float | None:
         """Sigma of a parameter's prior where the config gives one, else the default."""

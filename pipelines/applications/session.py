@@ -217,10 +217,14 @@ class Session:
         try:
             data = chosen.read(recording, config)
         except InputError as error:
-            if not lacking(chosen.requirements, recording, config):
+            missing = lacking(chosen.requirements, recording, config)
+            if not missing:
                 raise
             nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))
-            raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
+            said = str(error)
+            if said.startswith("topic "):  # a fault of a topic matters less than others that are not there
+                said = f"{recording.path}: method {chosen.name} lacks {'; '.join(missing)}"
+            raise InputError(f"{said}{f'; nearest is {nearest}' if nearest else ''}") from error
         noted = (COPIED, OVERTAKEN, HELD, "not believed (kept)")
         many = [f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted)]
         for sentence in (*many, *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
@@ -260,8 +264,12 @@ class Session:
     @cached_property
     def _problem(self) -> Problem:
         _check_sheets(self.method, self.config)
-        with progress.doing("preparing the graph"):
-            return self.method.graph(self.data, self.config).near(self.near)
+        try:
+            with progress.doing("preparing the graph"):
+                return self.method.graph(self.data, self.config).near(self.near)
+        except InputError as error:
+            unknown = str(error).startswith("unknown key") and self.config.origin
+            raise InputError(f"{self.config.origin}: {error}") if unknown else error from None
 
     @cached_property
     def facts(self) -> SessionFacts:

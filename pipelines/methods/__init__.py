@@ -149,6 +149,11 @@ class Method:
         from alidade.pipelines.simulation.scenario import load_scenario, shipped
 
         simulator, default = self.require_simulator(), self.default_scenario(images)
+        of = (scenario or "").partition("_")[0]
+        if of != self.name and of in _BUILT_IN and scenario in scenarios()[of]:
+            raise InputError(
+                f"scenario {scenario} is of method {of}; {self.name} has {', '.join(scenarios()[self.name])}"
+            )
         if scenario is None and default not in shipped(simulator.folder):
             return simulator.scenario()
         return load_scenario(simulator.scenario, scenario or default, simulator.folder)

@@ -28,7 +28,7 @@ def exported(saved: SavedCalibration, form: str) -> str:
     if not formats:
         raise InputError(f"this calibration of {saved.method} holds nothing that another program could be given")
     if form not in formats:
-        raise InputError(f"unknown format {form}; there are {', '.join(formats)}")
+        raise InputError(f"a calibration of {saved.method} has no format {form}; it has {', '.join(formats)}")
     return formats[form](saved)
 
 

@@ -342,3 +342,24 @@ main()
     assert run.returncode == 0
     assert run.stdout.startswith("Usage: alidade")
     assert run.stderr.strip() == "[]"
+
+
+def test_errors_name_what_is_missing_where_and_what_there_is(alidade: Command, session: Path, tmp_path: Path) -> None:
+    """A recording without a gimbal once had a dead sensor, and a key of `require` no file."""
+    from alidade.pipelines.methods import method
+
+    (tmp_path / "c.yaml").write_text("require: {helmet_mount_q: 1.0e-3}")
+    run = alidade("calibrate", session, "--config", tmp_path / "c.yaml", "--out", tmp_path / "out")
+    assert run.code == 2
+    assert "c.yaml: unknown key require.helmet_mount_q; the nearest known key is helmet_mount_" in run.err
+    run = alidade("simulate", "tumble", "--scenario", "los_nominal", "--out", tmp_path / "x.mcap")
+    assert run.code == 2
+    assert "scenario los_nominal is of method los; tumble has tumble_imu, " in run.err
+    method("tumble").write(tmp_path / "t.mcap", method("tumble").simulate(method("tumble").settings("tumble_imu"), 1))
+    run = alidade("calibrate", tmp_path / "t.mcap", "--method", "los", "--out", tmp_path / "out")
+    assert run.code == 2
+    assert "t.mcap: method los lacks /gimbal/joint_states (sensor_msgs/msg/JointState)" in run.err
+    assert "dead" not in run.err
+    run = alidade("follow")
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert "--replay" in run.err

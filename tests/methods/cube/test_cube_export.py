@@ -201,7 +201,9 @@ def test_a_magnetometer_without_a_known_strength_keeps_its_scale() -> None:
 
 def test_wrong_format_and_method() -> None:
     saved, _, _ = _fits(_diagonal())
-    with pytest.raises(InputError, match="unknown format yaml; there are px4, ardupilot, ros2, kalibr"):
+    with pytest.raises(
+        InputError, match="a calibration of cube has no format yaml; it has px4, ardupilot, ros2, kalibr"
+    ):
         exported(saved, "yaml")
     with pytest.raises(InputError, match="this calibration of head holds nothing"):
         exported(_calibration({"accel": np.eye(3)}, {"accel": np.zeros(3)}, "head"), "px4")
