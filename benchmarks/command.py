@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from benchmarks.batch import native_los, solve_native
 from benchmarks.measure import Cost, Ratio, costs
@@ -51,7 +51,7 @@ def run() -> Iterator[Ratio]:
     data, truth = simulate_los(MINUTES, 0)
     with tempfile.TemporaryDirectory() as folder:
         session = Path(folder) / "session.mcap"
-        write_los(session, data, truth, los_config(MINUTES))
+        method("los").write_data(session, data, truth, los_config(MINUTES))
         command = (*_ALIDADE, "calibrate", str(session), "--out", str(Path(folder) / "out"))
         a = process(*command, rounds=2)
         two, one = (process(*command, "--jobs", jobs, clock=time.perf_counter) for jobs in ("2", "1"))

@@ -22,7 +22,7 @@ from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.sources import Source
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from benchmarks.measure import Ratio, resident_mib
@@ -75,7 +75,7 @@ def _followed(seconds: float, images_hz: float, rate_hz: float, speed: float) ->
         scenario = LosScenario(
             duration_s=seconds, carrier=_BRISK, image_rate_hz=images_hz, gyro_rate_hz=rate_hz, gimbal_rate_hz=rate_hz
         )
-        write_los(whole, *simulate_los(scenario, 2), los_config(scenario))
+        method("los").write_data(whole, *simulate_los(scenario, 2), los_config(scenario))
         config.write_text(los_config(scenario))
         spawn = multiprocessing.get_context("spawn")
         began: Synchronized[float] = spawn.Value("d", 0.0)

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes
-from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import carried, helmet_gyro
 
 Array = NDArray[np.float64]
@@ -222,7 +223,7 @@ def main() -> None:
             print(f"gyro bias less mean rate at rest: {np.rad2deg(found.bias_error).round(3).tolist()} deg/s")
             print(f"time offset: {1e3 * found.time_offset:.2f} ms")
             return
-        write_head(options.out, to_session(read_trial(options.trial), options.seed), config_yaml=CONFIG)
+        method("head").write_data(options.out, to_session(read_trial(options.trial), options.seed), config_yaml=CONFIG)
     except InputError as error:
         parser.error(str(error))
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.recording import CubeData, write_cube
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.cube.recording import CubeData
 
 Array = NDArray[np.float64]
 
@@ -110,7 +111,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the session to write (.mcap)")
     options = parser.parse_args()
     try:
-        write_cube(options.out, to_session(options.folder), config_yaml=CONFIG)
+        method("cube").write_data(options.out, to_session(options.folder), config_yaml=CONFIG)
     except InputError as error:
         parser.error(str(error))
 

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.indexer.recording import IndexerData, write_indexer
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.indexer.recording import IndexerData
 
 Array = NDArray[np.float64]
 
@@ -93,7 +94,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the session to write (.mcap)")
     options = parser.parse_args()
     try:
-        write_indexer(options.out, to_session(read_parts(options.session)), config_yaml=CONFIG)
+        method("indexer").write_data(options.out, to_session(read_parts(options.session)), config_yaml=CONFIG)
     except InputError as error:
         parser.error(str(error))
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.noises import NoiseSpec
+    from alidade.pipelines.recording import series
     from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.result import Calibration
@@ -64,8 +65,7 @@ class Method:
         requirements: what a recording must contain.
         read: recording, config -> data. Raises InputError when the recording cannot be used.
         check: raises InputError where the sensors of arrays contradict one another, as `read` does of a recording.
-        write_data: file, data, truth, config (YAML), pictures -> recording; pictures replace what they show. Raises
-            InputError.
+        to_topics: simulated data, pictures -> series by topic name, to be written; pictures replace what they show.
         problem: data, config -> factor graph. Raises InputError when the data do not suffice, or when the config names
             an unknown parameter.
         faults: what can be wrong with the data; tried when residuals do not fit.
@@ -85,7 +85,7 @@ class Method:
     topics: tuple[Topic, ...]
     requirements: tuple[Need, ...]
     read: Callable[[Recording, Config], Any]
-    write_data: Callable[..., None]
+    to_topics: Callable[[Any, Any], dict[str, series.Topic]]
     problem: Callable[[Any, Config], Problem]
     parameters: tuple[ParameterSpec, ...]
     faults: FaultModel
@@ -139,6 +139,22 @@ class Method:
     def write(self, path: Path, simulated: Simulated) -> None:
         """Write simulated data as a recording with truth and config attached. Raises InputError."""
         self.write_data(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
+
+    def write_data(
+        self,
+        path: Path | str,
+        data: Any,
+        truth: Mapping[str, float] | None = None,
+        config_yaml: str | None = None,
+        pictures: Any = None,
+    ) -> None:
+        """Write data as a recording, stamps rounded to ns; `read` gives them back where the first sample is at t = 0.
+
+        Raises InputError when the file cannot be written.
+        """
+        from alidade.pipelines.recording.mcap_writer import attached, write_session
+
+        write_session(path, self.to_topics(data, pictures), attached(truth, config_yaml))
 
     def settings(self, scenario: str | None = None, images: bool = False) -> Any:
         """The simulator's settings of a scenario, by name or file; None: the default scenario, or the

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from alidade.factors.earth import magnetic_field
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import ParameterSpec
+from alidade.pipelines.recording import series
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import Topic, wanted
 from alidade.pipelines.settings import Config, first_given
@@ -44,6 +45,16 @@ def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float 
     latitude, longitude, height = (b if a is None else a for a, b in zip(given, found, strict=True))
     angles = [None if angle is None else float(np.deg2rad(angle)) for angle in (latitude, longitude)]
     return angles[0], angles[1], first_given(height, 0.0)
+
+
+def place_topics(
+    fix: Topic, epoch_ns: int, latitude: float | None, longitude: float | None, height: float, frame_id: str = "gnss"
+) -> dict[str, series.Topic]:
+    """The fix to be written, of a place in rad and m; none where it is unknown."""
+    if latitude is None or longitude is None:
+        return {}
+    at = [np.array([each]) for each in (np.rad2deg(latitude), np.rad2deg(longitude), height)]
+    return {fix.name: series.FixSeries(np.array([epoch_ns]), *at, frame_id=frame_id)}
 
 
 def _median(recording: Recording, topic: str) -> tuple[float, float, float]:

@@ -232,6 +232,11 @@ class CameraInfo:
     p: Array
     frame_id: str = ""
 
+    @classmethod
+    def of(cls, t_ns: int, size: tuple[int, int], model: str, d: Array, K: Array) -> CameraInfo:
+        """Of an unrectified camera of `size` (width, height), px."""
+        return cls(t_ns, *size, model, d, K, np.eye(3), np.pad(K, ((0, 0), (0, 1))), frame_id="camera")
+
 
 @dataclass(frozen=True, eq=False)
 class ImageSeries:
@@ -244,6 +249,10 @@ class ImageSeries:
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+
+# Of one camera, as simulators draw them.
+Pictures = tuple[CameraInfo, ImageSeries]
 
 
 Topic = Series | JointSeries | DetectionSeries | CameraInfo | ImageSeries

@@ -227,14 +227,18 @@ def imu_series(
     gyro: Array,
     accel: Array | None = None,
     density: float | None = None,
+    accel_density: float | None = None,
     frame_id: str = "imu",
 ) -> ImuSeries:
-    """The series of an IMU, to be written: samples at times t (N,), s, that state a noise density, rad/s/sqrt(Hz)."""
-    variance = 0.0 if density is None else density**2 / float(np.median(np.diff(t)))
-    t_ns = checks.nanoseconds(t, epoch_ns)
-    return ImuSeries(
-        t_ns, gyro, np.zeros(3) if accel is None else accel, gyro_cov=variance * np.eye(3), frame_id=frame_id
-    )
+    """The series of an IMU, to be written: samples at times t (N,), s, that state noise densities, SI per sqrt(Hz)."""
+    t_ns, force = checks.nanoseconds(t, epoch_ns), np.zeros(3) if accel is None else accel
+    gyro_cov, accel_cov = white_covariance(t, density), white_covariance(t, accel_density)
+    return ImuSeries(t_ns, gyro, force, gyro_cov=gyro_cov, accel_cov=accel_cov, frame_id=frame_id)
+
+
+def white_covariance(t: Array, density: float | None) -> Array:
+    """Covariance (3, 3) of samples at times t (N,), s, with white noise of a density; zeros where it is unknown."""
+    return (0.0 if density is None else density**2 / float(np.median(np.diff(t)))) * np.eye(3)
 
 
 def _rows(found: AnySeries, rows: NDArray[np.intp]) -> AnySeries:

@@ -58,7 +58,7 @@ def test_everything_that_a_method_defers_can_be_imported(name: str) -> None:
         for field in dataclasses.fields(getattr(group, "_target", group)):
             value = getattr(group, field.name)
             assert callable(value._target) if isinstance(value, _Deferred) else True, field.name
-    for function in (found.problem, found.published, found.read, found.write_data):
+    for function in (found.problem, found.published, found.read, found.to_topics):
         assert callable(getattr(function, "_target", function))
     assert found.settings() is not None
 

@@ -15,7 +15,8 @@ import pytest
 
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
-from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.simulation.scenario import load_scenario
 from tests.support.builders import IDEAL
@@ -48,7 +49,7 @@ def brief(scenario: HeadScenario, tmp_path_factory: pytest.TempPathFactory) -> P
 
 def _written(path: Path, scenario: HeadScenario) -> Path:
     simulated, truth = simulate_head(scenario, 1)
-    write_head(path, simulated, truth, head_config(scenario))
+    method("head").write_data(path, simulated, truth, head_config(scenario))
     return path
 
 
@@ -129,7 +130,7 @@ def test_weak_motion_exits_with_3_and_names_the_direction(alidade: Command, tmp_
     config = head_config(still).replace(
         "priors: {}", "priors: {camera_mount_x: 0.1, camera_mount_y: 0.1, camera_mount_z: 0.1}"
     )
-    write_head(tmp_path / "s.mcap", simulated, truth, config)
+    method("head").write_data(tmp_path / "s.mcap", simulated, truth, config)
     run = alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
     assert run.code == 3
     assert "camera_mount" in run.out
@@ -178,7 +179,7 @@ def _refused(run: Run, out: Path, words: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_bad_data_is_one_line(alidade: Command, data: HeadData, tmp_path: Path, damage: str) -> None:
     change, words = DAMAGE[damage]
-    write_head(tmp_path / "s.mcap", change(data))
+    method("head").write_data(tmp_path / "s.mcap", change(data))
     _refused(alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out"), tmp_path / "out", words)
 
 

@@ -12,7 +12,7 @@ from alidade.pipelines.applications.joint import calibrate_together
 from alidade.pipelines.applications.session import OpenOptions, Session
 from alidade.pipelines.applications.validate import validate
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.write import write_results
 
@@ -28,7 +28,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
         data: HeadData = simulated.data
         paths.append(folder / f"r{seed}.mcap")
         config = "method: head\npriors: {helmet_mount_x: null, helmet_mount_y: null, helmet_mount_z: null}\n"
-        write_head(paths[-1], data, None, config)
+        method("head").write_data(paths[-1], data, None, config)
     return paths
 
 

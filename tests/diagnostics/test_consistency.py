@@ -29,7 +29,6 @@ from alidade.pipelines.methods import Method, method
 from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.methods.head.recording import write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
@@ -366,7 +365,7 @@ def test_a_flipped_axis_ends_inconsistent_with_that_first(tmp_path: Path) -> Non
     _, data, config = head_of(6.0, sensors=None)
     session, out = tmp_path / "flipped.mcap", tmp_path / "out"
     text = config.model_dump_json(exclude_defaults=True)
-    write_head(session, replace(data, head_gyro=data.head_gyro * np.array([1.0, -1.0, 1.0])), None, text)
+    method("head").write_data(session, replace(data, head_gyro=data.head_gyro * np.array([1.0, -1.0, 1.0])), None, text)
     ended = CliRunner().invoke(app, ["calibrate", str(session), "--out", str(out)])
     assert ended.exit_code == 4
     saved = json.loads((out / "result.json").read_text())

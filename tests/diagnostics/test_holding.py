@@ -16,7 +16,6 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.device_changes import LEVEL, CalibrationCheck, check_calibration
 from alidade.pipelines.estimation.problem import Quantity, Told
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.indexer.recording import write_indexer
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
@@ -29,7 +28,7 @@ MOVED_ARCSEC = 0.5
 
 
 def written(path: Path, simulated: Simulated) -> Path:
-    write_indexer(path, simulated.data, simulated.truth, simulated.config)
+    method("indexer").write_data(path, simulated.data, simulated.truth, simulated.config)
     return path
 
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.diagnostics.goodness_of_fit import solver_difference
 from alidade.pipelines.estimation.problem import Estimate
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from tests.support.builders import IDEAL
 
@@ -37,7 +37,7 @@ def test_the_largest_difference_is_told() -> None:
 @pytest.mark.parametrize("option", [[], ["--no-check"]])
 def test_the_result_has_it_unless_it_is_not_wanted(option: list[str], tmp_path: Path) -> None:
     data, truth = simulate_los(SCENARIO, 1)
-    write_los(tmp_path / "s.mcap", data, truth, los_config(SCENARIO))
+    method("los").write_data(tmp_path / "s.mcap", data, truth, los_config(SCENARIO))
     command = ["calibrate", str(tmp_path / "s.mcap"), "--solver", "incremental", "--out", str(tmp_path), *option]
     assert CliRunner().invoke(app, command).exit_code in (0, 3)
     found = json.loads((tmp_path / "result.json").read_text())["self_check"]

@@ -18,8 +18,9 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import ParameterSpec, pull, quantities
 from alidade.pipelines.estimation.problem import Estimate, Quantity
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
-from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
+from alidade.pipelines.methods.head.recording import HeadData, read_head
 from alidade.pipelines.methods.head.report import findings
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.recording.recording import open_recording
@@ -140,7 +141,7 @@ def test_ideal_sensors_leave_what_is_calibrated_alone_and_go_wrong() -> None:
 def test_without_acceleration_g_sensitivity_is_fixed_with_a_finding(tmp_path: Path) -> None:
     data, _ = _recording()
     config = load_config(head_config(_scenario()).encode())
-    write_head(tmp_path / "s.mcap", replace(data, head_force=None))
+    method("head").write_data(tmp_path / "s.mcap", replace(data, head_force=None))
     read = read_head(open_recording(tmp_path / "s.mcap"), config)
     assert read.head_force is None
     assert not any(q.name.startswith("gyro_g") for q in problem(read, config).quantities)
@@ -152,7 +153,7 @@ def test_without_acceleration_g_sensitivity_is_fixed_with_a_finding(tmp_path: Pa
 
 def test_result_and_report_tell_assumptions_apart(alidade: Command, tmp_path: Path) -> None:
     data, truth = _recording()
-    write_head(tmp_path / "s.mcap", data, truth, head_config(_scenario()))
+    method("head").write_data(tmp_path / "s.mcap", data, truth, head_config(_scenario()))
     alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
     parameters = {p["name"]: p for p in json.loads((tmp_path / "out" / "result.json").read_text())["parameters"]}
     scale, mount = parameters["gyro_scale_x"], parameters["helmet_mount_x"]

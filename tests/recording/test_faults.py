@@ -16,10 +16,10 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head import model as head
-from alidade.pipelines.methods.head.recording import read_head, write_head
+from alidade.pipelines.methods.head.recording import read_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los import model as los
-from alidade.pipelines.methods.los.recording import read_los, write_los
+from alidade.pipelines.methods.los.recording import read_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledGyro
 from alidade.pipelines.recording.faults import drop_faults
@@ -131,8 +131,8 @@ def cases() -> dict[str, Case]:
     los_data, los_truth = simulate_los(LOS, 3)
     los_case = replace(los_data, force=None), los_truth, los_config(LOS)
     return {
-        "los": Case(*los_case, ("gyro_t", "gyro"), write_los, read_los, los.problem),
-        "head": Case(*head_case, ("head_t", "head_gyro"), write_head, read_head, head.problem),
+        "los": Case(*los_case, ("gyro_t", "gyro"), method("los").write_data, read_los, los.problem),
+        "head": Case(*head_case, ("head_t", "head_gyro"), method("head").write_data, read_head, head.problem),
     }
 
 

@@ -13,6 +13,7 @@ import alidade
 from alidade.factors import preintegration
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los import recording as los
 from alidade.pipelines.recording.checks import take_rows
 from alidade.pipelines.recording.plausibility import density
@@ -78,7 +79,7 @@ def test_memory_of_a_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     for seconds in lengths:
         path = tmp_path / f"{seconds:g}.mcap"
         simulated = alidade.simulate("los", {"duration_s": seconds, "gyro_rate_hz": 1000.0})
-        los.write_los(path, simulated.data, config_yaml=simulated.config)
+        method("los").write_data(path, simulated.data, config_yaml=simulated.config)
         del simulated
         used.append(_used(path))
     each = np.diff(used, axis=0)[0] / (1000.0 * np.diff(lengths))

@@ -12,7 +12,8 @@ import pytest
 from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head.recording import HeadData, read_head
 from alidade.pipelines.recording import checks, series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import open_recording
@@ -48,7 +49,7 @@ def read(path: Path) -> HeadData:
 @pytest.mark.parametrize("options", [{}, {"platform": False}, {"cov": False, "truth": False}])
 def test_written_and_read_back_is_identical(options: dict[str, bool], tmp_path: Path) -> None:
     data = made(**options)
-    write_head(tmp_path / "h.mcap", data, {"time_offset": 0.004}, "method: head\n")
+    method("head").write_data(tmp_path / "h.mcap", data, {"time_offset": 0.004}, "method: head\n")
     found = read(tmp_path / "h.mcap")
     for part in dataclasses.fields(HeadData):
         value = getattr(data, part.name)

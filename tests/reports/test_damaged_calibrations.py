@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording import mcap_writer
 from alidade.pipelines.reports.result_json import truth_errors
@@ -43,7 +43,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     data, truth = simulate_los(LOS, 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mcap_writer, "CHUNK_BYTES", 70_000)
-        write_los(path, data, truth, los_config(LOS))
+        method("los").write_data(path, data, truth, los_config(LOS))
     return path.read_bytes()
 
 

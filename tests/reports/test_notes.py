@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from alidade.pipelines.applications.session import calibrate
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from tests.support.builders import make_calibration
 
@@ -18,7 +18,7 @@ def test_a_gyro_turned_by_90_degrees_is_found_and_told(tmp_path: Path) -> None:
     scenario = LosScenario(duration_s=15.0, image_rate_hz=20.0, gyro_rate_hz=200.0)
     data, _ = simulate_los(scenario, 1)
     turned = np.stack([data.gyro[:, 1], -data.gyro[:, 0], data.gyro[:, 2]], axis=1)
-    write_los(tmp_path / "s.mcap", replace(data, gyro=turned), None, los_config(scenario))
+    method("los").write_data(tmp_path / "s.mcap", replace(data, gyro=turned), None, los_config(scenario))
     (found,) = calibrate(tmp_path / "s.mcap", ["batch"])
     far = [f.evidence for f in found.findings if f.kind == "prior_conflict" and f.evidence["parameter"] == "delta_z"]
     assert [round(each["z"], 1) for each in far] in ([15.6], [-15.6])

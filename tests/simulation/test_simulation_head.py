@@ -12,7 +12,8 @@ from alidade.factors import so3
 from alidade.factors.earth import earth_rate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.head.recording import read_head, write_head
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head.recording import read_head
 from alidade.pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
@@ -172,7 +173,7 @@ def test_written_and_read_back_is_the_same_session(name: str, tmp_path: Path) ->
     scenario = load_scenario(HeadScenario, name)
     data, truth = simulate_head(scenario, seed=2)
     path = tmp_path / "s.mcap"
-    write_head(path, data, truth, head_config(scenario))
+    method("head").write_data(path, data, truth, head_config(scenario))
     recording = open_recording(path)
     config = load_config(recording.attachment("alidade.yaml"))
     back = read_head(recording, config)

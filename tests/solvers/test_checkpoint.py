@@ -16,8 +16,9 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.model import problem
-from alidade.pipelines.methods.los.recording import read_los, write_los
+from alidade.pipelines.methods.los.recording import read_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
@@ -75,7 +76,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
     folder = tmp_path_factory.mktemp("checkpoint")
     session, checkpoint = folder / "s.mcap", folder / "s.checkpoint"
     data, truth = simulate_los(SCENARIO, 5)
-    write_los(session, data, truth, los_config(SCENARIO))
+    method("los").write_data(session, data, truth, los_config(SCENARIO))
     recording = open_recording(session)
     config = load_config(recording.attachment("alidade.yaml"))
     made = problem(read_los(recording, config), config)

@@ -14,13 +14,13 @@ from alidade.factors import so3
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Problem
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube import model as cube
 from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.indexer import model as indexer
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los import model as los
-from alidade.pipelines.methods.los.recording import write_los
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
@@ -139,7 +139,7 @@ def test_gross_tag_corners_cost_no_more_than_knowing_them_would() -> None:
 
 def test_an_estimate_that_is_no_solution_is_never_calibrated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     data, truth = simulate_los(LOS, 1)
-    write_los(tmp_path / "s.mcap", data, truth, los_config(LOS))
+    method("los").write_data(tmp_path / "s.mcap", data, truth, los_config(LOS))
     # What gtsam's own optimizers return silently as if it was a solution.
     monkeypatch.setattr(Group, "cost", lambda *_: np.nan)
     (found,) = calibrate(tmp_path / "s.mcap", ["batch"])

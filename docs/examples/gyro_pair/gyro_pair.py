@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -37,7 +36,6 @@ from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.noises import NoiseSpec
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import check_overlap
-from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.recording.streams import StreamReader, imu_series
@@ -94,11 +92,11 @@ def read(recording: Recording, config: Config) -> GyroPairData:
     return GyroPairData(reader.epoch_ns, a.t, a.series.gyro, b.t, b.series.gyro, *densities, reader.dropped)
 
 
-def write(path: Path, data: GyroPairData, truth: Mapping[str, float], config: str, _pictures: None = None) -> None:
-    """Write simulated data with truth and config attached; stamps are rounded to ns."""
+def to_topics(data: GyroPairData, _pictures: None = None) -> dict[str, Any]:
+    """Series by topic, to be written."""
     a = imu_series(data.epoch_ns, data.a_t, data.a_gyro, density=data.a_density, frame_id="a")
     b = imu_series(data.epoch_ns, data.b_t, data.b_gyro, density=data.b_density, frame_id="b")
-    write_session(path, {GYRO_A.name: a, GYRO_B.name: b}, attached(truth, config))
+    return {GYRO_A.name: a, GYRO_B.name: b}
 
 
 @dataclass(frozen=True)
@@ -329,7 +327,7 @@ METHOD = Method(
     topics=(GYRO_A, GYRO_B),
     requirements=(((GYRO_A,),), ((GYRO_B,),)),
     read=read,
-    write_data=write,
+    to_topics=to_topics,
     parameters=PARAMETERS,
     noise=(B_DENSITY,),
     problem=problem,

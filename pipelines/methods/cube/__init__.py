@@ -4,7 +4,7 @@ from pathlib import Path
 
 from alidade.pipelines.methods import Method, deferred
 from alidade.pipelines.methods.cube.parameters import PARAMETERS
-from alidade.pipelines.methods.cube.recording import REQUIREMENTS, TOPICS, CubeConfig, CubeData, read_cube, write_cube
+from alidade.pipelines.methods.cube.recording import REQUIREMENTS, TOPICS, CubeConfig, CubeData, cube_topics, read_cube
 
 METHOD = Method(
     name="cube",
@@ -14,7 +14,7 @@ METHOD = Method(
     config_section=CubeConfig,
     requirements=REQUIREMENTS,
     read=read_cube,
-    write_data=write_cube,
+    to_topics=cube_topics,
     parameters=PARAMETERS,
     problem=deferred("alidade.pipelines.methods.cube.model:problem"),
     published=deferred("alidade.pipelines.methods.cube.published:published_estimate"),

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Self, TypeVar, cast
 
 import numpy as np
@@ -14,19 +13,19 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from alidade.pipelines.estimation.noise import Noise
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.noise import stated
-from alidade.pipelines.methods.place import field_at, read_place
+from alidade.pipelines.methods.place import field_at, place_topics, read_place
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import (
     SLOWEST_GYRO_S,
     check_overlap,
     nanoseconds,
 )
-from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
-from alidade.pipelines.recording.streams import StreamReader, Temperature
+from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series, white_covariance
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, TEMPERATURE, Need, Setting, Topic, wanted
 from alidade.pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
 from alidade.pipelines.vision.camera import Camera
@@ -320,75 +319,33 @@ def _reference(reader: StreamReader, topic: str) -> tuple[Array, Array, Array | 
     return t, wxyz, cov if known else None
 
 
-Array = NDArray[np.float64]
+def cube_topics(data: CubeData, pictures: Iterable[bytes] | None = None) -> dict[str, series.Topic]:
+    """Topics of a recording under their default names.
 
-
-def write_cube(
-    path: Path | str,
-    data: CubeData,
-    truth: Mapping[str, float] | None = None,
-    config_yaml: str | None = None,
-    pictures: Iterable[bytes] | None = None,
-) -> None:
-    """Write a cube session under the default topic names, with its truth and config as attachments.
-
-    Stamps are rounded to ns. With pictures (JPEG files, one for each frame of the sightings, in their order) these are
-    written instead of the detections. read_cube gives the same data back if the first sample is the one at t = 0.
+    Pictures, JPEG files, one for each frame of the sightings in their order, take the place of the detections.
     """
     epoch = data.epoch_ns
-
-    def covariance(t: Array, density: float | None) -> Array:
-        return (0.0 if density is None else density**2 / float(np.median(np.diff(t)))) * np.eye(3)
-
-    topics: dict[str, series.Topic] = {
-        IMU.name: series.ImuSeries(
-            nanoseconds(data.imu_t, epoch),
-            data.gyro,
-            data.accel,
-            gyro_cov=covariance(data.imu_t, data.gyro_density),
-            accel_cov=covariance(data.imu_t, data.accel_density),
-            frame_id="imu",
-        )
-    }
+    imu = imu_series(epoch, data.imu_t, data.gyro, data.accel, data.gyro_density, data.accel_density)
+    topics: dict[str, series.Topic] = {IMU.name: imu}
     if data.mag_t is not None and data.mag is not None:
-        cov = covariance(data.mag_t, data.mag_density)
-        topics[MAG.name] = series.MagneticSeries(
-            nanoseconds(data.mag_t, epoch), data.mag, field_cov=cov, frame_id="imu"
-        )
+        t_ns, cov = nanoseconds(data.mag_t, epoch), white_covariance(data.mag_t, data.mag_density)
+        topics[MAG.name] = series.MagneticSeries(t_ns, data.mag, field_cov=cov, frame_id="imu")
     if data.reference_t is not None and data.reference_wxyz is not None:
-        n = len(data.reference_t)
         topics[REFERENCE_IMU.name] = series.ImuSeries(
             nanoseconds(data.reference_t, epoch),
-            np.zeros((n, 3)),
+            np.zeros((len(data.reference_t), 3)),
             wxyz=data.reference_wxyz,
             wxyz_cov=np.zeros((3, 3)) if data.reference_cov is None else data.reference_cov,
             frame_id="reference",
         )
-    start = np.array([epoch])
-    if data.latitude is not None and data.longitude is not None:
-        latitude, longitude = np.rad2deg([data.latitude, data.longitude])
-        topics[REFERENCE_FIX.name] = series.FixSeries(
-            start, np.array([latitude]), np.array([longitude]), np.array([data.height]), frame_id="reference"
-        )
+    topics |= place_topics(REFERENCE_FIX, epoch, data.latitude, data.longitude, data.height, "reference")
     if data.camera is not None and data.sightings is not None:
-        topics[CAMERA_INFO.name] = _info_message(data.camera, epoch)
+        c = data.camera
+        topics[CAMERA_INFO.name] = series.CameraInfo.of(
+            epoch, (c.width, c.height), c.distortion_model, c.coefficients, c.K
+        )
         topics |= _pictures_or_tags(data.sightings, epoch, pictures)
-    topics |= temperature.topics(data.temperature, epoch)
-    write_session(path, topics, attached(truth, config_yaml))
-
-
-def _info_message(camera: Camera, epoch_ns: int) -> series.CameraInfo:
-    return series.CameraInfo(
-        epoch_ns,
-        camera.width,
-        camera.height,
-        camera.distortion_model,
-        camera.coefficients,
-        camera.K,
-        np.eye(3),
-        np.hstack([camera.K, np.zeros((3, 1))]),
-        frame_id="camera",
-    )
+    return topics | temperature.topics(data.temperature, epoch)
 
 
 def _pictures_or_tags(seen: Sightings, epoch_ns: int, pictures: Iterable[bytes] | None) -> dict[str, series.Topic]:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Parameter, Quantity
+from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
 from alidade.pipelines.methods.cube.recording import (
     TAG_DETECTIONS,
-    Array,
     CubeConfig,
     CubeData,
     RefinedCamera,

@@ -9,9 +9,9 @@ from alidade.pipelines.methods.head.recording import (
     TOPICS,
     HeadConfig,
     HeadData,
+    head_topics,
     proposed,
     read_head,
-    write_head,
 )
 
 METHOD = Method(
@@ -23,7 +23,7 @@ METHOD = Method(
     proposed=proposed,
     requirements=REQUIREMENTS,
     read=read_head,
-    write_data=write_head,
+    to_topics=head_topics,
     parameters=PARAMETERS,
     problem=deferred("alidade.pipelines.methods.head.model:problem"),
     published=deferred("alidade.pipelines.methods.head.published:published_estimate"),

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -21,7 +19,6 @@ from alidade.pipelines.recording.checks import (
     check_overlap,
     nanoseconds,
 )
-from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
@@ -137,19 +134,8 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     )
 
 
-def write_head(
-    path: Path | str,
-    data: HeadData,
-    truth: Mapping[str, float] | None = None,
-    config_yaml: str | None = None,
-    pictures: tuple[series.CameraInfo, series.ImageSeries] | None = None,
-) -> None:
-    """Write a head session under the default topic names, with its truth and config as attachments.
-
-    Given pictures, they take the place of vision's attitudes. Stamps are rounded to ns. read_head gives the same data
-    back if the first sample is the one at t = 0.
-    """
-
+def head_topics(data: HeadData, pictures: series.Pictures | None = None) -> dict[str, series.Topic]:
+    """Topics of a recording under their default names; pictures take the place of vision's attitudes."""
     epoch = data.epoch_ns
     topics: dict[str, series.Topic] = {
         HEAD_IMU.name: imu_series(epoch, data.head_t, data.head_gyro, data.head_force, data.gyro_density),
@@ -161,15 +147,14 @@ def write_head(
         cov = np.zeros((len(data.vision_t), 6, 6))
         if data.vision_cov is not None:
             cov[:, _ROTATION, _ROTATION] = data.vision_cov
-        t_ns = nanoseconds(data.vision_t, data.epoch_ns)
+        t_ns = nanoseconds(data.vision_t, epoch)
         topics[VISION_ATTITUDE.name] = series.PoseSeries(t_ns, data.vision_wxyz, cov=cov, frame_id="camera")
     else:
         topics[CAMERA_INFO.name], topics[IMAGE.name] = pictures
     if data.truth_t is not None and data.truth_wxyz is not None:
-        t_ns = nanoseconds(data.truth_t, data.epoch_ns)
+        t_ns = nanoseconds(data.truth_t, epoch)
         topics[TRUTH_ATTITUDE.name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")
-    topics |= temperature.topics(data.temperature, data.epoch_ns)
-    write_session(path, topics, attached(truth, config_yaml))
+    return topics | temperature.topics(data.temperature, epoch)
 
 
 def _from_pictures(reader: StreamReader, config: Config) -> tuple[Array, Array, Array]:

@@ -96,17 +96,8 @@ def draw(
     centre = np.array([settings.width - 1.0, settings.height - 1.0]) / 2.0 + _OFF_CENTRE
     K = np.array([[settings.focal_px, 0.0, centre[0]], [0.0, settings.focal_px, centre[1]], [0.0, 0.0, 1.0]])
     camera = Camera(settings.width, settings.height, K, "plumb_bob", np.array(settings.distortion))
-    info = series.CameraInfo(
-        t_ns=int(t_ns[0]),
-        width=camera.width,
-        height=camera.height,
-        distortion_model=camera.distortion_model,
-        d=camera.coefficients,
-        k=K,
-        r=np.eye(3),
-        p=np.pad(K, ((0, 0), (0, 1))),
-        frame_id="camera",
-    )
+    size = camera.width, camera.height
+    info = series.CameraInfo.of(int(t_ns[0]), size, camera.distortion_model, camera.coefficients, K)
     position = np.array(settings.position_m) + np.array(settings.sway_m) * np.sin(2.0 * np.pi * t[:, None] * _SWAY_HZ)
     files = _exposures(settings, camera, cRh, position, rng)
     return info, series.ImageSeries(t_ns, files, settings.format, "camera")

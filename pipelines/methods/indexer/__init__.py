@@ -9,8 +9,8 @@ from alidade.pipelines.methods.indexer.recording import (
     TOPICS,
     IndexerConfig,
     IndexerData,
+    indexer_topics,
     read_indexer,
-    write_indexer,
 )
 
 METHOD = Method(
@@ -21,7 +21,7 @@ METHOD = Method(
     config_section=IndexerConfig,
     requirements=REQUIREMENTS,
     read=read_indexer,
-    write_data=write_indexer,
+    to_topics=indexer_topics,
     parameters=PARAMETERS,
     problem=deferred("alidade.pipelines.methods.indexer.model:problem"),
     published=deferred("alidade.pipelines.methods.indexer.published:published_estimate"),

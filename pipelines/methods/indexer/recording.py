@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -18,7 +16,6 @@ from alidade.pipelines.recording.checks import (
     nanoseconds,
     unit_quaternions,
 )
-from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
@@ -106,32 +103,21 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
     )
 
 
-def write_indexer(
-    path: Path | str,
-    data: IndexerData,
-    truth: Mapping[str, float] | None = None,
-    config_yaml: str | None = None,
-    _pictures: None = None,
-) -> None:
-    """Write an indexer session under the default topic names, with its truth and config as attachments.
-
-    Stamps are rounded to ns. read_indexer gives the same data back if the first sample is the one at t = 0.
-    """
-    encoder_ns = nanoseconds(data.encoder_t, data.epoch_ns)
-    imu = imu_series(data.epoch_ns, data.gyro_t, data.gyro, density=data.gyro_density)
+def indexer_topics(data: IndexerData, _pictures: None = None) -> dict[str, series.Topic]:
+    """Topics of a recording under their default names."""
+    epoch = data.epoch_ns
+    imu = imu_series(epoch, data.gyro_t, data.gyro, density=data.gyro_density)
     if data.attitude is not None:
         imu = replace(imu, wxyz=data.attitude, wxyz_cov=np.zeros((3, 3)))
     angles = np.column_stack([data.outer, data.inner])
     topics: dict[str, series.Topic] = {
         IMU.name: imu,
-        INDEXER.name: series.JointSeries(encoder_ns, angles, JOINTS, frame_id="indexer"),
+        INDEXER.name: series.JointSeries(nanoseconds(data.encoder_t, epoch), angles, JOINTS, frame_id="indexer"),
     }
     if data.latitude_deg is not None:
-        start = np.array([data.epoch_ns])
-        fix = series.FixSeries(start, np.array([data.latitude_deg]), np.zeros(1), frame_id="gnss")
-        topics[FIX.name] = fix
-    topics |= temperature.topics(data.temperature, data.epoch_ns)
-    write_session(path, topics, attached(truth, config_yaml))
+        start = np.array([epoch])
+        topics[FIX.name] = series.FixSeries(start, np.array([data.latitude_deg]), np.zeros(1), frame_id="gnss")
+    return topics | temperature.topics(data.temperature, epoch)
 
 
 def _latitude(recording: Recording, config: Config) -> float | None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from alidade.pipelines.methods import Method, deferred
 from alidade.pipelines.methods.los.parameters import PARAMETERS
-from alidade.pipelines.methods.los.recording import REQUIREMENTS, TOPICS, LosData, check, read_los, write_los
+from alidade.pipelines.methods.los.recording import REQUIREMENTS, TOPICS, LosData, check, los_topics, read_los
 
 METHOD = Method(
     name="los",
@@ -15,7 +15,7 @@ METHOD = Method(
     requirements=REQUIREMENTS,
     read=read_los,
     check=partial(check, gyro="gyro", gimbal="gimbal"),
-    write_data=write_los,
+    to_topics=los_topics,
     parameters=PARAMETERS,
     problem=deferred("alidade.pipelines.methods.los.model:problem"),
     published=deferred("alidade.pipelines.methods.los.published:published_estimate"),

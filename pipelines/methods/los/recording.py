@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise, product
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -16,7 +15,6 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.faults import drop_frozen
-from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
@@ -149,33 +147,19 @@ def check(data: LosData, gyro: str, gimbal: str) -> None:
     check_motion(gyro, gimbal, data)
 
 
-def write_los(
-    path: Path | str,
-    data: LosData,
-    truth: Mapping[str, float] | None = None,
-    config_yaml: str | None = None,
-    pictures: tuple[series.CameraInfo, series.ImageSeries] | None = None,
-) -> None:
-    """Write a los session under the default topic names, with its truth and config as attachments.
-
-    Given pictures, they take the place of the LOS errors. Stamps are rounded to ns. read_los gives the same data back
-    if the first sample is the one at t = 0.
-    """
-
-    def ns(t: Array) -> NDArray[np.int64]:
-        return nanoseconds(t, data.epoch_ns)
-
+def los_topics(data: LosData, pictures: series.Pictures | None = None) -> dict[str, series.Topic]:
+    """Topics of a recording under their default names; pictures take the place of the LOS errors."""
+    epoch = data.epoch_ns
     topics: dict[str, series.Topic] = {
-        IMU.name: imu_series(data.epoch_ns, data.gyro_t, data.gyro, data.force, data.gyro_density),
-        GIMBAL.name: series.JointSeries(ns(data.gimbal_t), data.gimbal, JOINTS, frame_id="gimbal"),
+        IMU.name: imu_series(epoch, data.gyro_t, data.gyro, data.force, data.gyro_density),
+        GIMBAL.name: series.JointSeries(nanoseconds(data.gimbal_t, epoch), data.gimbal, JOINTS, frame_id="gimbal"),
     }
     if pictures is None:
-        vector = data.error[:, [0, 2, 1]]
-        topics[LOS_ERROR.name] = series.VectorSeries(ns(data.image_t), vector, frame_id="los")
+        t_ns = nanoseconds(data.image_t, epoch)
+        topics[LOS_ERROR.name] = series.VectorSeries(t_ns, data.error[:, [0, 2, 1]], frame_id="los")
     else:
         topics[CAMERA_INFO.name], topics[IMAGE.name] = pictures
-    topics |= temperature.topics(data.temperature, data.epoch_ns)
-    write_session(path, topics, attached(truth, config_yaml))
+    return topics | temperature.topics(data.temperature, epoch)
 
 
 def check_gimbal(topic: str, data: LosData) -> None:

@@ -312,17 +312,8 @@ def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraIn
     centre = 0.5 * camera.width - 0.5 + 3.4, 0.5 * camera.height - 0.5 - 2.7
     K = np.array([[camera.focal_px, 0.0, centre[0]], [0.0, camera.focal_px, centre[1]], [0.0, 0.0, 1.0]])
     t_ns = nanoseconds(stamps, EPOCH_NS)
-    info = series.CameraInfo(
-        int(t_ns[0]),
-        camera.width,
-        camera.height,
-        "plumb_bob",
-        np.array(camera.distortion),
-        K,
-        np.eye(3),
-        np.hstack([K, np.zeros((3, 1))]),
-        "camera",
-    )
+    size = camera.width, camera.height
+    info = series.CameraInfo.of(int(t_ns[0]), size, "plumb_bob", np.array(camera.distortion), K)
     # The lens magnifies by more than CameraInfo knows.
     magnified = 1.0 + motion.effects["los_scale"]
     lens = K * np.array([magnified, magnified, 1.0])

@@ -6,7 +6,7 @@ from alidade.pipelines.estimation.parameters import ParameterSpec, gyro_bias, sc
 from alidade.pipelines.methods import Guidance, Method, Report, deferred
 from alidade.pipelines.methods.triads import triad_specs
 from alidade.pipelines.methods.tumble import turning
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES, TumbleData, read_tumble, write_tumble
+from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES, TumbleData, read_tumble, tumble_topics
 from alidade.pipelines.methods.tumble.topics import REQUIREMENTS, TOPICS
 
 # Priors of triads and strengths are in `tumble.parameters`: over the strength, and by the model of the field.
@@ -47,7 +47,7 @@ METHOD = Method(
     topics=TOPICS,
     requirements=REQUIREMENTS,
     read=read_tumble,
-    write_data=write_tumble,
+    to_topics=tumble_topics,
     parameters=PARAMETERS,
     problem=deferred("alidade.pipelines.methods.tumble.graph:problem"),
     published=deferred("alidade.pipelines.methods.tumble.published:published_estimate"),

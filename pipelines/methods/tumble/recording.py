@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import accel_square, temperature_slope
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.place import read_place
+from alidade.pipelines.methods.place import place_topics, read_place
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import (
     check_overlap,
@@ -20,11 +18,10 @@ from alidade.pipelines.recording.checks import (
     nanoseconds,
     too_fast,
 )
-from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, is_there, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
-from alidade.pipelines.recording.streams import Samples, StreamReader, Temperature
+from alidade.pipelines.recording.streams import Samples, StreamReader, Temperature, white_covariance
 from alidade.pipelines.recording.topics import FIX, IMU, MAG, wanted
 from alidade.pipelines.settings import Config
 
@@ -141,22 +138,12 @@ def _gyro(reader: StreamReader, topic: str, imu: series.ImuSeries) -> Samples[se
     return reader.samples(topic, imu, "gyro", may_be_constant=True)
 
 
-def write_tumble(
-    path: Path | str,
-    data: TumbleData,
-    truth: Mapping[str, float] | None = None,
-    config_yaml: str | None = None,
-    _pictures: None = None,
-) -> None:
-    """Write simulated data under the default topic names, with truth and config attached."""
+def tumble_topics(data: TumbleData, _pictures: None = None) -> dict[str, series.Topic]:
+    """Topics of a recording under their default names."""
     epoch = data.epoch_ns
-
-    def covariance(t: Array, noise: float | None) -> Array:
-        return (0.0 if noise is None else noise**2 / float(np.median(np.diff(t)))) * np.eye(3)
-
     topics: dict[str, series.Topic] = {}
     if data.mag_t is not None and data.mag is not None:
-        cov = covariance(data.mag_t, data.mag_density)
+        cov = white_covariance(data.mag_t, data.mag_density)
         topics[MAG.name] = series.MagneticSeries(nanoseconds(data.mag_t, epoch), data.mag, field_cov=cov, frame_id="b")
     imu_t = data.gyro_t if data.accel_t is None else data.accel_t
     if imu_t is not None:
@@ -165,14 +152,9 @@ def write_tumble(
             nanoseconds(imu_t, epoch),
             np.zeros((len(imu_t), 3)) if data.gyro is None else data.gyro,
             np.zeros((len(imu_t), 3)) if data.accel is None else data.accel,
-            gyro_cov=absent if data.gyro is None else covariance(imu_t, data.gyro_density),
-            accel_cov=absent if data.accel is None else covariance(imu_t, data.accel_density),
+            gyro_cov=absent if data.gyro is None else white_covariance(imu_t, data.gyro_density),
+            accel_cov=absent if data.accel is None else white_covariance(imu_t, data.accel_density),
             frame_id="b",
         )
-    if data.latitude is not None and data.longitude is not None:
-        place = np.rad2deg([data.latitude, data.longitude])
-        topics[FIX.name] = series.FixSeries(
-            np.array([epoch]), place[:1], place[1:], np.array([data.height]), frame_id="gnss"
-        )
-    topics |= temperature.topics(data.temperature, epoch)
-    write_session(path, topics, attached(truth, config_yaml))
+    topics |= place_topics(FIX, epoch, data.latitude, data.longitude, data.height)
+    return topics | temperature.topics(data.temperature, epoch)

@@ -26,7 +26,6 @@ from alidade.pipelines.applications.fleet.montecarlo import simulate_and_solve
 from alidade.pipelines.applications.fleet.recordings import find
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.head.recording import write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.support.builders import IDEAL
 from tests.support.fleet_command import alidade
@@ -53,7 +52,7 @@ def written(folder: Path, duration_s: float) -> Path:
     )
     for seed in range(COUNT):
         data, truth = simulate_head(scenario, seed)
-        write_head(folder / f"U{seed:02}.mcap", data, truth, head_config(scenario))
+        method("head").write_data(folder / f"U{seed:02}.mcap", data, truth, head_config(scenario))
     return folder
 
 

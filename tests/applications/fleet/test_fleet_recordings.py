@@ -15,7 +15,7 @@ import pytest
 from alidade.pipelines.applications.fleet import engine
 from alidade.pipelines.applications.fleet.fleet import Settings, calibrate_recording
 from alidade.pipelines.applications.fleet.recordings import find
-from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.support.browser import fits
 from tests.support.fleet_command import alidade
@@ -50,7 +50,7 @@ def scenario(mount_deg: tuple[float, float, float], one_axis: bool = False) -> H
 def write(path: Path, seed: int, mount_deg: Any, one_axis: bool = False) -> Path:
     settings = scenario(tuple(mount_deg), one_axis)
     data, truth = simulate_head(settings, seed)
-    write_head(path, data, truth, head_config(settings))
+    method("head").write_data(path, data, truth, head_config(settings))
     return path
 
 

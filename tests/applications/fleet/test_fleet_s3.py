@@ -16,7 +16,7 @@ import pytest
 
 from alidade.pipelines.applications.fleet.fleet import Settings, calibrate_recording
 from alidade.pipelines.applications.fleet.recordings import find
-from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.support.builders import IDEAL
 from tests.support.command import Command
@@ -85,7 +85,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def write(path: Path, seed: int) -> None:
     scenario = HeadScenario(duration_s=4.0, gyro_rate_hz=100.0, vision_rate_hz=20.0, truth_rate_hz=1.0, sensors=IDEAL)
     data, truth = simulate_head(scenario, seed)
-    write_head(path, data, truth, head_config(scenario))
+    method("head").write_data(path, data, truth, head_config(scenario))
 
 
 def rows_of(out: Path) -> list[dict[str, str]]:

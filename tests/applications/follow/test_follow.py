@@ -26,7 +26,7 @@ from alidade.pipelines.applications.follow.serve import LiveServer
 from alidade.pipelines.applications.follow.sources import Source
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import ClockSheet
@@ -85,7 +85,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished recording, which the tests have recorded anew."""
     path = tmp_path_factory.mktemp("whole") / "whole.mcap"
     data, truth = simulate_los(SCENARIO, 2)
-    write_los(path, data, truth, los_config(SCENARIO))
+    method("los").write_data(path, data, truth, los_config(SCENARIO))
     return path
 
 
@@ -229,7 +229,7 @@ def test_a_clock_that_drifts_far_is_told_and_the_recording_solved_anew(tmp_path:
     scenario = SCENARIO.model_copy(update={"sensors": sensors, "effects": {"clock_skew": 2e-3}})
     data, truth = simulate_los(scenario, 2)
     whole, session = tmp_path / "whole.mcap", tmp_path / "s.mcap"
-    write_los(whole, data, truth, los_config(scenario))
+    method("los").write_data(whole, data, truth, los_config(scenario))
     recorder = _recorder(whole, session, 45.0, tmp_path / "go")
     calibration, views, said = _follow(session, Settings(), tmp_path / "go", until=40.0)
     assert recorder.wait() == 0

@@ -18,7 +18,7 @@ from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.sources import Source, StandardInput, source_of
 from alidade.pipelines.applications.session import calibrate
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.growing import GrowingFiles
 from alidade.pipelines.reports.result import Calibration
@@ -46,7 +46,7 @@ def record(
         gimbal_rate_hz=rate_hz,
         sensors=sensors,
     )
-    write_los(path / "whole.mcap", *simulate_los(scenario, 2), los_config(scenario))
+    method("los").write_data(path / "whole.mcap", *simulate_los(scenario, 2), los_config(scenario))
     (path / "c.yaml").write_text(los_config(scenario))
     return path / "whole.mcap", path / "c.yaml"
 

@@ -25,7 +25,7 @@ from alidade.pipelines.applications.follow.sources import Replay, Source, Standa
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
@@ -51,7 +51,7 @@ SCENARIO = LosScenario(
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    write_los(path, *simulate_los(SCENARIO, 2), los_config(SCENARIO))
+    method("los").write_data(path, *simulate_los(SCENARIO, 2), los_config(SCENARIO))
     return path
 
 
@@ -163,7 +163,7 @@ def test_a_ros_1_bag_is_followed_killed_and_resumed_when_it_is_closed(tmp_path: 
     """What tells a bag from others is not its head, which is written anew when the bag is closed."""
     scenario = SCENARIO.model_copy(update={"duration_s": 75.0, "image_rate_hz": 3.0, "gyro_rate_hz": 25.0})
     whole, config = tmp_path / "whole.mcap", tmp_path / "c.yaml"
-    write_los(whole, *simulate_los(scenario, 2), los_config(scenario))
+    method("los").write_data(whole, *simulate_los(scenario, 2), los_config(scenario))
     config.write_text(los_config(scenario))
     closed = forms.rosbag1(whole, tmp_path / "closed.bag", chunk=8_000).read_bytes()
     path, settings = tmp_path / "s.bag", Settings(config=config, checkpoint=tmp_path / "s.checkpoint")

@@ -14,7 +14,8 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.recording import CubeData, write_cube
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.cube.recording import CubeData
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.static_poses import static_poses
@@ -104,7 +105,9 @@ def test_a_tag_that_came_loose_is_no_fault_of_the_camera() -> None:
 
 def test_the_command_says_it_in_one_line(tmp_path: Path, alidade: Command) -> None:
     data, truth, config = _simulated()
-    write_cube(tmp_path / "s.mcap", replace(data, **_with_corners(_corners()[:, [2, 3, 0, 1]])), truth, config)
+    method("cube").write_data(
+        tmp_path / "s.mcap", replace(data, **_with_corners(_corners()[:, [2, 3, 0, 1]])), truth, config
+    )
     run = alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
     assert run.code == 2
     assert "the corners of all tags come as top right, top left, bottom left, bottom right" in run.err

@@ -16,8 +16,8 @@ from ruamel.yaml import YAML
 
 from alidade.factors import so3
 from alidade.pipelines.applications import cli
-from alidade.pipelines.methods import simulate
-from alidade.pipelines.methods.cube.recording import CubeData, Sightings, write_cube
+from alidade.pipelines.methods import method, simulate
+from alidade.pipelines.methods.cube.recording import CubeData, Sightings
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.vision.camera import Camera
@@ -83,12 +83,12 @@ def _numbers(text: str) -> str:
     ids=["size missing", "size negative", "rotation no quaternion"],
 )
 def test_bad_tags(alidade: Command, tmp_path: Path, data: CubeData, change: Any, message: str) -> None:
-    write_cube(tmp_path / "s.mcap", data, None, _numbers(_tags(change)))
+    method("cube").write_data(tmp_path / "s.mcap", data, None, _numbers(_tags(change)))
     _refused(alidade, tmp_path, message)
 
 
 def test_two_tags_with_one_id_in_the_config(alidade: Command, tmp_path: Path, data: CubeData) -> None:
-    write_cube(tmp_path / "s.mcap", data, None, CONFIG.replace("    17:\n", "    16:\n"))
+    method("cube").write_data(tmp_path / "s.mcap", data, None, CONFIG.replace("    17:\n", "    16:\n"))
     _refused(alidade, tmp_path, "16")
 
 
@@ -96,7 +96,9 @@ def test_two_tags_with_one_id_in_the_pictures(alidade: Command, tmp_path: Path, 
     seen = data.sightings
     assert seen is not None
     frame, ids, corners = (np.concatenate([a, a]) for a in (seen.frame, seen.ids, seen.corners))
-    write_cube(tmp_path / "s.mcap", replace(data, sightings=Sightings(seen.t, frame, ids, corners, None)), None, CONFIG)
+    method("cube").write_data(
+        tmp_path / "s.mcap", replace(data, sightings=Sightings(seen.t, frame, ids, corners, None)), None, CONFIG
+    )
     _refused(alidade, tmp_path, r"/tag_detections: tag 16 is seen twice .* every tag in sight needs its own id")
 
 
@@ -104,7 +106,7 @@ def test_camera_info_zero(alidade: Command, tmp_path: Path, data: CubeData) -> N
     assert data.camera is not None
     blind = Camera(1280, 960, data.camera.K)
     object.__setattr__(blind, "K", np.zeros((3, 3)))
-    write_cube(tmp_path / "s.mcap", replace(data, camera=blind), None, CONFIG)
+    method("cube").write_data(tmp_path / "s.mcap", replace(data, camera=blind), None, CONFIG)
     _refused(alidade, tmp_path, "camera_info")
 
 
@@ -119,7 +121,7 @@ def test_camera_info_zero(alidade: Command, tmp_path: Path, data: CubeData) -> N
     ids=["uT", "gauss", "g", "never at rest"],
 )
 def test_bad_sensors(alidade: Command, tmp_path: Path, data: CubeData, change: Any, message: str) -> None:
-    write_cube(tmp_path / "s.mcap", replace(data, **change(data)), None, CONFIG)
+    method("cube").write_data(tmp_path / "s.mcap", replace(data, **change(data)), None, CONFIG)
     _refused(alidade, tmp_path, message)
 
 
@@ -128,7 +130,7 @@ def test_a_cube_that_is_not_rigid_names_the_tag(alidade: Command, tmp_path: Path
         turned = so3.multiply(tags[18]["rotation"], so3.exp([0.0, 0.0, 0.5 * np.pi]))
         tags[18]["rotation"] = turned.tolist()
 
-    write_cube(tmp_path / "s.mcap", data, None, _numbers(_tags(turn)))
+    method("cube").write_data(tmp_path / "s.mcap", data, None, _numbers(_tags(turn)))
     _refused(alidade, tmp_path, "cube not rigid: tag 18 disagrees")
 
 
@@ -144,7 +146,7 @@ def test_blurred_pictures_only(alidade: Command, tmp_path: Path) -> None:
 def test_three_poses_are_unobservable_and_say_what_is_missing(alidade: Command, tmp_path: Path) -> None:
     scenario = SCENARIO.model_copy(update={"poses": 3})
     data, truth = simulate_cube(scenario, 2)
-    write_cube(tmp_path / "s.mcap", data, truth, cube_config(scenario))
+    method("cube").write_data(tmp_path / "s.mcap", data, truth, cube_config(scenario))
     code, out, err = alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
     assert (code, err) == (3, "")
     for words in (
@@ -161,7 +163,7 @@ def test_three_poses_are_unobservable_and_say_what_is_missing(alidade: Command, 
 
 def test_from_recording_to_other_programs(alidade: Command, tmp_path: Path, data: CubeData) -> None:
     """calibrate, export in every format, validate."""
-    write_cube(tmp_path / "s.mcap", data, None, CONFIG)
+    method("cube").write_data(tmp_path / "s.mcap", data, None, CONFIG)
     code, _, err = alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
     assert (code in (0, 3), err) == (True, "")
     saved = tmp_path / "out" / "calibration.yaml"

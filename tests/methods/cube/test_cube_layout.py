@@ -12,8 +12,9 @@ import pytest
 from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.layout import cube_layout, layout_yaml
-from alidade.pipelines.methods.cube.recording import CubeConfig, write_cube
+from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.recording.recording import open_recording
@@ -36,7 +37,7 @@ DENSE = SCENARIO.model_copy(update={"camera": CubeCamera(rate_hz=4.0)})
 
 def _session(path: Path, seed: int, scenario: CubeScenario = SCENARIO) -> dict[str, float]:
     data, truth = simulate_cube(scenario, seed)
-    write_cube(path, data, truth, cube_config(scenario))
+    method("cube").write_data(path, data, truth, cube_config(scenario))
     return truth
 
 
@@ -97,7 +98,7 @@ def test_one_tag_alone_places_nothing(tmp_path: Path) -> None:
     one = data.sightings.ids == 16
     seen = data.sightings
     data = replace(data, sightings=replace(seen, frame=seen.frame[one], ids=seen.ids[one], corners=seen.corners[one]))
-    write_cube(tmp_path / "s.mcap", data, None, cube_config(SCENARIO))
+    method("cube").write_data(tmp_path / "s.mcap", data, None, cube_config(SCENARIO))
     recording = open_recording(tmp_path / "s.mcap")
     with pytest.raises(InputError, match="no picture shows tag 16 together with another tag"):
         cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])

@@ -12,8 +12,9 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.model import problem
-from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, LayoutCovariance, write_cube
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, LayoutCovariance
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.settings import Config
@@ -118,7 +119,7 @@ def test_a_layout_of_one_recording_serves_another(alidade: Command, tmp_path: Pa
     for name, poses in (("turned", 20), ("still", 16)):
         scenario = _scenario(poses, 0.02).model_copy(update={"cube": TagCube(), "effects": off})
         data, truth = simulate_cube(scenario, 3)
-        write_cube(tmp_path / f"{name}.mcap", data, truth, cube_config(scenario))
+        method("cube").write_data(tmp_path / f"{name}.mcap", data, truth, cube_config(scenario))
     assert (
         alidade("cube-layout", tmp_path / "turned.mcap", "--out", tmp_path / "cube.yaml", "--refine-camera").code == 0
     )
@@ -141,7 +142,7 @@ def test_a_layout_of_one_recording_serves_another(alidade: Command, tmp_path: Pa
 
 def test_a_camera_of_another_recording_is_refused(alidade: Command, tmp_path: Path) -> None:
     scenario = _scenario(4, 0.0)
-    write_cube(tmp_path / "s.mcap", *simulate_cube(scenario, 0), cube_config(scenario))
+    method("cube").write_data(tmp_path / "s.mcap", *simulate_cube(scenario, 0), cube_config(scenario))
     for text, says in (
         ("focal: [600, 600], centre: [640, 480], distortion: [0, 0, 0, 0, 0]", "its focal length is 600 px"),
         ("focal: [1150, 1150], centre: [640, 480], distortion: [0, 0, 0, 0]", "it has 4 coefficients of distortion"),

@@ -13,7 +13,7 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, Sightings, local_field, read_cube, write_cube
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, Sightings, local_field, read_cube
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.static_poses import static_intervals, static_poses
@@ -34,7 +34,7 @@ def _config(text: str = "") -> Config:
 
 
 def _read_back(path: Path, data: CubeData, config: Config | None = None) -> CubeData:
-    write_cube(path, data, {"accel_k11": 1.0}, cube_config(SCENARIO))
+    method("cube").write_data(path, data, {"accel_k11": 1.0}, cube_config(SCENARIO))
     recording = open_recording(path)
     return read_cube(recording, config or load_config(recording.attachment("alidade.yaml")))
 
@@ -200,6 +200,8 @@ def test_blurred_pictures_only(tmp_path: Path, session: CubeData) -> None:
     t = static_intervals(session, _config()).mean(axis=1)
     nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)
     grey = encode(np.full((960, 1280), 90, dtype=np.uint8), "jpeg")
-    write_cube(tmp_path / "s.mcap", replace(session, sightings=nothing), None, cube_config(SCENARIO), [grey] * len(t))
+    method("cube").write_data(
+        tmp_path / "s.mcap", replace(session, sightings=nothing), None, cube_config(SCENARIO), [grey] * len(t)
+    )
     with pytest.raises(InputError, match="no tag is seen sharply in any of the 4 pictures"):
         read_cube(open_recording(tmp_path / "s.mcap"), _config())

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import alidade
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
 from alidade.pipelines.reports.result import Calibration
 
@@ -68,7 +68,7 @@ def test_the_course_is_that_of_the_run(online: Calibration, concluded: Calibrati
 
 def test_the_command_says_so(tmp_path: Path) -> None:
     data, truth = simulate_head(SCENARIO.model_copy(update={"duration_s": 6.0}), 1)
-    write_head(tmp_path / "s.mcap", data, truth)
+    method("head").write_data(tmp_path / "s.mcap", data, truth)
     command = ["calibrate", str(tmp_path / "s.mcap"), "--solver", "incremental", "--out", str(tmp_path / "o")]
     assert CliRunner().invoke(app, command).exit_code in (0, 3, 4)
     text = (tmp_path / "o" / "result.json").read_text()

@@ -16,8 +16,8 @@ from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
-from alidade.pipelines.methods.head.recording import write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch
@@ -185,7 +185,7 @@ def test_without_platform_motion_only_the_product_of_the_mounts_is_known(solve: 
 def test_unobservable_mount_ends_with_code_3(tmp_path: Path) -> None:
     settings = scenario(platform=None, priors={f"camera_mount_{axis}": 0.35 for axis in "xyz"})
     data, truth = simulate_head(settings, 1)
-    write_head(tmp_path / "s.mcap", data, truth, head_config(settings))
+    method("head").write_data(tmp_path / "s.mcap", data, truth, head_config(settings))
     result = CliRunner().invoke(app, ["calibrate", str(tmp_path / "s.mcap")])
     assert result.exit_code == 3
     assert "turn the platform" in result.output

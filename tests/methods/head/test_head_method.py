@@ -16,8 +16,9 @@ from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
-from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import validate
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.settings import Config
@@ -119,7 +120,7 @@ def test_validate_on_another_recording_writes_a_page(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("b", 1)):
         settings = scenario(time_offset_s=0.012 if name == "a" else 0.0120001, sensors="ideal")
         data, truth = simulate_head(settings, seed)
-        write_head(tmp_path / f"{name}.mcap", data, truth, head_config(settings))
+        method("head").write_data(tmp_path / f"{name}.mcap", data, truth, head_config(settings))
     run = CliRunner()
     assert run.invoke(app, ["calibrate", str(tmp_path / "a.mcap"), "--out", str(tmp_path / "cal")]).exit_code == 0
     command = ["validate", "--calibration", str(tmp_path / "cal" / "calibration.yaml")]
@@ -141,7 +142,7 @@ def _line(text: str, part: str) -> str:
 def test_calibration_of_another_method_is_refused(tmp_path: Path) -> None:
     settings = scenario()
     data, truth = simulate_head(settings, 1)
-    write_head(tmp_path / "s.mcap", data, truth, head_config(settings))
+    method("head").write_data(tmp_path / "s.mcap", data, truth, head_config(settings))
     (tmp_path / "c.yaml").write_text(
         "schema: alidade.calibration/1\nmethod: los\nsolver: batch\nstatus: calibrated\n"
         "recording: {file: x, sha256: x, start: '2026-01-01T00:00:00+00:00'}\nparameters: {}\n"

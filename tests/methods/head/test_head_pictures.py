@@ -11,7 +11,8 @@ from alidade.factors import so3
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head.recording import HeadData, read_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head, simulate_pictures
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
@@ -23,7 +24,7 @@ def scenario(**changes: object) -> HeadScenario:
 
 def written(path: Path, settings: HeadScenario, seed: int) -> Path:
     data, truth = simulate_head(settings, seed)
-    write_head(path, data, truth, head_config(settings, images=True), simulate_pictures(settings, seed))
+    method("head").write_data(path, data, truth, head_config(settings, images=True), simulate_pictures(settings, seed))
     return path
 
 

@@ -13,8 +13,9 @@ from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.estimation.problem import Array, Attitudes
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import _between
-from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import carried
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.simulation.scenario import load_scenario
@@ -73,7 +74,7 @@ def written(folder: Path, seed: int = 1) -> Path:
     scenario, *_ = made(duration_s=12)
     path = folder / f"{seed}.mcap"
     data, truth = simulate_head(scenario, seed)
-    write_head(path, data, truth, head_config(scenario))
+    method("head").write_data(path, data, truth, head_config(scenario))
     return path
 
 

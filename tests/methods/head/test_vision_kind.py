@@ -15,8 +15,9 @@ from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
-from alidade.pipelines.methods.head.recording import HeadData, white_angle, write_head
+from alidade.pipelines.methods.head.recording import HeadData, white_angle
 from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
 
 KINDS = ("mocap", "pnp", "vio", "other")
@@ -69,7 +70,7 @@ def proposed(path: Path, config: str = "") -> list[str]:
 def test_info_proposes_motion_capture_by_rate_or_noise(
     rate_hz: float, sigma: float, kind: str | None, tmp_path: Path
 ) -> None:
-    write_head(tmp_path / "s.mcap", made(rate_hz, sigma))
+    method("head").write_data(tmp_path / "s.mcap", made(rate_hz, sigma))
     said = proposed(tmp_path / "s.mcap")
     assert len(said) == (kind is not None)
     if kind:

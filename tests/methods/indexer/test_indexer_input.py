@@ -11,8 +11,9 @@ import pytest
 from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.indexer.model import problem
-from alidade.pipelines.methods.indexer.recording import INDEXER, JOINTS, IndexerData, read_indexer, write_indexer
+from alidade.pipelines.methods.indexer.recording import INDEXER, JOINTS, IndexerData, read_indexer
 from alidade.pipelines.methods.indexer.report import validate
 from alidade.pipelines.methods.indexer.simulation import (
     IndexerNoise,
@@ -127,13 +128,13 @@ def test_an_orientation_that_is_not_there_throughout_is_none(
     lacking = turning.copy()
     lacking[rows] = np.nan
     for wxyz, there in ((turning, True), (lacking, False)):
-        write_indexer(tmp_path / "s.mcap", replace(data, attitude=wxyz))
+        method("indexer").write_data(tmp_path / "s.mcap", replace(data, attitude=wxyz))
         found = read_indexer(open_recording(tmp_path / "s.mcap"), _config())
         assert (found.attitude is not None) is there
 
 
 def test_fixes_that_never_came_are_none(session: tuple[IndexerData, dict[str, float]], tmp_path: Path) -> None:
-    write_indexer(tmp_path / "s.mcap", session[0])
+    method("indexer").write_data(tmp_path / "s.mcap", session[0])
     whole = open_recording(tmp_path / "s.mcap")
     none = series.FixSeries(np.empty(0, np.int64), np.empty(0), np.empty(0))
     topics: dict[str, series.Topic] = {

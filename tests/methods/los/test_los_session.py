@@ -11,8 +11,8 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods import simulate
-from alidade.pipelines.methods.los.recording import LosData, read_los, write_los
+from alidade.pipelines.methods import method, simulate
+from alidade.pipelines.methods.los.recording import LosData, read_los
 from alidade.pipelines.methods.los.simulation import LosCamera, LosScenario, los_config, simulate_los, simulate_pictures
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.sources import TopicSource
@@ -23,14 +23,14 @@ DATA, TRUTH = simulate_los(LosScenario(duration_s=12.0, measures_roll=True), 1)
 
 
 def _back(path: Path, data: LosData, config: Config | None = None) -> LosData:
-    write_los(path, data)
+    method("los").write_data(path, data)
     return read_los(open_recording(path), config or Config())
 
 
 def test_written_and_read_back(tmp_path: Path) -> None:
     scenario = LosScenario(duration_s=12.0, measures_roll=True)
     path = tmp_path / "s.mcap"
-    write_los(path, DATA, TRUTH, los_config(scenario))
+    method("los").write_data(path, DATA, TRUTH, los_config(scenario))
     recording = open_recording(path)
     config = load_config(recording.attachment("alidade.yaml"))
     back = read_los(recording, config)
@@ -191,7 +191,7 @@ def test_pictures_take_the_place_of_los_errors(tmp_path: Path) -> None:
         scenario.model_copy(update={"noise": scenario.noise.model_copy(update={"los_error": 0.0})}), 1
     )
     path = tmp_path / "s.mcap"
-    write_los(path, data, pictures=simulate_pictures(scenario, 1))
+    method("los").write_data(path, data, pictures=simulate_pictures(scenario, 1))
     back = read_los(open_recording(path), Config())
     assert back.error_cov is not None
     # To a tenth of a pixel, up to where the first picture puts the target.
@@ -202,7 +202,7 @@ def test_pictures_take_the_place_of_los_errors(tmp_path: Path) -> None:
 def test_pictures_without_camera_info(tmp_path: Path) -> None:
     info, images = simulate_pictures(_small_pictures(), 1)
     path = tmp_path / "s.mcap"
-    write_los(path, DATA, pictures=(info, images))
+    method("los").write_data(path, DATA, pictures=(info, images))
     with pytest.raises(InputError, match="no topic /camera/none"):
         read_los(open_recording(path), Config(topics={"camera_info": TopicSource(topic="/camera/none")}))
     with pytest.raises(InputError, match="no topic /los/error"):
