@@ -19,13 +19,14 @@ class AppliedFormulas:
     def __init__(self, formulas: Sequence[Formula], values: Mapping[str, float], others: Mapping[str, float]) -> None:
         self.values = values
         self._formulas, self._all = formulas, {**others, **values}
-        self._needed = {name for formula in formulas for name in formula.inputs}
         self._first = {"temperature": others["first_temperature"]} if "first_temperature" in others else {}
 
     def __call__(self, **measured: Array) -> Mapping[str, Array]:
         """What follows from measurements, at the first temperature."""
-        given = {name: value for name, value in {**measured, **self._first}.items() if name in self._needed}
-        return apply(self._formulas, self._all, given)
+        given = {**measured, **self._first}
+        usable = [formula for formula in self._formulas if given.keys() >= {*formula.inputs}]
+        needed = {name for formula in usable for name in formula.inputs}
+        return apply(usable, self._all, {name: given[name] for name in needed})
 
 
 def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:

@@ -106,3 +106,11 @@ def test_noise_of_the_use_widens_the_band() -> None:
     noisy = replace(use, lines=(replace(line, noise=np.array([3.0])),))
     assert use_bands(use, _posterior(1.0)).after == pytest.approx(1.96, rel=1e-3)
     assert use_bands(noisy, _posterior(1.0)).after == pytest.approx(2.0 * 1.96, rel=1e-3)
+
+
+def test_a_device_that_warms_has_its_uses() -> None:
+    """Formulas that need no temperature are applied without it."""
+    settings = {"duration_s": 10.0, "temperature": {"start_c": 20.0, "rise_k": 10.0, "time_constant_s": 20.0}}
+    c = alidade.calibrate(alidade.simulate("head", settings, seed=1))
+    assert "first_temperature" in c.problem.constants
+    assert [found.use.name for found in c.uses] == ["attitude", "outage"]
