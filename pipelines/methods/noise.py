@@ -1,4 +1,4 @@
-"""What noises a method's graph reckons with: the config's, the messages', what sensors' own samples say."""
+"""Noise levels of a graph: from the config, from messages, and from a sensor's own samples."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _CONFIG: Source = "config"
 _MESSAGE: Source = "message"
 _DEFAULT: Source = "default"
 
-# Of this order are the differences that tell a sensor's white noise while it moves: motion is smooth, noise is not.
+# Order of the differences that separate a sensor's white noise from its motion: motion is smooth, noise is not.
 _ORDER = 6
 # Means of so many samples are looked at, one after the other, until two of them agree to this part: below a sensor's
 # own filter its noise is white.
 _MEANS, _ALIKE = (1, 2, 4, 8), 0.1
 # Differences worked out at a time.
 _BLOCK = 100_000
-# Fewer differences tell nothing; the best of them are not trusted to less than this, in the logarithm.
+# Fewer differences are not used; the best of them are not trusted to less than this, in the logarithm.
 _FEWEST, _TRUSTED = 200, 0.05
 # A walk is looked for in steps of this, in the logarithm, where the bias was seen so many times.
 # ... and what was stated is contradicted by so many sigmas.
@@ -70,7 +70,7 @@ def stated(
 
 
 def repeatability(sensor: str, config: Config, family: str) -> Level:
-    """What a mean over a rest, or a turn, repeats to beside white noise: as stated, until the residuals tell.
+    """Repeatability of a mean over a rest, or a turn, beside white noise: as stated, until residuals estimate it.
 
     Where nobody states it, it counts as hardly known, and as none where noise is said to be known exactly.
     """
@@ -103,7 +103,7 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     found = white_density(time, samples) if noise.known > 0.0 and noise.stated > 0.0 else None
     held = replace(noise, families=())
     if found is None:
-        # What neither anybody states nor samples tell is asked of the residuals after all.
+        # A default that samples do not determine is estimated from residuals.
         return Level(noise if noise.source == _DEFAULT else held)
     ratio, spread = found[0] / noise.stated, max(found[1], _TRUSTED)
     level = _weighed(Level(held, 1.0, ratio, ratio * spread))
@@ -198,7 +198,7 @@ def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
             return None
         density = robust_sigma(differences) / comb(2 * _ORDER, _ORDER) ** 0.5 * (count * interval) ** 0.5
         if before is not None and abs(np.log(density / before)) < _ALIKE:
-            # Neighbouring differences go together, and the median tells less than the mean square would.
+            # Neighbouring differences are correlated, and the median is less efficient than the mean square.
             return before, float(2.0 * differences.size**-0.5)
         before = density
     return None
@@ -215,7 +215,7 @@ def _differences(samples: Array, count: int) -> Array:
 
 
 def typical(covariance: Array | None, *components: int) -> float | None:
-    """Median sigma of some components of measurements' covariances (n, m, m); None where none is told."""
+    """Median sigma of some components of measurements' covariances (n, m, m); None where none is stated."""
     if covariance is None:
         return None
     variance = np.concatenate([covariance[:, i, i] for i in components])

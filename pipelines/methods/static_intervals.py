@@ -25,13 +25,13 @@ _MARGIN = 0.25
 _MOVED, _UNMOVED = 5.0, 1.0
 # What stays below that is slow all the same: this share of a long interval, up to s, is cut off at least.
 _SLOW_SHARE, _SLOW = 0.1, 0.4
-# Samples whose means tell whether noise is white, and how many such means it takes.
+# Samples whose means show whether noise is white, and how many such means it takes.
 _TOGETHER, _FEWEST_BLOCKS, _TINY = 8, 4, np.finfo(float).tiny
 # Brief rests, of a second and less, are looked for with this share of span, margin and shortest; there readings scatter
 # by less than so many times what they differ by from one to the next, over sqrt(2): 1 for white noise, beyond 5 where
 # a hand turns back.
 _BRIEF, _WHITE = 0.5, 2.0
-# Of a triad, nine numbers at rest, fewer static poses than this tell too little for brief ones to be left out.
+# Of a triad, nine numbers at rest, fewer static poses than this are too few for brief ones to be left out.
 _FEWEST_POSES = 9
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)

@@ -1,6 +1,6 @@
 """Faults of a camera's description, by which no tag fits: order of corners, size of the picture, rectified pictures.
 
-Each is told by the reprojection errors of poses with several tags, before anything else is estimated.
+Each is found from the reprojection errors of poses with several tags, before anything else is estimated.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.pose import TagBody, estimate_pose
 from alidade.pipelines.vision.tags import Detections
 
-# Poses that are tried, and the fewest that tell.
+# Poses that are tried, and the fewest that decide.
 _POSES, _FEWEST = 5, 3
 # A correction explains the misfit if errors fall by this factor; the median over poses scatters by a tenth of that.
 _BETTER = 2.0

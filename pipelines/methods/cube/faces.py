@@ -1,4 +1,4 @@
-"""The faces of a cube as it is drawn, with their tags, and attitudes told by them."""
+"""The faces of a cube as it is drawn, with their tags, and attitudes stated by them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the person recording a cube is told of what has been collected."""
+"""Guidance of the cube method: motion while recording and of a plan, faults of the data."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _tag_size(data: CubeData, config: Config, change: float) -> tuple[CubeData, 
 
 
 def _focal_length(data: CubeData, config: Config, change: float) -> tuple[CubeData, Config] | None:
-    # Of one that is free the parameter tells.
+    # Where it is free, its parameter has the error.
     if data.camera is None or is_stated(FOCAL, config):
         return None
     K = data.camera.K * np.array([1.0 + change, 1.0 + change, 1.0])[:, None]
@@ -216,7 +216,7 @@ class _FisherInformation:
 
 
 def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[Resting], list[Resting]]:
-    """Single poses that tell most, of one sensor or of all, and the best so many to rest in one after the other."""
+    """Most informative single poses, of one sensor or of all, and the best sequence of a number of poses."""
     field = None
     if scenario.magnetometer:
         place = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # A line of the file holds whatever belongs together.
 _WIDE = 10_000
-# Many pictures of one pose tell little more than a few; each is a pose to be found.
+# Many pictures of one pose add little to a few; each is a pose to be found.
 _MOST_PICTURES = 800
 
 

@@ -160,9 +160,9 @@ def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values)
     samples, deviation = model.samples(k), current.atVector(deviation_key(k - 1))
     own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), deviation)
     gyro, accel = samples.gyro, samples.accel
-    if samples.warmth is not None:
+    if samples.temperature_rise is not None:
         slopes = model.parameters.slopes
-        drifts = {name: np.outer(samples.warmth, current.atVector(SLOPE_KEYS[name])) for name in slopes}
+        drifts = {name: np.outer(samples.temperature_rise, current.atVector(SLOPE_KEYS[name])) for name in slopes}
         gyro, accel = gyro - drifts.get("gyro", 0.0), accel - drifts.get("accel", 0.0)
     of_force = []
     if model.parameters.sensitivity is not None:
@@ -183,13 +183,13 @@ _LONGEST_GAP = 0.1
 class Turning:
     """A turn's samples: stamps (N,), s, and gyro and accelerometer (N, 3) in nominal units.
 
-    warmth (N,), K: temperature above the recording's first; None where nobody measures it.
+    temperature_rise (N,), K: temperature above the recording's first; None where nobody measures it.
     """
 
     t: Array
     gyro: Array
     accel: Array
-    warmth: Array | None
+    temperature_rise: Array | None
 
     @property
     def whole(self) -> bool:
@@ -225,7 +225,7 @@ class Model:
         t, warming = self.data.imu_t[rows], self.data.temperature
         return Turning(t, gyro, accel, None if warming is None else warming.above(warming.first, t))
 
-    def warmth(self, sensor: str, k: int) -> Array | None:
+    def temperature_rise(self, sensor: str, k: int) -> Array | None:
         """(1,) K, mean temperature in pose k above the recording's first; None where a sensor's offset ignores it."""
         warming, celsius = self.data.temperature, self.poses.celsius
         if warming is None or celsius is None or sensor not in self.parameters.slopes:
@@ -352,13 +352,13 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
     gyro_density, accel_density, mag_density = model.density
     duration = poses.duration[row]
     curved, feels = model.parameters.curvature is not None, model.parameters.sensitivity is not None
-    warmths = {name: model.warmth(name, k) for name in SLOPE_KEYS}
-    slopes = {name: [] if warmths[name] is None else [key] for name, key in SLOPE_KEYS.items()}
+    temperature_rises = {name: model.temperature_rise(name, k) for name in SLOPE_KEYS}
+    slopes = {name: [] if temperature_rises[name] is None else [key] for name, key in SLOPE_KEYS.items()}
     accel_sigma = accel_density / np.sqrt(duration)
-    accel = AccelFactor(time, poses.accel[row], accel_sigma, model.gravity, curved, warmths["accel"])
+    accel = AccelFactor(time, poses.accel[row], accel_sigma, model.gravity, curved, temperature_rises["accel"])
     gyro_sigma = np.sqrt(gyro_density**2 / duration + model.unknown_rate**2)
     gravity = model.gravity if feels else None
-    gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, gravity, warmths["gyro"])
+    gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, gravity, temperature_rises["gyro"])
     terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
     of_accel = accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms, *slopes["accel"])
     of_gyro = gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G, *slopes["gyro"])
@@ -437,9 +437,9 @@ def turn_factor(model: Model, k: int) -> Factor:
     slopes = model.parameters.slopes
     # What an accelerometer drifts by alone is nothing beside a gyro that does not.
     drifting = [name for name in ("gyro", *(["accel"] if feels else [])) if name in slopes and "gyro" in slopes]
-    warmth = None if samples.warmth is None or not drifting else [samples.warmth]
+    temperature_rise = None if samples.temperature_rise is None or not drifting else [samples.temperature_rise]
     drifts = "accel" in drifting
-    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, warmth, drifts)
+    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, temperature_rise, drifts)
     of_force = [SENSITIVITY_KEY, TRIAD_KEYS["accel"]] if feels else []
     gyro = TRIAD_KEYS["gyro"]
     slope = [SLOPE_KEYS[name] for name in drifting]

@@ -79,7 +79,7 @@ TILT = ParameterSpec(
     axes="en",
     per_recording=True,
 )
-# What CameraInfo is off by; taken for exact unless the config says something of it.
+# Errors of CameraInfo; fixed unless the config states a prior.
 FOCAL = scalar("camera_focal", "", 5e-3, "Relative correction of the focal length.", "camera.focal")
 CENTRE = ParameterSpec(
     "camera_centre", "px", 3.0, "Correction of the image centre along {axis}.", "camera.centre", axes="xy"
@@ -176,8 +176,8 @@ def first_priors(parameters: Parameters) -> list[Factor]:
 def _strength(key: int, model: Array) -> Factor:
     """The field's strength is as the model says, to the model's own error.
 
-    No motion tells it from the magnetometer's scale, and the usual prior on the components is made for its direction.
-    Not for a field that is farther off: what a building does to it, it does to its strength too.
+    No motion separates it from the magnetometer's scale, and the usual prior on the components is made for its
+    direction. Not for a field that is farther off: a building changes its strength too.
     """
     along = (model / np.linalg.norm(model))[None]
     return Factor.process_of("prior", linear_factor({key: along}, {key: model}, STRENGTH_SIGMA))

@@ -1,4 +1,4 @@
-"""A recording of the cube method as arrays."""
+"""Topics, config section and arrays of the cube method, from and to a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""How a cube result is applied. Frames: b cube's body, B reference, C camera, n level. Methods page, section 4."""
+"""Results of the cube method: formulas, tables, figures, validation.
+
+Frames: b cube's body, B reference, C camera, n level. Methods page, section 4.
+"""
 
 from __future__ import annotations
 
@@ -151,7 +154,7 @@ def _reduced(reading: str, errors: Sequence[str], conversion: RawConversion | No
     return f"({reading}{''.join(each)})" if each else reading
 
 
-# White noise is told from means over this much time, s: shorter ones are what the device's own filter leaves.
+# White noise is estimated from means over this much time, s: shorter ones are what the device's own filter leaves.
 _BLOCK = 0.25
 _UNITS = {"accel": "m/s^2/sqrt(Hz)", "gyro": "rad/s/sqrt(Hz)", "mag": "T/sqrt(Hz)"}
 

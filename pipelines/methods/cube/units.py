@@ -29,7 +29,7 @@ _USUAL = {
 _NEAR = {"accel": 0.06, "gyro": 0.07, "mag": 0.35}
 # The earth's field is within a third of this almost everywhere, T.
 _FIELD = 4.8e-5
-# A gyro is held against how gravity turns in means over this time, s, where the force is within this of its median.
+# Rates are compared with the rotation of gravity in means over this time, s, with the force this near to its median.
 _MEAN, _STEADY = 0.1, 0.15
 # Norms that scatter by less than this share are those of readings without an offset.
 _ROUND = 0.12

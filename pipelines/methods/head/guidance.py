@@ -1,4 +1,4 @@
-"""What the person recording a head is told of what has been collected."""
+"""Guidance of the head method: motion while recording and of a plan, faults of the data."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
             yield f"the {who}: {words}", {**scenario, key: motion}
 
 
-# A platform's rate, taken for a bias, wanders by this much, rad/s/sqrt(s): an aircraft's manoeuvres.
+# Random walk of a platform's rate that acts as a bias, rad/s/sqrt(s): an aircraft's manoeuvres.
 _MANOEUVRES = 0.3
 
 

@@ -17,7 +17,7 @@ from alidade.pipelines.estimation.problem import Array, Parameter
 # Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
 _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
-# Pairs of pictures that tell the clock.
+# Pairs of pictures from which the clock is estimated.
 _CLOCK_PAIRS = 1000
 
 
@@ -62,7 +62,7 @@ def guess_picture_clock(
     parameters: tuple[Parameter, Parameter, Parameter],
     sigma: float,
 ) -> Clock:
-    """The clock with which the helmet's gyro tells best what pictures show, guessed with its bias and mount.
+    """Clock that fits the helmet's gyro to the pictures best, estimated with gyro bias and mount.
 
     Args:
         gyro, platform: of helmet and platform, integrated without any bias taken off; None: the platform is at rest.
@@ -94,9 +94,9 @@ def guess_picture_clock(
 
         def miss(x: Array) -> Array:
             turns = turns_at(*taken(x))
-            told = so3.multiply(turns.wxyz, so3.exp(turns.bias_jacobian @ x[3:6]))
+            predicted = so3.multiply(turns.wxyz, so3.exp(turns.bias_jacobian @ x[3:6]))
             vRh = so3.multiply(mount, so3.exp(x[None, :3]))
-            return so3.log(so3.multiply(so3.inverse(so3.compose(vRh, turn, so3.inverse(vRh))), told))
+            return so3.log(so3.multiply(so3.inverse(so3.compose(vRh, turn, so3.inverse(vRh))), predicted))
 
         return miss
 

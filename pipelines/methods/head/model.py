@@ -50,7 +50,7 @@ _FEWEST_FRAMES = 10
 _FEW_OUTLIERS = 0.02
 _FAMILY = "vision"
 
-# Said where it is taken for granted.
+# Stated in the report where it is assumed.
 _AT_REST = "No platform IMU: the platform counts as at rest."
 
 
@@ -62,7 +62,7 @@ class _Model:
     pictures: NDArray[np.intp]  # (K + 1,) those of keyframe k are from pictures[k] to pictures[k + 1]
     stamps: Array  # (frames,)
     taken: Array  # (frames,) s, about when
-    clock: Clock  # that tells so
+    clock: Clock  # of the pictures
     origins: tuple[float, float, float]  # s: of `elapsed`, of the groups that share a keyframe, and how long these are
     elapsed: Array  # (frames,) since the recording's first stamp
     measured: Array  # (frames, 4) cRh
@@ -163,7 +163,7 @@ def _prepare(
 ) -> _Model:
     """The model of a recording, or of one that grows from a keyframe of its model until now on.
 
-    `noises` are those in force; None: as stated. `clock` tells when pictures were taken. Those of a recording that
+    `noises` are those in force; None: as stated. `clock` has the times of the pictures. Those of a recording that
     grows count as taken at their stamps.
     """
     begun = float(data.vision_t[0]) if before is None else before.clock.begun
@@ -176,8 +176,8 @@ def _prepare(
         platform = GyroPath(data.platform_t, data.platform_gyro)
         platform_density = noises["platform_gyro_density"].used
     reference = temperature.reference(data.temperature) if before is None else before.reference
-    warmth = temperature.above(data.temperature, reference, data.head_t)
-    drivers = {SENSITIVITY: data.head_force, GYRO_SLOPE: warmth}
+    temperature_rise = temperature.above(data.temperature, reference, data.head_t)
+    drivers = {SENSITIVITY: data.head_force, GYRO_SLOPE: temperature_rise}
     caused = [each for each, driver in drivers.items() if driver is not None]
     if before is None:
         around = _all_around(data.vision_wxyz)

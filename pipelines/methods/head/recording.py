@@ -1,4 +1,4 @@
-"""A recording of the head method as arrays, and back."""
+"""Topics, config section and arrays of the head method; the arrays from and to a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""How a head result is applied. Frames: v helmet IMU, h markers, c camera, b platform. Methods page, section 3."""
+"""Results of the head method: formulas, findings, figures, validation, attitudes at gyro rate.
+
+Frames: v helmet IMU, h markers, c camera, b platform. Methods page, section 3.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the person recording an indexer is told of what has been collected."""
+"""Guidance of the indexer method: motion while recording and of a plan, faults of the data."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ _KEPT = 64
 _SLOW = 2.0
 # Encoder errors below this, rad, are beneath notice.
 _NO_ERROR = 1e-8
-# How well the scatter at rest tells their noise, in the logarithm.
+# Accuracy of their noise as estimated from the scatter at rest, one sigma of the logarithm.
 _SCATTERED = 0.05
 
 
@@ -249,9 +249,9 @@ def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: St
     # A resting encoder repeats its slow errors from edge to edge, a turning one need not (quantisation).
     turning = np.array([group.run.axis in ("outer", "both"), group.run.axis in ("inner", "both")])
     encoder = np.hypot(model.encoder, np.where(turning, model.slow, 0.0))
-    warmth = group.warmth(temperature.reference(model.data.temperature))
+    temperature_rise = group.temperature_rise(temperature.reference(model.data.temperature))
     average = IndexerAverageFactor.of(
-        group.gyro, group.rates, model.density, encoder, options, wander, THETA_UNIT, warmth
+        group.gyro, group.rates, model.density, encoder, options, wander, THETA_UNIT, temperature_rise
     )
     step.factors.append(Factor.of(group.kind, average.on(*columns)))
 

@@ -1,4 +1,4 @@
-"""A recording of the indexer method as arrays, and back."""
+"""Topics, config section and arrays of the indexer method, from and to a recording."""
 
 from __future__ import annotations
 

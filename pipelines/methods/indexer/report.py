@@ -1,4 +1,7 @@
-"""How an indexer result is applied. Frames: n level, b base, t platform, m IMU on it. Methods page, section 2."""
+"""Results of the indexer method: formulas, figures, validation.
+
+Frames: n level, b base, t platform, m IMU on it. Methods page, section 2.
+"""
 
 from __future__ import annotations
 
@@ -227,8 +230,8 @@ def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array,
         share = np.diff(group.rates.edges) / group.duration
         fixed, cosine, sine = np.moveaxis(group.rates.parts(encoder), 1, 0)
         expected = share @ (fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
-        warmth = group.warmth(values.get(FIRST))
-        drift = bias if warmth is None else bias + share @ warmth * slope
+        temperature_rise = group.temperature_rise(values.get(FIRST))
+        drift = bias if temperature_rise is None else bias + share @ temperature_rise * slope
         found = so3.rotate(tRm, np.linalg.solve(gain, group.mean_gyro - drift))
         errors.append((found - expected) / np.linalg.norm(expected))
     return np.array([float(g.rates.edges[-1]) for g in groups]), np.array(errors).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""What the axes of an indexer did: turns, moves and dwells, found in the encoder stream."""
+"""Turns, moves and dwells of an indexer's axes from its encoders, and groups of windows with their mean rates."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _GAP_SAMPLES = 2.5
 
 @dataclass(frozen=True)
 class Run:
-    """A stretch in which the same axes moved the same way, without gaps in either stream.
+    """A segment in which the same axes moved the same way, without gaps in either stream.
 
     Attributes:
         axis: which one moved.
@@ -232,7 +232,7 @@ class Group:
         """(3,) mean rate over the whole group, rad/s."""
         return np.asarray(np.diff(self.rates.edges) @ self.gyro / self.duration)
 
-    def warmth(self, reference: float | None) -> Array | None:
+    def temperature_rise(self, reference: float | None) -> Array | None:
         """Mean temperatures (n,) above another, degrees Celsius, K; None where nobody measures them."""
         return None if self.celsius is None or reference is None else self.celsius - reference
 

@@ -1,4 +1,4 @@
-"""What the person recording a swaying carrier is told of what has been collected."""
+"""Guidance of the los method: motion while recording and of a plan, faults of the data."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
     """In words, and the changed scenario."""
     for words, motion in sways(scenario["carrier"], _ADDED_SWAY):
         yield f"the carrier: {words}", {**scenario, "carrier": motion}
-    # Another target from the middle of the longest stretch without one found anew.
+    # Another target from the middle of the longest segment of one target.
     found = sorted([0.0, *(loss["end_s"] for loss in scenario["losses"]), scenario["duration_s"]])
     i = int(np.argmax(np.diff(found)))
     middle = 0.5 * (found[i] + found[i + 1])

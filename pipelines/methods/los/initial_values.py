@@ -2,7 +2,7 @@
 
 They come from pictures a second apart. Linearising at zero angles and zero bias is good enough for a minute; over ten
 what they do together would start too far off, and a clock that runs fast or slow would be further off than motion
-around the stamps tells.
+around the stamps determines.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _carried(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
 
 
 def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath, target_rate: Array) -> Array:
-    """phx, phz (n, 2), rad, that one target's pictures would show if the gyro told all since the first of them.
+    """phx, phz (n, 2), rad, predicted for one target's pictures by the gyro alone since the first of them.
 
     The target's frame turns at `target_rate` (3,), rad/s.
     """
@@ -106,7 +106,7 @@ def foreseen(chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measur
 
 
 def _broken_line(t: Array, values: Array) -> Array:
-    """(n, d) the least-squares fit to values (n, d) at times (n,) of a line that bends at knots alone.
+    """(n, d) the least-squares fit to values (n, d) at times (n,) of a piecewise linear function with given knots.
 
     Its normal equations are tridiagonal: knots and times without the product of their numbers.
     """
@@ -275,7 +275,7 @@ _LOST = 0.5
 # A gap in gyro or gimbal longer than so many sample intervals is no sampling jitter.
 _GAP = 5.0
 _FEWEST_PICTURES = 10
-# Times are differences of stamps, which are whole ns: they are told apart beyond this, s.
+# Times are differences of stamps, which are whole ns: they differ beyond this, s.
 _ROUNDING = 1e-9
 # Pictures that a target's first one has to agree with.
 _FOLLOWERS = 5

@@ -47,8 +47,8 @@ from alidade.pipelines.methods.noise import sampled, stated, typical, walking
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
-# Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
-# free when no picture tells the camera's roll (it only turns t), and held for the sake of the arithmetic.
+# Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures determine it. Rotation about the line of
+# sight is free when no picture measures the camera's roll (it only rotates t), and fixed for numerical reasons.
 _WIDE, _HELD = 0.3, 1e-3
 # Families of pictures whose roll is not measured, and is.
 _FAMILIES = ("los", "los with roll")
@@ -57,7 +57,7 @@ _SETTLED = 0.05
 # Pictures within so long, s, share a step, but no more than so many: nobody waits for the estimate between them, and
 # five at once take a smoother little more time than one.
 _TOGETHER, _MOST_TOGETHER = 0.1 - 1e-3, 10
-# So far from its stamp, s, motion around it still tells what gyro and gimbal did when the picture was taken.
+# So far from its stamp, s, motion around it still has the rates of gyro and gimbal at the time of exposure.
 _NEAR = 0.02
 
 

@@ -1,4 +1,4 @@
-"""A recording of the los method as arrays, and back."""
+"""Topics and arrays of the los method, from and to a recording, and checks of gimbal and gyro."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ _STEEPEST = np.deg2rad(80.0)
 _WIDEST_ERROR = 0.5
 # A tracker that reads whole pixels repeats itself while a good gimbal holds the target, but not one value as often.
 _STUCK = 0.9
-# A gimbal is looked at in stretches this long, s, and counts as moved by the carrier beyond this, rad.
+# A gimbal is checked in segments this long, s, and counts as moved by the carrier beyond this, rad.
 _STRETCH, _MOVED = 2.0, 0.01
-# Pictures this far apart, s, and at least so many, tell the signs of the gyro's axes.
+# Pictures this far apart, s, and at least so many, determine the signs of the gyro's axes.
 _STRIDE, _FEWEST = 0.2, 20
-# Another reading is told where it leaves this part of the misfit; those of deg/s and of the gimbal only where the
+# Another reading is reported where it leaves this part of the misfit; those of deg/s and of the gimbal only where the
 # carrier's turn about any axis is this part of the largest: a mount off by 30 deg leaks half of one axis into another.
 _FAR_BETTER, _LEAST_SPREAD = 0.3, 0.3
 # What may be wrong -> weights (2, 3) of the gyro's x, y, z in the turn of the picture about the camera's z and x.
@@ -165,7 +165,7 @@ def los_topics(data: LosData, pictures: series.Pictures | None = None) -> dict[s
 def check_gimbal(topic: str, data: LosData) -> None:
     """Raise InputError if an encoder stands still while the carrier turns and the picture does not move.
 
-    A gimbal locked on purpose is told from a frozen encoder by the LOS error, which then moves with the carrier.
+    A gimbal locked on purpose differs from a frozen encoder in the LOS error, which then moves with the carrier.
     """
     turned = np.empty((len(data.gyro_t), 2))
     for some, by_axes in _turned_by_carrier(data):

@@ -1,4 +1,7 @@
-"""How a los result is applied. Frames: m gyro (IMU), b carrier, l line of sight. Methods page, section 1."""
+"""Results of the los method: formulas, findings, figures, validation.
+
+Frames: m gyro (IMU), b carrier, l line of sight. Methods page, section 1.
+"""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ class LosScenario(BaseModel):
 
     @property
     def gaps(self) -> list[Span]:
-        """[start, end) of all stretches without pictures of the target, s."""
+        """[start, end) of all segments without pictures of the target, s."""
         return [*self.dropouts_s, *((loss.start_s, loss.end_s) for loss in self.losses)]
 
 
@@ -373,7 +373,7 @@ def _slew(scenario: LosScenario, t: Array) -> Array:
 
 
 def _stabilise(scenario: LosScenario, t: Array, gyro: Array) -> Array:
-    """Gimbal angles (N + 1, 2) under the commanded rates, the command taken for the angles at mid-interval."""
+    """Gimbal angles (N + 1, 2) under the commanded rates, commands computed for the angles at mid-interval."""
     dt = 1.0 / scenario.gyro_rate_hz
     angles = np.empty((len(t) + 1, 2))
     angles[0] = np.deg2rad([scenario.azimuth_deg, scenario.elevation_deg])
