@@ -47,6 +47,7 @@ from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.reports.result_json import ParameterResult, truth_errors
 from alidade.pipelines.reports.results_table import (
     LEGEND,
+    MAX_SIGMA_OVER_PRIOR,
     ResultCard,
     ResultGroup,
     ResultRow,
@@ -57,8 +58,6 @@ from alidade.pipelines.reports.results_table import (
 from alidade.pipelines.reports.sketch import enlarged, rotation_text, sketch_with
 from alidade.pipelines.reports.snippets import c_code, python_code
 
-# A value whose sigma exceeds so many sigmas of its prior is not shown.
-_MAX_SIGMA_OVER_PRIOR = 10.0
 # Effects of fixed inputs that are named: the smallest, in sigmas of the parameter, and how many.
 _MIN_EFFECT_SIGMAS, _MAX_EFFECTS = 0.1, 6
 _TONES: dict[str, Tone] = {"calibrated": "good", "weak": "warn", "unobservable": "bad", "inconsistent": "bad"}
@@ -257,7 +256,7 @@ def _use_card(found: UseBands) -> Card:
     curves = Curves(tuple(zip(captions, (plain, applied), strict=True)), tuple(legend))
     condition = Text(f"{use.condition[:1].upper()}{use.condition[1:]}.")
     return Card(
-        (Text(" ".join(parts), soft=False), curves, condition, Details("Formula", formula)),
+        (Text(" ".join(parts), soft=False), curves, condition, Details("Formula", formula, "screen")),
         use.title,
         f"use-{use.name}",
     )
@@ -273,7 +272,7 @@ def _diagnostics(c: Calibration) -> tuple[Block, ...]:
         *more,
         *_titled("Stability during the recording", _stability(c)),
         *_titled("Error budget", _error_budget(c)),
-        *((Tables(own, "pair"),) if own else ()),
+        *((Tables(own),) if own else ()),
     )
 
 
@@ -301,7 +300,12 @@ def _details(c: Calibration) -> tuple[Block, ...]:
         ("Recording", _recording(c)),
         ("Provenance", _provenance(c)),
     ]
-    return tuple(Details(title, blocks, "fold", title.lower().replace(" ", "-")) for title, blocks in parts if blocks)
+    unprinted = ("K matrices and offsets b",)  # the numbers are among the parameters
+    return tuple(
+        Details(title, blocks, "fold screen" if title in unprinted else "fold", title.lower().replace(" ", "-"))
+        for title, blocks in parts
+        if blocks
+    )
 
 
 def direction_blocks(findings: Sequence[Finding]) -> tuple[Block, ...]:
@@ -390,7 +394,7 @@ def _estimate_cells(c: Calibration, q: Quantity) -> tuple[Cell | str, ...]:
 
 
 def _is_known(q: Quantity, p: ParameterResult) -> bool:
-    return p.sigma < _MAX_SIGMA_OVER_PRIOR * q.scale
+    return p.sigma < MAX_SIGMA_OVER_PRIOR * q.scale
 
 
 def _error_column(c: Calibration) -> tuple[Column, ...]:

@@ -27,6 +27,8 @@ _BIAS_UNITS = {"accel": ("mg", 1e3 / _G), "gyro": ("deg/s", _DEG), "mag": ("µT"
 _FACTORS = {"deg": _DEG, "deg/s": _DEG, "deg/h": 3600.0 * _DEG, "ms": 1e3, "%": 100.0, "ppm": 1e6, "µT": 1e6}
 # Scale errors below this are shown in ppm.
 _PPM = 1e-3
+# A value whose sigma exceeds so many sigmas of its prior is not shown.
+MAX_SIGMA_OVER_PRIOR = 10.0
 # Share of a sigma that is a step for derivatives.
 _STEP = 0.01
 # A derived number whose sigma is below this share of its requirement is fixed: rounding.
@@ -47,7 +49,7 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class ResultRow:
-    """A number in the unit of its group; `names`: parameters that it is made of."""
+    """A number in the unit of its group; `names`: parameters that it is made of; `known`: better than ten priors."""
 
     label: str
     value: float
@@ -57,6 +59,7 @@ class ResultRow:
     error: float | None
     names: tuple[str, ...]
     hint: str = ""
+    known: bool = True
 
     def times(self, factor: float) -> ResultRow:
         """In another unit."""
@@ -151,8 +154,8 @@ def _rows(card: ResultCard) -> Iterator[Row]:
             mark, words = MARKS[row.verdict or ""]
             yield (
                 Cell(row.label, hint=row.hint),
-                to_digits_of(row.value, row.sigma),
-                rounded(row.sigma) if row.sigma > 0.0 else "fixed",
+                to_digits_of(row.value, row.sigma) if row.known else "unknown",
+                "" if not row.known else rounded(row.sigma) if row.sigma > 0.0 else "fixed",
                 "" if not row.require else rounded(row.require),
                 Cell("", interval=Interval(row.sigma, row.require, row.error), tone=row.verdict or ""),
                 Cell(mark, tone=row.verdict or "", hint=f"{row.verdict or 'nuisance'}: {words}"),
@@ -173,6 +176,7 @@ def _group(c: Calibration, title: str, unit: str, names: Sequence[str]) -> Resul
             name.rpartition("_")[2],
             *(p.value, p.sigma, p.require, p.observability, error, (name,)),
             hint=f"{name}: {c.method.describe(name)}",
+            known=p.sigma < MAX_SIGMA_OVER_PRIOR * quantities[name].scale,
         )
         rows.append(row.times(factor))
     return ResultGroup(title, human, tuple(rows))
@@ -245,7 +249,8 @@ def _derived(c: Calibration, names: Sequence[str], function: Callable[[Array], A
                 "weak" if doubtful and found == "observable" else found,
                 None if error is None else float(error[i]),
                 tuple(names),
-                "of K and b: " + ", ".join(n for n, d in zip(names, J[i], strict=True) if d)[:80],
+                hint="of K and b: " + ", ".join(n for n, d in zip(names, J[i], strict=True) if d)[:80],
+                known=bool(sigma[i] < MAX_SIGMA_OVER_PRIOR * scale[i]) or fixed,
             )
         )
     return rows

@@ -17,7 +17,7 @@ from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import BEFORE, COLORS, FAINT, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, sphere_map, widest_gap
 from alidade.pipelines.display.table import Table
-from alidade.pipelines.display.units import rounded, to_digits_of
+from alidade.pipelines.display.units import rounded
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings
 from alidade.pipelines.methods import Report, temperature
@@ -536,19 +536,11 @@ def coverage(calibration: Calibration) -> Plot | None:
 
 NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 _NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg(60.0)), "mag": ("nT/√Hz", 1e9)}
-_PARTS = (
-    ("scale", "%", ("x", "y", "z")),
-    ("nonorthogonality", "deg", ("xy", "xz", "yz")),
-    ("mounting", "deg", ("x", "y", "z")),
-)
-# A part of K known no better than this, %, or deg, is not known.
-_UNKNOWN = 20.0
 
 
 def cube_tables(calibration: Calibration) -> list[Table]:
     """Of what was found beside the parameters; empty ones are left out."""
     tables = (
-        _taken_apart(calibration),
         _noise_table(calibration),
         _static_poses(calibration),
         _disturbed_table(calibration),
@@ -559,32 +551,6 @@ def cube_tables(calibration: Calibration) -> list[Table]:
 def rows_of(calibration: Calibration, name: str) -> Sequence[Mapping[str, Any]]:
     """Rows of a table of findings; none if there is no such table."""
     return calibration.tables.get(name, ())
-
-
-def _taken_apart(calibration: Calibration) -> Table:
-    """K of each triad as scale, non-orthogonality and mounting."""
-    triads = rows_of(calibration, "triads")
-    rows = []
-    for part, unit, axes in _PARTS if triads else ():
-        for i, axis in enumerate(axes):
-            cells = [_number(part, triad[part][i], triad[f"{part}_sigma"][i], unit) for triad in triads]
-            what = {"nonorthogonality": "non-orthogonality", "scale": "scale error"}.get(part, part)
-            rows.append((f"{what} {axis}, {unit}", *cells))
-    return Table(
-        "Scale, non-orthogonality, misalignment",
-        "What is in K: by how much each axis says too much, by how much two of them are closer than a right angle, "
-        "and the rotation vector that turns the body's axes into the sensor's, with sigmas.",
-        ("", *(NAMES[triad["sensor"]] for triad in triads)),
-        tuple(rows),
-    )
-
-
-def _number(part: str, value: float, sigma: float, unit: str) -> str:
-    factor = 100.0 if unit == "%" else np.rad2deg(1.0)
-    shown, spread = factor * (value - (part == "scale")), factor * sigma
-    if not spread < _UNKNOWN:
-        return "unknown"
-    return f"{to_digits_of(shown, spread)} ± {rounded(spread)}" if spread > 0.0 else f"{to_digits_of(shown, 0.0)} fixed"
 
 
 def _noise_table(calibration: Calibration) -> Table:

@@ -12,7 +12,6 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.sphere_map import described
-from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.recording import CubeData
@@ -107,7 +106,6 @@ def test_static_poses_are_told_with_what_was_used(solved: Solved) -> None:
 def test_figures_and_tables(solved: Solved) -> None:
     plots = _plots(solved)
     assert list(plots) == [
-        "Scale, non-orthogonality, misalignment",
         "White noise at rest",
         "Static poses",
         "Accelerometer before and after",
@@ -122,10 +120,6 @@ def test_figures_and_tables(solved: Solved) -> None:
         assert np.sqrt((before**2).mean()) > least * np.sqrt((after**2).mean())
     raw, good, _ = plots["Sphere of the accelerometer"].beside[1].marks
     assert np.abs(good.y).max() < 0.1 < 1.0 < np.abs(raw.y).max()
-    table = plots["Scale, non-orthogonality, misalignment"]
-    assert isinstance(table, Table)
-    assert table.columns == ("", "accelerometer", "gyro", "magnetometer")
-    assert [row[0] for row in table.rows][::3] == ["scale error x, %", "non-orthogonality xy, deg", "mounting x, deg"]
     covered = plots["Attitudes covered"]
     assert isinstance(covered, Plot)
     (poses,) = covered.figure.named("poses")
