@@ -38,7 +38,10 @@ _DESKTOP, _PHONE = (1280, (600, 560)), (390, (205, 560))
 _REPORT = (1020, (760, 860))
 _SHEET = (396, 560)
 _GAP, _COLOURS = 10, 48
-_DRAWN = "document.readyState == 'complete' && !document.querySelector('.plot:not([data-drawn])')"
+_DRAWN = (
+    "document.readyState == 'complete' && "
+    "![...document.querySelectorAll('.plot:not([data-drawn])')].some(plot => !plot.closest('details:not([open])'))"
+)
 # Units of a fleet: mounting angles at two dates, of which one has moved.
 _UNITS = {"U1": (0.50, 0.50), "U2": (0.42, 0.42), "U3": (0.57, 0.57), "U4": (0.47, 0.47), "U5": (0.52, 0.90)}
 _SHORT = "{{duration_s: 20, gyro_rate_hz: 100, image_rate_hz: 20, sensors: ideal, angles_deg: {{delta_px: {0}}}}}"
@@ -146,6 +149,8 @@ def _write_figure(tab: Tab, name: str, report: Path, title: str) -> None:
     tab.screen()
     tab.size(845, 380)
     tab.open(report.as_uri())
+    tab.wait("document.readyState == 'complete'", 60.0)
+    tab.value("for (const fold of document.querySelectorAll('details')) fold.open = true")
     tab.wait(_DRAWN, 60.0)
     cards = "[...document.querySelectorAll('.card.figure')]"
     card = f"{cards}.find(card => card.querySelector('h3').textContent.startsWith('{title}'))"
@@ -162,7 +167,7 @@ def _run(*words: str | Path) -> None:
     try:
         cli.main()
     except SystemExit as stop:
-        if stop.code not in (0, None, 3):
+        if stop.code not in (0, None, 3, 4):
             raise
 
 

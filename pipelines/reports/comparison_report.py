@@ -91,7 +91,7 @@ def _comparison_table(calibrations: Sequence[Calibration], quantities: Sequence[
     known = calibrations[0].truth is not None
     columns: list[Column | str] = ["parameter", Column("unit", "text")]
     rows: list[list[Cell | str]] = [
-        [Cell(q.name, calibrations[0].method.describe(q.name)), human_unit(q)[0]] for q in quantities
+        [Cell(q.name, hint=calibrations[0].method.describe(q.name)), human_unit(q)[0]] for q in quantities
     ]
     for c in calibrations:
         solver, errors = c.estimate.solver, truth_errors(c)
@@ -209,7 +209,7 @@ def _halves(c: Calibration, quantities: Sequence[Quantity], halves: Mapping[str,
             half, (unit, factor) = halves[q.name], human_unit(q)
             pairs = ((half.first, half.first_sigma), (half.second, half.second_sigma))
             cells = (_with_sigma(factor * value, factor * sigma) for value, sigma in pairs)
-            rows.append((Cell(q.name, c.method.describe(q.name)), unit, *cells, signed(half.z)))
+            rows.append((Cell(q.name, hint=c.method.describe(q.name)), unit, *cells, signed(half.z)))
     caption = (
         "Each half solved by itself, as if the other had not been recorded. A difference beyond three or four sigmas "
         "means that something changed, or that the model lacks something."

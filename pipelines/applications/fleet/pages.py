@@ -236,11 +236,16 @@ def _consistency(study: Study, solvers: Sequence[str]) -> Summary:
         for solver, nees in judged.items()
     )
     wrong = [solver for solver, nees in judged.items() if not nees.consistent]
+    needed = max(nees.needed for nees in judged.values())
+    fewest = min(nees.runs for nees in judged.values())
+    if not wrong and fewest < needed:
+        text = f"Too few runs to tell: {fewest}, {needed} are needed to see sigmas that are a fifth too small. {said}."
+        return Summary(question, "cannot say", "fixed", text, (), (f"Give `--runs {needed}` or more.",))
     if not wrong:
         steps = ("Rely on the sigmas of recordings like this one; another motion or sensor is another study.",)
         return Summary(question, "yes", "good", f"Errors are as large as the sigmas say: {said}.", (), steps)
     steps = ("See below which parameters' ratio of error to sigma is far from 1, and which are biased.",)
-    return Summary(question, "no", "bad", f"Not those of {', '.join(wrong)}: {said}.", (), steps)
+    return Summary(question, "NO", "bad", f"Not those of {', '.join(wrong)}: {said}.", (), steps)
 
 
 _WITHIN = ("within 1 sigma", "2 sigmas", "3 sigmas")

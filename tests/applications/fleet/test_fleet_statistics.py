@@ -239,3 +239,11 @@ def test_few_units_have_no_spread() -> None:
         assert p.control is None
         assert p.beyond == 0
         assert not p.outlying.any()
+
+
+def test_a_study_needs_runs_enough_to_see_sigmas_a_fifth_too_small() -> None:
+    """At so many runs the 99 % interval ends below 1.44, at half as many it does not."""
+    for dof in (4.0, 22.0):
+        needed = statistics.Nees(1.0, 0.0, 0.0, 1, dof).needed
+        assert statistics.mean_nees(np.ones(needed), np.full(needed, dof)).high / dof < 1.5
+        assert statistics.mean_nees(np.ones(needed // 2), np.full(needed // 2, dof)).high / dof > 1.5
