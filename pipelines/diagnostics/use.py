@@ -11,7 +11,7 @@ N is noise of the use itself (angle random walk of a dead-reckoned attitude; 0 e
 m +- 1.96 sqrt(S). Of a vector the length is shown with the 95 % quantile of |N(m, S)|, whose square is matched in mean
 and variance by a scaled chi-square (Patnaik 1949): mean tr S + m'm, variance 2 tr S^2 + 4 m' S m. Derivatives are
 central differences of a tenth of a sigma. Where 2,000 draws of true ~ N(x, P) show that the error is not linear, the
-bound is the quantile of 10,000 draws. Bands are conditional on the posterior: NEES over seeds is the test of P itself.
+bound is the quantile of 4,000 draws. Bands are conditional on the posterior: NEES over seeds is the test of P itself.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from alidade.pipelines.estimation.problem import Array
 
 Z95 = 1.959963984540054
 # Draws that test whether the error is linear, the coverage that they may show, and draws that give bounds where not.
-_TEST_DRAWS, _COVERAGE, _BOUND_DRAWS = 2000, (0.93, 0.97), 10_000
+_TEST_DRAWS, _COVERAGE, _BOUND_DRAWS = 2000, (0.93, 0.97), 4000
 _CHUNK = 250
 # Bounds smaller than this share of the largest are rounding.
 _NOTHING = 1e-9

@@ -232,7 +232,7 @@ def _use_card(found: UseBands) -> Card:
     if whole > 0.0 and found.figure(lambda band: band.bound) / whole > _GAIN:
         parts.append(f"Applying all estimates, undetermined ones too, would leave {sign}{rounded(whole)} {use.unit}.")
     if found.drawn:
-        parts.append("The error is not linear: bounds are quantiles of 10,000 draws.")
+        parts.append("The error is not linear: bounds are quantiles of 4,000 draws.")
     plain, applied = (Figure(use.y_title, use.x_title, _CURVE_PX) for _ in range(2))
     for line, dash in zip(use.lines, _DASHES, strict=False):
         band, f = found.bands[line.name], use.factor
