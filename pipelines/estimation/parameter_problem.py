@@ -1,6 +1,6 @@
 """Graphs without states: every measurement depends on the shared parameters alone.
 
-parameter_problem("gyro_pair", PARAMETERS, config, initial, "increment", model, dropped=data.dropped)
+parameter_problem("mine", PARAMETERS, config, initial, "increment", model, dropped=data.dropped)
 """
 
 from __future__ import annotations
