@@ -27,8 +27,8 @@ from alidade.pipelines.methods.tumble.turning import DELAY_KEY, FieldGuess, Rows
 from alidade.pipelines.settings import Config
 
 FAMILIES = {"accel": "accelerometer", "mag": "magnetometer"}
-# Prior sigma of the first attitude, rad: as good as none. A magnetometer alone at an unknown place leaves its rotation
-# about the field undetermined, whatever it is, and the start fixes it to this.
+# Prior sigma of the first attitude, rad: as good as none. A magnetometer alone leaves its rotation about the field, which
+# is y then, undetermined: it is fixed to this, and the earth's rate is in the axes that follow.
 _ANY_ATTITUDE, _FIXED = np.pi, 1e-3
 
 
@@ -118,8 +118,8 @@ def _begin(graph: _Graph, step: Step) -> None:
         step.initial.insert(parameter.key, zeros)
         step.factors.append(vector_prior(parameter, zeros))
     chain = turned.chain
-    about_field = _FIXED if turned.earth is None and "accel" not in graph.sensors else _ANY_ATTITUDE
-    sigmas = np.array([_ANY_ATTITUDE, about_field, _ANY_ATTITUDE])  # about the axes of a: the field has no dip there
+    about_field = _ANY_ATTITUDE if "accel" in graph.sensors else _FIXED
+    sigmas = np.array([_ANY_ATTITUDE, about_field, _ANY_ATTITUDE])
     R = so3.matrix(chain.initial[0]) / sigmas[:, None]
     step.factors.append(rotation_about(chain.state(0), chain.initial[0], R))
 

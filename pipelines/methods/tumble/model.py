@@ -136,7 +136,7 @@ class Sensor:
 class Dip:
     """The field's inclination: first guess, rad, and by the field model, rad, with how well that is known, or None.
 
-    A magnetometer alone at an unknown place has none: the level frame is defined by the field, with sigma 0.
+    A magnetometer alone has none: the level frame is defined by the field, with sigma 0.
     """
 
     start: float
@@ -246,7 +246,7 @@ def _chained(
     """Sensors in the gyro's axes, and the dip."""
     *beside, mag = sensors
     beside = [replace(each, symmetric=False, start=each.start @ entries(True).T) for each in map(_of_hand, beside)]
-    sine, premises, found = 0.0 if model is None else np.sin(model[0]), [], _of_guess(mag, gyro)
+    sine, premises, found = 0.0, [], _of_guess(mag, gyro)
     if beside:
         accel = beside[0]
         rows = np.clip(np.searchsorted(mag.time, accel.time), 0, len(mag.time) - 1)
@@ -264,7 +264,7 @@ def _chained(
                 rotation = -rotation
                 premises.append(_LEFT_HANDED_ACCEL)
         beside = [accel if _is_mounted_straight(rotation) else _turned(accel, rotation.T)]
-    elif model is None:
+    else:
         model = 0.0, 0.0
     dip = Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model)
     return [*beside, found], dip, gyro, premises

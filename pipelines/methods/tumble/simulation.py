@@ -59,8 +59,8 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
     slopes = _slopes(scenario, np.random.default_rng([seed, 1]))
     truth |= slopes
     g = 9.80665 if place is None else float(gravity(float(place[0]), 0.0))
+    earth = earth_rate(_LATITUDE if place is None else float(place[0]))
     if (gyro := scenario.gyro) is not None:
-        earth = earth_rate(_LATITUDE if place is None else float(place[0]))
         t, raw, own = _gyro(motion, gyro, scenario.accelerometer, earth, g, rng)
         raw = raw + drift(scenario.temperature, "gyro", slopes, t)
         found |= {"gyro_t": t, "gyro": raw, "gyro_density": gyro.density}
@@ -88,21 +88,19 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
         truth |= _truth("mag", K, b, symmetric=accel is None and gyro is None)
         truth |= {"field_strength": float(np.linalg.norm(field)) / unit}
         if accel is not None or gyro is not None:
-            truth |= _level_frame(field, gyro is not None and place is None, accel is None)
+            estimated = gyro is not None and (place is None or accel is None)
+            truth |= _level_frame(field, earth if estimated else None, accel is None)
     found |= {"temperature": measured(scenario.temperature, motion.duration)}
     return Simulated(TumbleData(EPOCH_NS, **found), truth, tumble_config(scenario))  # type: ignore[arg-type]
 
 
-def _level_frame(field: Array, nowhere: bool, alone: bool) -> dict[str, float]:
-    """Dip and, at an unknown place beside a gyro, the earth's rate; a magnetometer alone defines y by the field."""
-    dip = float(np.arcsin(-field[2] / np.linalg.norm(field)))
-    if not nowhere:
-        return {"field_dip": dip}
-    to_frame = so3.exp(np.array([dip if alone else 0.0, 0.0, 0.0]))
-    rate = so3.rotate(to_frame, earth_rate(_LATITUDE))
-    return {"field_dip": 0.0 if alone else dip} | {
-        f"earth_rate_{a}": float(w) for a, w in zip("xyz", rate, strict=True)
-    }
+def _level_frame(field: Array, earth: Array | None, alone: bool) -> dict[str, float]:
+    """Dip and the earth's rate where it is estimated; a magnetometer alone defines y by the field, and nothing x."""
+    unit = field / np.linalg.norm(field)
+    if alone and earth is not None:
+        return {"field_dip": 0.0, "earth_rate_y": float(earth @ unit)}
+    rates = {} if earth is None else {f"earth_rate_{a}": float(w) for a, w in zip("xyz", earth, strict=True)}
+    return {"field_dip": float(np.arcsin(-unit[2]))} | rates
 
 
 def _slopes(scenario: TumbleScenario, rng: np.random.Generator) -> dict[str, float]:

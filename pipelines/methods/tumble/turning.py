@@ -125,12 +125,13 @@ class Turning:
 
     Attributes:
         chain: the keyframes, joined by the gyro.
-        earth: (3,) rate of n in a, rad/s; None: unknown, a parameter.
+        earth: (3,) rate of n in a, rad/s; None: unknown, as without a place, or without an accelerometer that says
+            where up is: a parameter.
         mag, accel: rows of the sensors' readings that are used, and the keyframe of each, in time order.
         bias, delay: parameters; the delay may be fixed.
         arm: that of an accelerometer which is used while it moves: m, in b, to it from the point about which the
             device is turned; None at rest.
-        earth_rate: parameter, rad/s, in the axes of n at the first keyframe; None where the place is known.
+        earth_rate: parameter, rad/s, in the axes of n at the first keyframe; None where it is known.
         levels: of the gyro's noises.
     """
 
@@ -276,6 +277,7 @@ def turning(
         walk=walk.used,
         errors=errors,
     )
+    earth = None if accel is None or data.latitude is None else _earth(data.latitude, declination)
     delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, 0.5 * np.median(np.diff(data.gyro_t)))))
     known = tuple(
         Quantity(name, "rad/s", config.prior(name, _BIAS_PRIOR), _BIAS_PRIOR, config.require.get(name, _BIAS_REQUIRE))
@@ -283,13 +285,13 @@ def turning(
     )
     return Turning(
         chain=chain,
-        earth=None if data.latitude is None else _earth(data.latitude, declination),
+        earth=earth,
         mag=Rows(inside, np.repeat(np.arange(len(time)), np.diff(begins))),
         accel=rested or Rows(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)),
         bias=Parameter(FIRST, known),
         delay=Parameter(DELAY_KEY, quantities(delay, config)),
         arm=_arm(config) if accel is not None and accel.swung else None,
-        earth_rate=_earth_rate(config) if data.latitude is None else None,
+        earth_rate=_earth_rate(config) if earth is None else None,
         levels=(density, walk),
     )
 
@@ -300,7 +302,7 @@ def _earth(latitude: float, declination: float) -> Array:
 
 
 def _earth_rate(config: Config) -> Parameter:
-    """The earth's rate at an unknown place: of known size, in any direction."""
+    """The earth's rate where its direction in n is unknown: of known size."""
     known = (
         Quantity(name, "rad/s", config.prior(name, EARTH_RATE), EARTH_RATE, np.inf, group="assumption")
         for name in EARTH

@@ -88,9 +88,9 @@ def _solved(simulated: Simulated) -> Estimate:
 
 
 def _errors(estimate: Estimate, truth: dict[str, float] | Any) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of what is free, and their covariance."""
-    free = np.diag(estimate.covariance) > 0.0
-    error = estimate.values - np.array([truth[name] for name in estimate.names])
+    """Errors of what is free and has a truth, and their covariance."""
+    free = (np.diag(estimate.covariance) > 0.0) & [name in truth for name in estimate.names]
+    error = estimate.values - np.array([truth.get(name, 0.0) for name in estimate.names])
     return error[free], estimate.covariance[np.ix_(free, free)]
 
 
