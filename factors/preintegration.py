@@ -29,7 +29,8 @@ _UNEVEN = 0.05
 _GAP = 1.5
 # Sample intervals integrated together, and how many such blocks are kept.
 _BLOCK, _KEPT = 1 << 16, 48
-# s, half of what accelerations are differenced over: short against motion, long against the noise of a sample.
+# s, half of what accelerations are differenced over: short against motion, long against the noise of a sample; and no
+# shorter than half an interval between samples.
 _HALF = 0.007
 # Windows looked up together.
 _TOGETHER = 20_000
@@ -73,7 +74,8 @@ class GyroPath:
     """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
 
     It is integrated block by block. The first blocks looked at are kept, three million samples, and the others of a
-    longer stream are integrated anew when they are needed. Stamps and rates as given stay at hand as `t` and `read`.
+    longer stream are integrated anew when they are needed. Stamps and rates as given stay at hand as `t` and `read`,
+    the median interval between stamps, s, as `interval`.
 
     Args:
         t: (N,) stamps, s, increasing, N >= 2.
@@ -99,6 +101,7 @@ class GyroPath:
         if self._driving.ndim != 2 or len(self._driving) != len(self.read):
             raise ValueError(f"needs drivers for each rate; got {self._driving.shape} and {self.read.shape}")
         self._unseen = _gap_variance(self.t, self.read)
+        self.interval = float(np.median(np.diff(self.t)))
         self._last = (len(self.t) - 2) // _BLOCK
         self._kept: dict[int, _Block] = {}
         # Attitudes at the blocks' starts.
@@ -165,13 +168,14 @@ class GyroPath:
         return np.asarray(rate + slope * s)
 
     def acceleration(self, at: ArrayLike) -> tuple[Array, Array]:
-        """Angular acceleration (n, 3) at the times, rad/s^2, and its derivative by the time; differences over 14 ms."""
-        at = np.asarray(at, dtype=float)
-        i, s = self._place(np.concatenate([at - _HALF, at + _HALF]))
+        """Angular acceleration (n, 3) at the times, rad/s^2, by differences over 14 ms or a sample interval, if that is
+        longer, and its derivative by the time."""
+        at, half = np.asarray(at, dtype=float), max(_HALF, 0.5 * self.interval)
+        i, s = self._place(np.concatenate([at - half, at + half]))
         rate, slope = self._line(i, _rates)
         rate = rate + slope * s
         n = len(at)
-        return (rate[n:] - rate[:n]) / (2.0 * _HALF), (slope[n:] - slope[:n]) / (2.0 * _HALF)
+        return (rate[n:] - rate[:n]) / (2.0 * half), (slope[n:] - slope[:n]) / (2.0 * half)
 
     def drivers(self, at: ArrayLike) -> Array | None:
         """The drivers (n, d) at the times; None without."""

@@ -131,6 +131,7 @@ class GyroSheet(Sheet):
     scale: SigmaOrZero | None = None  # no unit
     skew: SigmaOrZero | None = None  # rad: half the angle error between two axes
     g_sensitivity: SigmaOrZero | None = None  # rad/s per m/s^2
+    filter: SigmaOrZero | None = None  # s^2, half the second moment of its impulse response, beyond a sample interval's
     temperature: SigmaOrZero | None = None  # rad/s/K, slope of the bias
 
 

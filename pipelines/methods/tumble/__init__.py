@@ -24,6 +24,7 @@ PARAMETERS = (
     *turning.SCALE,
     turning.SENSITIVITY,
     turning.DELAY,
+    turning.FILTER,
     ParameterSpec("accel_arm", "m", 0.3, "Lever arm from the point of rotation to the accelerometer, {axis}."),
     ACCEL_SQUARE,
     *SLOPES,

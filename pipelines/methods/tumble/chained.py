@@ -23,12 +23,12 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.tumble.model import Model, Sensor
 from alidade.pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.methods.tumble.turning import DELAY_KEY, FieldGuess, Rows, Seen, Turning, turning
+from alidade.pipelines.methods.tumble.turning import DELAY_KEY, FILTER_KEY, FieldGuess, Rows, Seen, Turning, turning
 from alidade.pipelines.settings import Config
 
 FAMILIES = {"accel": "accelerometer", "mag": "magnetometer"}
-# Prior sigma of the first attitude, rad: as good as none. A magnetometer alone leaves its rotation about the field, which
-# is y then, undetermined: it is fixed to this, and the earth's rate is in the axes that follow.
+# Prior sigma of the first attitude, rad: as good as none. A magnetometer alone leaves its rotation about the field,
+# which is y then, undetermined: it is fixed to this, and the earth's rate is in the axes that follow.
 _ANY_ATTITUDE, _FIXED = np.pi, 1e-3
 
 
@@ -130,7 +130,15 @@ def _field(graph: _Graph, keyframes: range) -> list[Factor]:
     if not len(seen.row):
         return []
     factor = FieldFactor(*_measured(turned, sensor, seen), chain.gyro, turned.errors, turned.earth)
-    keys = TRIAD_KEYS["mag"], STRENGTH_KEYS["mag"], DIP_KEY, DELAY_KEY, *chain.error_keys, *_earth_key(turned)
+    keys = (
+        FILTER_KEY,
+        TRIAD_KEYS["mag"],
+        STRENGTH_KEYS["mag"],
+        DIP_KEY,
+        DELAY_KEY,
+        *chain.error_keys,
+        *_earth_key(turned),
+    )
     states = [chain.state(int(k)) for k in seen.keyframe]
     return [Factor.of(FAMILIES["mag"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
 
@@ -147,7 +155,7 @@ def _up(graph: _Graph, keyframes: range) -> list[Factor]:
     factor = UpFactor(*measured, chain.gyro, turned.errors, turned.earth, unit, drivers)
     arm = [] if turned.arm is None else [turned.arm.key]
     slope = [] if drivers is None else [SLOPE_KEY]
-    keys = TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope, *_earth_key(turned)
+    keys = FILTER_KEY, TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope, *_earth_key(turned)
     states = [chain.state(int(k)) for k in seen.keyframe]
     return [Factor.of(FAMILIES["accel"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
 

@@ -20,7 +20,7 @@ from alidade.pipelines.estimation.parameters import ParameterSpec, parameter
 from alidade.pipelines.estimation.parameters import stated as sheet
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.methods.noise import stated
+from alidade.pipelines.methods.noise import sampled, stated
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
 from alidade.pipelines.methods.static_intervals import quiet_intervals
 from alidade.pipelines.methods.triads import triad_names
@@ -320,7 +320,7 @@ def _turned(sensor: Sensor, rotation: Array) -> Sensor:
 
 
 def _rests(data: TumbleData, config: Config) -> Array | None:
-    """Beginnings and ends (P, 2), s, of when accelerometer and magnetometer were quiet; None where that is too few."""
+    """Beginnings and ends (P, 2), s, of when all sensors were quiet; None where that is too few."""
     assert data.accel is not None
     assert data.accel_t is not None
     t = data.accel_t
@@ -329,13 +329,21 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
     unit = 1.0 if _is_si("accel", data.accel) else max(size, np.finfo(float).tiny)
     streams = [(data.accel / unit, stated("accel_density", config).stated * root_rate)]
     if data.mag is not None and data.mag_t is not None:
-        mag = np.stack([np.interp(t, data.mag_t, axis) for axis in data.mag.T], axis=1)
+        mag = _at(t, data.mag_t, data.mag)
         streams.append((mag / mag.std(), 1e-3))
+    if data.gyro is not None and data.gyro_t is not None:
+        density = sampled(stated("gyro_density", config, data.gyro_density), data.gyro_t, data.gyro).used
+        streams.insert(0, (_at(t, data.gyro_t, data.gyro), density * root_rate))
     try:
         found = quiet_intervals(t, streams, FEWEST)
     except InputError:
         return None
     return found if len(found) >= _FEWEST_RESTS else None
+
+
+def _at(time: Array, stamps: Array, values: Array) -> Array:
+    """Vectors (n, 3) at the times, linear between their stamps."""
+    return np.stack([np.interp(time, stamps, axis) for axis in values.T], axis=1)
 
 
 def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sensor:
@@ -525,7 +533,7 @@ def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[ND
     step = 1.5 * float(np.median(np.diff(t)))
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     rows = np.flatnonzero((at >= t[0]) & (at <= t[-1]) & (t[after] - t[after - 1] <= step))
-    readings = np.stack([np.interp(at[rows], t, axis) for axis in values.T], axis=1)
+    readings = _at(at[rows], t, values)
     return rows, at[rows], readings, np.ones(len(rows))
 
 

@@ -17,7 +17,7 @@ from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quant
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
-from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, EARTH, SCALE, SENSITIVITY
+from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, EARTH, FILTER, SCALE, SENSITIVITY
 from alidade.pipelines.settings import Config, check_names
 
 TRIAD_KEYS = {"accel": int(gtsam.symbol("A", 0)), "mag": int(gtsam.symbol("M", 0))}
@@ -136,7 +136,7 @@ def _check_names(config: Config) -> None:
         *BIAS,
         *ARM,
         *EARTH,
-        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, ACCEL_SQUARE, *SLOPES)),
+        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, FILTER, ACCEL_SQUARE, *SLOPES)),
     ]
     check_names(config.priors, known, "priors")
     check_names(config.require, known, "require")

@@ -183,6 +183,7 @@ def _gyro(
     names = (*(f"gyro_scale_{a}" for a in "xyz"), *(f"gyro_skew_{a}" for a in ("xy", "xz", "yz")))
     truth = dict(zip(names, S.tolist(), strict=True))
     truth |= {f"gyro_bias_{a}": float(x) for a, x in zip("xyz", bias, strict=True)}
+    truth["gyro_filter"] = rate_hz**-2 / 24.0  # a point's beside that of a mean over an interval
     if beside is not None:
         truth |= {f"gyro_g_{a}{c}": float(G[i, j]) for i, a in enumerate("xyz") for j, c in enumerate("xyz")}
     return t, exact + sensor.density * np.sqrt(rate_hz) * rng.standard_normal(exact.shape), truth

@@ -41,9 +41,17 @@ BIAS = tuple(f"gyro_bias_{axis}" for axis in "xyz")
 SCALE = gyro_scale("gyro", "gyro", 1e-2)
 SENSITIVITY = g_sensitivity(2e-4)
 DELAY = scalar("mag_delay", "s", 1e-2, "Magnetometer time delay (true time minus stamp).", "mag.delay")
+# A low-pass of 10 ms.
+FILTER = scalar(
+    "gyro_filter",
+    "s^2",
+    5e-5,
+    "Low-pass of the gyro: half the second moment of its impulse response, beyond a mean over its sample interval.",
+    "gyro.filter",
+)
 ARM = tuple(f"accel_arm_{axis}" for axis in "xyz")
 EARTH = tuple(f"earth_rate_{axis}" for axis in "xyz")
-DELAY_KEY, ARM_KEY, _ERRORS_KEY, _EARTH_KEY = (int(gtsam.symbol(letter, 0)) for letter in "drGe")
+DELAY_KEY, FILTER_KEY, ARM_KEY, _ERRORS_KEY, _EARTH_KEY = (int(gtsam.symbol(letter, 0)) for letter in "dlrGe")
 # m; of the hand that turns a device.
 _ARM_PRIOR = 0.3
 _BIAS_PRIOR, _BIAS_REQUIRE = 0.05, 2e-3
@@ -128,7 +136,7 @@ class Turning:
         earth: (3,) rate of n in a, rad/s; None: unknown, as without a place, or without an accelerometer that says
             where up is: a parameter.
         mag, accel: rows of the sensors' readings that are used, and the keyframe of each, in time order.
-        bias, delay: parameters; the delay may be fixed.
+        bias, delay, filter: parameters; the last two may be fixed.
         arm: that of an accelerometer which is used while it moves: m, in b, to it from the point about which the
             device is turned; None at rest.
         earth_rate: parameter, rad/s, in the axes of n at the first keyframe; None where it is known.
@@ -141,6 +149,7 @@ class Turning:
     accel: Rows
     bias: Parameter
     delay: Parameter
+    filter: Parameter
     arm: Parameter | None
     earth_rate: Parameter | None
     levels: tuple[Level, ...]
@@ -149,7 +158,9 @@ class Turning:
     def parameters(self) -> tuple[Parameter, ...]:
         """In reporting order."""
         return tuple(
-            each for each in (self.bias, self.chain.errors, self.delay, self.arm, self.earth_rate) if each is not None
+            each
+            for each in (self.bias, self.chain.errors, self.delay, self.filter, self.arm, self.earth_rate)
+            if each is not None
         )
 
     @property
@@ -278,7 +289,10 @@ def turning(
         errors=errors,
     )
     earth = None if accel is None or data.latitude is None else _earth(data.latitude, declination)
-    delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, 0.5 * np.median(np.diff(data.gyro_t)))))
+    # A low-pass of half an interval delays by as much; the second moment of its response is the square of that.
+    lag = 0.5 * float(np.median(np.diff(data.gyro_t)))
+    delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, lag)))
+    low_pass = replace(FILTER, prior=float(np.hypot(FILTER.prior, 0.5 * lag**2)))
     known = tuple(
         Quantity(name, "rad/s", config.prior(name, _BIAS_PRIOR), _BIAS_PRIOR, config.require.get(name, _BIAS_REQUIRE))
         for name in BIAS
@@ -290,6 +304,7 @@ def turning(
         accel=rested or Rows(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)),
         bias=Parameter(FIRST, known),
         delay=Parameter(DELAY_KEY, quantities(delay, config)),
+        filter=Parameter(FILTER_KEY, quantities(low_pass, config)),
         arm=_arm(config) if accel is not None and accel.swung else None,
         earth_rate=_earth_rate(config) if earth is None else None,
         levels=(density, walk),
