@@ -229,10 +229,14 @@ class _Table:
         return len(steps) > 2 and bool(np.mean(steps >= 0.0) > 0.99) and bool(np.mean(steps > 0.0) > 0.4)
 
     def _triads(self) -> dict[str, tuple[int, ...]]:
-        """Kind -> columns along x, y and z: by names, and without a header by numbers."""
+        """Kind -> columns along x, y and z: by names, or the file's of three alone, and without a header by numbers."""
         out: dict[str, tuple[int, ...]] = {}
-        if self._form.names[0] == "column 1":
-            first = 1 if self._increases(0) else 0
+        along = _along_axes(self._form.names)
+        first = 1 if self._increases(0) else 0
+        if self._form.names[0] == "column 1" and len(self._values) == first + 3 and _kind(self.path.stem.lower()):
+            along = [("", (first, first + 1, first + 2))]
+            self.doubts.append(f"{self.path.name}: its columns are named after the file: check it")
+        elif self._form.names[0] == "column 1":
             for i in range(first, len(self._values) - 2, 3):
                 columns: tuple[int, ...] = (i, i + 1, i + 2)
                 if not self._moves(columns):
@@ -243,9 +247,9 @@ class _Table:
                     where = f"{self.path.name}: columns {i + 1} to {i + 3}"
                     self.doubts.append(f"{where} are {kind} by their size: check it")
             return out
-        for name, columns in _along_axes(self._form.names):
+        for name, columns in along:
             name = name or self.path.stem.lower()  # x, y, z alone: the file is named after the sensor
-            kind = next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
+            kind = _kind(name)
             # ROS calls linear acceleration what has gravity in it.
             is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
             if is_linear or (kind == "accel" and self._lacks_gravity(columns)):
@@ -302,6 +306,11 @@ class _Table:
                 if abs(float(np.median(self._norms(columns))) - 1.0) < 0.01:
                     return self._names(columns)
         return []
+
+
+def _kind(name: str) -> str:
+    """The sensor that a name, lower case, is about; empty: none."""
+    return next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
 
 
 def _bare(name: str) -> str:

@@ -130,6 +130,17 @@ def test_a_file_is_named_after_its_sensor(tmp_path: Path) -> None:
     assert (found.columns["/imu"].time, found.columns["/imu"].unit) == ("time", "ns")
 
 
+def test_three_columns_without_a_header_are_what_the_file_is_named_after(tmp_path: Path) -> None:
+    counts = 3500.0 * DIRECTIONS + [10_000.0, -8_000.0, 8_500.0]
+    found = propose_columns(open_recording(write(tmp_path / "mag3_raw.csv", "", counts)))
+    assert found is not None
+    assert found.columns["/mag"].field == ("column 1", "column 2", "column 3")
+    assert "named after the file: check it" in " ".join(found.doubts)
+    unnamed = propose_columns(open_recording(write(tmp_path / "run7.csv", "", counts)))
+    assert unnamed is not None
+    assert not unnamed.columns
+
+
 def test_a_phones_files_of_one_sensor_each_are_one_imu(tmp_path: Path) -> None:
     write(tmp_path / "Accelerometer.csv", "Time (s),acc x (g),acc y (g),acc z (g)", SECONDS, DIRECTIONS)
     write(tmp_path / "Gyroscope.csv", "Time (s),gyr x (rad/s),gyr y (rad/s),gyr z (rad/s)", SECONDS, RATES)

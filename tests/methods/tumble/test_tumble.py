@@ -20,6 +20,7 @@ from alidade.factors.testing import assert_jacobians
 from alidade.factors.turned import FieldFactor, UpFactor
 from alidade.pipelines.applications.planning import make_plan
 from alidade.pipelines.applications.session import Session, resolve_method
+from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate
@@ -39,7 +40,7 @@ from alidade.pipelines.methods.tumble.unturned import unturned
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.sensors import Warming
 from alidade.pipelines.simulation.simulated import Simulated
@@ -576,6 +577,19 @@ def test_nothing_changed_in_a_clean_recording_with_rests_of_a_second(seed: int) 
     assert np.abs(off).max() < 4.0
 
 
+def test_gyro_clipped_at_its_range_is_noticed(tmp_path: Path) -> None:
+    """Scale errors of -7.7 % were blamed."""
+    simulated = _simulated(SECOND, 2)
+    clipped = replace(simulated.data, gyro=np.clip(simulated.data.gyro, -2.0, 2.0))
+    TUMBLE.write(tmp_path / "s.mcap", replace(simulated, data=clipped))
+    calibration = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None).calibrate(report=False)
+    assert calibration.status == "calibrated"
+    assert re.search("saturated: [0-9]+ samples left out", " ".join(calibration.notes))
+    for axis in "xyz":
+        found = calibration.parameters[f"gyro_scale_{axis}"]
+        assert abs(found.value - simulated.truth[f"gyro_scale_{axis}"]) < 4.0 * found.sigma
+
+
 def test_a_rest_counts_as_one_attitude() -> None:
     data = _simulated(TumbleScenario(attitudes=4, rest_s=3.0), 1).data
     (sensor,) = prepare(data, Config.model_validate({"noise": {"mag_density": 5e-8}})).sensors
@@ -610,13 +624,10 @@ def test_the_figures_of_a_published_example(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.linalg.inv(K), np.diag(axes), atol=1e-4)
 
 
-def test_a_real_magnetometer_alone(tmp_path: Path) -> None:
+def test_a_real_magnetometer_alone() -> None:
     """ICM-20948 counts, tumbled by hand indoors: the published centre to 0.2 % of the field, and within its sigmas."""
-    counts = np.loadtxt(_shared("icm20948") / "mag3_raw.csv", delimiter=",")
-    rows = [f"{0.2 * k:.1f},{x:g},{y:g},{z:g}" for k, (x, y, z) in enumerate(counts)]
-    (tmp_path / "mag.csv").write_text("\n".join(["t,x,y,z", *rows]))
-    config = Config.model_validate({"columns": {"/mag": {"time": "t", "field": ["x", "y", "z"]}}})
-    calibration = Session.read(open_recording(tmp_path / "mag.csv"), None, config).calibrate()
+    path = _shared("icm20948") / "mag3_raw.csv"
+    calibration = Session.read(*_concluded(path)).calibrate()
     assert calibration.method.name == "tumble"
     K, b, spread = _centre_with_sigmas(calibration.estimate)
     centre = -np.linalg.solve(K, b)
@@ -627,6 +638,18 @@ def test_a_real_magnetometer_alone(tmp_path: Path) -> None:
     # Soft iron as published, for a sphere of 1000, within sigmas and to 0.2 %.
     soft = np.array([[0.25060, 0.02942, -0.02955], [0.02942, 0.31692, 0.00789], [-0.02955, 0.00789, 0.30592]])
     np.testing.assert_allclose(1e3 * K, soft, atol=7e-4)
+
+
+def _concluded(path: Path) -> tuple[Recording, None, Config]:
+    """A table as a new user opens it."""
+    recording, config = with_columns(open_recording(path), Config())
+    return recording, None, config
+
+
+def test_one_ring_determines_nothing() -> None:
+    """HMC5883L, turned about one axis."""
+    path = _shared("reports") / "files" / "ring_mag_sample.txt"
+    assert Session.read(*_concluded(path)).calibrate(report=False).status in ("weak", "unobservable")
 
 
 def _centre_with_sigmas(estimate: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
