@@ -41,14 +41,8 @@ BIAS = tuple(f"gyro_bias_{axis}" for axis in "xyz")
 SCALE = gyro_scale("gyro", "gyro", 1e-2)
 SENSITIVITY = g_sensitivity(2e-4)
 DELAY = scalar("mag_delay", "s", 1e-2, "Magnetometer time delay (true time minus stamp).", "mag.delay")
-# A low-pass of 10 ms.
-FILTER = scalar(
-    "gyro_filter",
-    "s^2",
-    5e-5,
-    "Low-pass of the gyro: half the second moment of its impulse response, beyond a mean over its sample interval.",
-    "gyro.filter",
-)
+# A low-pass of 10 ms, beyond a mean over the sample interval.
+FILTER = scalar("gyro_filter", "s^2", 5e-5, "Low-pass of the gyro (half its response's second moment).", "gyro.filter")
 ARM = tuple(f"accel_arm_{axis}" for axis in "xyz")
 EARTH = tuple(f"earth_rate_{axis}" for axis in "xyz")
 DELAY_KEY, FILTER_KEY, ARM_KEY, _ERRORS_KEY, _EARTH_KEY = (int(gtsam.symbol(letter, 0)) for letter in "dlrGe")
