@@ -14,6 +14,7 @@ import pytest
 from alidade.pipelines import files
 from alidade.pipelines.applications.fleet.store import RecordingResult, Store
 from alidade.pipelines.applications.fleet.tables import write_csv
+from alidade.pipelines.applications.follow.sources import source_of
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml
@@ -47,6 +48,15 @@ def test_what_is_no_regular_file_is_refused_at_once(reader: str, kind: str, tmp_
         READERS[reader](path)
     assert time.monotonic() - start < 1.0
     assert str(path) in str(refused.value)
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe"])
+def test_what_never_ends_is_not_followed(kind: str, tmp_path: Path) -> None:
+    path = Path("/dev/zero") if kind == "device" else tmp_path / "x"
+    if kind == "pipe":
+        os.mkfifo(path)
+    with pytest.raises(InputError, match="a device or a pipe, and no regular file"):
+        source_of(str(path))
 
 
 YAML = {

@@ -18,6 +18,7 @@ from typing import BinaryIO
 
 from alidade.pipelines.applications.follow.spool import RETRY_PERIOD_S, Spool
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import require_regular
 from alidade.pipelines.recording.mcap_records import MAGIC
 from alidade.pipelines.recording.opening import Where, is_closed, parts_in
 from alidade.pipelines.recording.recording import open_recording
@@ -196,7 +197,7 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
         say: is told of connections, and what goes wrong with them.
 
     Raises:
-        InputError: a folder cannot be written, or a library is not installed.
+        InputError: a folder cannot be written, a library is not installed, or what is there is a device or a pipe.
     """
     if what == "-":
         return StandardInput(folder, say=say)
@@ -204,7 +205,10 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
         from alidade.pipelines.applications.follow.bridge import Bridge
 
         return Bridge(what, folder, say)
-    return Source(Path(what))
+    path = Path(what)
+    if path.exists() and not path.is_dir():
+        require_regular(path)
+    return Source(path)
 
 
 def _size(path: Path) -> int:
