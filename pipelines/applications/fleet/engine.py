@@ -16,12 +16,13 @@ import importlib.util
 import logging
 import queue
 import signal
-import threading
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from importlib import metadata
 from itertools import islice
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -167,27 +168,34 @@ def _result(client: Client, future: Future) -> Any:
 def _local(jobs: int | None) -> Any:
     from dask.system import CPU_COUNT
     from distributed import LocalCluster
+    from distributed.utils import LoopRunner
 
-    # Ctrl-C reaches every process on the terminal; workers inherit deafness to it and leave it to this one.
-    with _deaf():
-        return LocalCluster(
-            n_workers=jobs or CPU_COUNT,
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
+    # Ctrl-C reaches every process on the terminal; workers inherit the mask of the thread that starts them, and leave
+    # it to this one, which hears it meanwhile. The tracker of resources, started by the first of them, would undo it.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    runner = LoopRunner()
+    runner.start()
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    class Cluster(LocalCluster):  # type: ignore[misc]
+        """Closed by its block alone: one that Ctrl-C has met half made is none that could be closed at exit."""
+
+        shutdown_on_close = property(lambda _: False, lambda *_: None)
+
+    return Cluster(
+        n_workers=jobs or CPU_COUNT,
+        threads_per_worker=1,
+        loop=runner.loop,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    )
 
 
-@contextmanager
-def _deaf() -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+def answer_interruption() -> bool:
+    """Answers Ctrl-C at once: workers take a while to end."""
+    print("interrupted: what is finished is written", file=sys.stderr, flush=True)
+    return True
 
 
 def _require_workers(client: Client, timeout: float) -> None:

@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.fleet import require_extra
-from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
+from alidade.pipelines.applications.fleet.engine import (
+    Killed,
+    answer_interruption,
+    cluster,
+    completed,
+    source_version,
+)
 from alidade.pipelines.applications.fleet.histories import packed
 from alidade.pipelines.applications.fleet.recordings import Recording, as_date, from_metadata, from_name, local
 from alidade.pipelines.applications.fleet.store import (
@@ -170,7 +176,7 @@ def _calibrated_all(
                 else:
                     fresh[name] = result
         except KeyboardInterrupt:
-            return fresh, again, True
+            return fresh, again, answer_interruption()
     return fresh, again, False
 
 

@@ -20,7 +20,13 @@ import numpy as np
 
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.fleet import require_extra, statistics
-from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
+from alidade.pipelines.applications.fleet.engine import (
+    Killed,
+    answer_interruption,
+    cluster,
+    completed,
+    source_version,
+)
 from alidade.pipelines.applications.fleet.store import (
     ParameterError,
     RunResult,
@@ -175,7 +181,7 @@ def run_study(
                     else:
                         store.add(name, result)
             except KeyboardInterrupt:
-                interrupted = True
+                interrupted = answer_interruption()
     known = {**store.results, **killed}
     results = {seed: known[str(seed)] for seed in seeds if str(seed) in known}
     name = Path(scenario or chosen.default_scenario()).stem

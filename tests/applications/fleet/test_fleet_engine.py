@@ -222,7 +222,7 @@ def test_ctrl_c_keeps_what_is_finished(
     # As a terminal does: to every process of the group.
     os.killpg(command.pid, signal.SIGINT)
     output, error = command.communicate(timeout=60)
-    assert (command.returncode, error) == (130, "")
+    assert (command.returncode, error) == (130, "interrupted: what is finished is written\n")
     assert "interrupted; the same command continues" in output
     kept = len(finished(out))
     assert 2 <= kept < 10
@@ -230,6 +230,20 @@ def test_ctrl_c_keeps_what_is_finished(
     assert alidade(monkeypatch, *words, "--scheduler", local_cluster) == 0
     assert f"10 of 10 recordings, {kept} from an earlier run" in capsys.readouterr().out
     assert len(rows_of(out)) == 10
+
+
+@pytest.mark.parametrize(
+    "after", [3.0, pytest.param(4.5, marks=pytest.mark.slow), pytest.param(6.0, marks=pytest.mark.slow)]
+)
+def test_ctrl_c_is_heard_while_workers_start(after: float, start: Start, recordings: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = start("alidade", "fleet", recordings / "*.mcap", "--out", out, "--jobs", 2)
+    time.sleep(after)
+    os.killpg(command.pid, signal.SIGINT)
+    _, error = command.communicate(timeout=60)
+    assert command.returncode in (130, -signal.SIGINT)
+    assert "Traceback" not in error
+    assert len(finished(out)) < COUNT
 
 
 @pytest.mark.slow
