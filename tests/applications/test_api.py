@@ -461,3 +461,14 @@ def test_all_that_the_command_does_is_there(
     files, missing = alidade.certificate(tmp_path / "out")
     assert {path.name for path in files} == {"certificate.html", "certificate.json"}
     assert "serial" in missing
+
+
+def test_arrays_are_looked_at_as_files_are() -> None:
+    """A component that never changes was not measured; sensors that contradict one another are named."""
+    data = alidade.simulate("los", {"duration_s": 20.0, "gyro_rate_hz": 100.0}).data
+    error = np.column_stack([data.error[:, :2], np.zeros(len(data.error))])
+    session = alidade.open(replace(data, error=error), method="los")
+    assert np.isnan(session.data.error[:, 2]).all()
+    assert [reason for reason in session.data.dropped if "column 2 reads one value throughout" in reason]
+    with pytest.raises(alidade.InputError, match="arrays: gyro: gimbal and pictures show that the gyro is in deg/s"):
+        alidade.open(replace(data, gyro=np.rad2deg(data.gyro)), method="los")

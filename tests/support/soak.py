@@ -55,7 +55,7 @@ class Soak:
         sent, lost: messages of the bridge, and those missing in the recording.
         astray: of the lost those that the bridge did not send about when it hung up.
         failed: threads that ended with an exception.
-        memory: (n, 2) s and MiB of this process.
+        memory: (n, 2) s and MiB of this process while the bridge plays.
     """
 
     calibration: Calibration
@@ -101,7 +101,8 @@ def soak(folder: Path, seconds: float, clients: int) -> Soak:
     dropped = np.array([sent[int(share * len(sent))][0] for share in drops])
     apart = np.abs(lost[:, None] - dropped).min(axis=1, initial=np.iinfo(np.int64).max)
     astray = int((apart > _IN_FLIGHT_S * 1e9).sum())
-    return Soak(live, recording, attacks, refused, full[0], len(sent), len(lost), astray, failed, np.array(memory))
+    used = np.array([each for each in memory if each[0] < seconds])
+    return Soak(live, recording, attacks, refused, full[0], len(sent), len(lost), astray, failed, used)
 
 
 def _free_port() -> int:
@@ -237,8 +238,8 @@ def main() -> None:
     print(
         f"{given.minutes:g} min, {given.clients} clients: {found.attacks} attacks ({found.refused} refused), disk full "
         f"at {found.full} writes; {found.lost} of {found.sent} messages lost, {found.astray} of them not in flight "
-        f"when the bridge hung up; {len(found.failed)} threads failed; {found.calibration.status}; memory at most "
-        f"{found.peak(0.2, 0.6):.0f} MiB from 20 to 60 % of the time, {found.peak(0.6, 1.0):.0f} MiB after"
+        f"when the bridge hung up; {len(found.failed)} threads failed; {found.calibration.status}; memory by tenths of "
+        f"the time, MiB: {', '.join(f'{found.peak(0.1 * i, 0.1 * i + 0.1):.0f}' for i in range(10))}"
     )
 
 

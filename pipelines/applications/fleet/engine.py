@@ -70,7 +70,7 @@ def cluster(scheduler: str | None, jobs: int | None) -> Iterator[Client]:
     if jobs is not None and (scheduler is not None or jobs < 1):
         raise InputError(f"--jobs {jobs}: a number of local workers, 1 or more, and not together with --scheduler")
     # Lost workers and connections are in the results, or an error of one line.
-    for name in ("distributed", "distributed.client"):
+    for name in ("distributed", "distributed.client", "tornado.application", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         address = scheduler or stack.enter_context(_local(jobs))
