@@ -165,7 +165,8 @@ def _result(client: Client, future: Future) -> Any:
         ) from error
 
 
-def _local(jobs: int | None) -> Any:
+@contextmanager
+def _local(jobs: int | None) -> Iterator[Any]:
     from dask.system import CPU_COUNT
     from distributed import LocalCluster
     from distributed.utils import LoopRunner
@@ -183,13 +184,17 @@ def _local(jobs: int | None) -> Any:
 
         shutdown_on_close = property(lambda _: False, lambda *_: None)
 
-    return Cluster(
-        n_workers=jobs or CPU_COUNT,
-        threads_per_worker=1,
-        loop=runner.loop,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    )
+    try:
+        with Cluster(
+            n_workers=jobs or CPU_COUNT,
+            threads_per_worker=1,
+            loop=runner.loop,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        ) as local:
+            yield local
+    finally:
+        runner.stop()
 
 
 def answer_interruption() -> bool:
