@@ -39,6 +39,8 @@ _MAX_TESTED, _MAX_REPORTED = 3, 3
 _NOISE_KNOWN = 0.1
 # A score is promising below this share of the score as recorded, and below so many times the best one.
 _PROMISING, _MAX_RIVAL = 0.97, 3.0
+# Scores within this share of the best are alike: the flip of any axis is the exchange of any two, with another mount.
+_ALIKE = 0.05
 # Noise less than this factor from its statement is not reported.
 _MIN_NOISE_FACTOR = 1.1
 _WHAT = "testing hypotheses"
@@ -126,16 +128,19 @@ def _explaining(build: Build, cases: Iterable[TrialCase], before: TrialFit, conc
 
 
 def _promising(build: Build, model: FaultModel, data: Any, config: Config, before: TrialFit) -> list[TrialCase]:
-    """The cases worth solving, by their scores after a few iterations on a short segment."""
+    """The cases worth solving, by their scores after a few iterations on a short segment, alike ones by priors."""
     found = list(trial_cases(build, model, data, config))
     cases = [*found, TrialCase("", data, config)]
     if model.cut and before.estimate.residuals:
         worst = _worst_segment(before.estimate.residuals, _SCORE_SEGMENT_S)
         cases = [TrialCase(case.label, model.segment(case.data, *worst), case.config) for case in cases]
     works = [partial(score_trial, build, case.data, case.config, case.label) for case in cases]
-    *scores, recorded = parallel.done(works, _WHAT, max_concurrent(model.times(cases[-1].data)))
-    enough = min(_PROMISING * recorded, _MAX_RIVAL * min(scores, default=np.inf))
-    return [found[i] for i in np.argsort(scores)[:_MAX_TESTED] if scores[i] < enough]
+    scored = parallel.done(works, _WHAT, max_concurrent(model.times(cases[-1].data)))
+    (*scores, recorded), (*priors, _) = zip(*scored, strict=True)
+    best = min(scores, default=np.inf)
+    enough = min(_PROMISING * recorded, _MAX_RIVAL * best)
+    order = np.lexsort((priors, np.maximum(scores, (1.0 + _ALIKE) * best)))
+    return [found[i] for i in order[:_MAX_TESTED] if scores[i] < enough]
 
 
 def _worst_segment(residuals: Mapping[str, Residuals], length: float) -> tuple[float, float]:

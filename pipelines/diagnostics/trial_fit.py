@@ -74,14 +74,21 @@ class TrialFit:
 
     @property
     def cost(self) -> float:
-        """Chi-square, the rejected measurements included."""
-        return self.chi_square.value + self.lost
+        """Chi-square, the rejected measurements and the priors of assumed errors included.
+
+        A gyro whose scale is -1 fits where an axis has the wrong sign.
+        """
+        return self.chi_square.value + self.lost + sum(self._assumed)
 
     @property
     def cost_with_priors(self) -> float:
-        """The same with how far the solution is from its priors: what weighs corrections that fit alike."""
-        found = zip(self.quantities, self.estimate.values.tolist(), strict=True)
-        return self.cost + sum(((x - q.prior_mean) / q.prior_sigma) ** 2 for q, x in found if q.prior_sigma)
+        """The same with how far the rest of the solution is from its priors: it weighs corrections that fit alike."""
+        return self.chi_square.value + self.lost + sum(_from_priors(self.quantities, self.estimate.values))
+
+    @property
+    def _assumed(self) -> list[float]:
+        rows = [i for i, q in enumerate(self.quantities) if q.assumed]
+        return _from_priors([self.quantities[i] for i in rows], self.estimate.values[rows])
 
     @property
     def factor(self) -> float:
@@ -90,9 +97,16 @@ class TrialFit:
 
     @property
     def fits(self) -> bool:
-        """Whether chi-square lies within its interval with no more than a few outliers rejected."""
-        few = self.chi_square.dof > (1.0 - _MAX_OUTLIERS) * self.dof
-        return few and self.chi_square.value <= Fit.of(0.0, self.chi_square.dof).high
+        """Whether chi-square, and that of the assumed errors, lie within, with no more than a few outliers rejected."""
+        few, priors = self.chi_square.dof > (1.0 - _MAX_OUTLIERS) * self.dof, self._assumed
+        within = not priors or sum(priors) <= Fit.of(0.0, float(len(priors))).high
+        return few and within and self.chi_square.value <= Fit.of(0.0, self.chi_square.dof).high
+
+
+def _from_priors(quantities: Sequence[Quantity], values: Array) -> list[float]:
+    """Squares of how far values (n,) are from their priors, in the priors' sigmas."""
+    found = zip(quantities, values.tolist(), strict=True)
+    return [((x - q.prior_mean) / q.prior_sigma) ** 2 for q, x in found if q.prior_sigma]
 
 
 def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> TrialFit | None:
@@ -104,13 +118,13 @@ def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> Tri
     return _tried(label, partial(_solution, build, data, config))
 
 
-def score_trial(build: Build, data: Any, config: Config, label: str = "") -> float:
-    """Median whitened residual of the measurements plus that of the processes, near the least-squares solution.
+def score_trial(build: Build, data: Any, config: Config, label: str = "") -> tuple[float, float]:
+    """Median whitened residual of measurements plus that of processes near the least-squares solution, and its priors.
 
     Infinite when there is no solution; exceptions as of `solve_trial`.
     """
     score = _tried(label, lambda: _score(build(data, config)))
-    return np.inf if score is None else score
+    return (np.inf, np.inf) if score is None else score
 
 
 def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
@@ -143,20 +157,22 @@ def max_concurrent(times: Sequence[Array]) -> int:
     return max(_MAX_SAMPLES // max((len(time) for time in times), default=1), 1)
 
 
-def _score(problem: Problem) -> float:
+def _score(problem: Problem) -> tuple[float, float]:
     from alidade.pipelines.solvers.engines import Compiled
     from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
     from alidade.pipelines.solvers.linearization import NOT_MEASURED
+    from alidade.pipelines.solvers.posterior import Reported
 
     compiled = Compiled.of(problem)
     engine, config = compiled.engine.under(None), LevenbergConfig(_SCORE_ITERATIONS, max_damping=_MAX_SCORE_DAMPING)
-    whitened = list(
-        zip(engine.groups, engine.residuals(minimize(engine, compiled.initial, config).values), strict=True)
-    )
+    values = minimize(engine, compiled.initial, config).values
+    whitened = list(zip(engine.groups, engine.residuals(values), strict=True))
     measured = [np.abs(r).ravel() for group, r in whitened if group.is_measurement]
     processes = [r for group, r in whitened if not group.is_measurement and group.family not in NOT_MEASURED]
     sizes = [np.sqrt((r**2).mean(axis=1)) for r in processes]
-    return sum(float(np.median(np.concatenate(each))) for each in (measured, sizes) if each)
+    numbers = Reported.of(problem, compiled.layout, values, compiled.current_keys).numbers
+    score = sum(float(np.median(np.concatenate(each))) for each in (measured, sizes) if each)
+    return score, sum(_from_priors(problem.quantities, numbers))
 
 
 def held_out_residuals(problem: Problem) -> dict[str, float]:

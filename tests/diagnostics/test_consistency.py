@@ -140,6 +140,14 @@ def test_signs_of_the_helmet_gyro(head: Case, signs: tuple[float, ...]) -> None:
     assert label == f"the sign of the helmet gyro's {axes} is wrong"
 
 
+def test_a_flipped_axis_where_mounts_and_scales_are_free_is_told_from_its_equivalents() -> None:
+    """With nothing stated a scale of -1 and another mount fit as well, but for their priors."""
+    scenario = HeadScenario(duration_s=12.0, vision_rate_hz=15, gyro_rate_hz=100, platform=None)
+    data, _ = simulate_head(scenario, 1)
+    flipped = replace(data, head_gyro=data.head_gyro * np.array([1.0, 1.0, -1.0]))
+    assert first_hypothesis((method("head"), flipped, Config())) == "the sign of the helmet gyro's z is wrong"
+
+
 @pytest.mark.slow
 def test_sign_of_the_platform_gyro(head: Case) -> None:
     find, data, config = head
