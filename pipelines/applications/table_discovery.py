@@ -208,6 +208,10 @@ class _Table:
         unnamed = self._form.names[0] == "column 1"
         chosen: int | None = next(iter(called), 0 if unnamed and increasing[:1] == [0] else None)
         if chosen is None:
+            still = [name for name in self._form.names if _TIME.search(_bare(name))]
+            self.doubts += [
+                f"{self.path.name}: {name} is no time: it does not increase from row to row" for name in still
+            ]
             return {}
         name = self._names([chosen])[0]
         if ":" in str(self._texts[chosen][0]):

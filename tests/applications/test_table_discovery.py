@@ -141,6 +141,15 @@ def test_three_columns_without_a_header_are_what_the_file_is_named_after(tmp_pat
     assert not unnamed.columns
 
 
+def test_a_time_with_too_few_digits_is_told(tmp_path: Path) -> None:
+    found = propose_columns(
+        open_recording(write(tmp_path / "x.csv", "t,mx,my,mz", np.full(N, 1.75e9), 48.0 * DIRECTIONS))
+    )
+    assert found is not None
+    assert found.columns["/mag"].rate == 100.0
+    assert "x.csv: t is no time: it does not increase from row to row" in found.doubts
+
+
 def test_a_phones_files_of_one_sensor_each_are_one_imu(tmp_path: Path) -> None:
     write(tmp_path / "Accelerometer.csv", "Time (s),acc x (g),acc y (g),acc z (g)", SECONDS, DIRECTIONS)
     write(tmp_path / "Gyroscope.csv", "Time (s),gyr x (rad/s),gyr y (rad/s),gyr z (rad/s)", SECONDS, RATES)
