@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 # Amplitudes of roll, pitch and heading, deg.
 MOTIONS = {"wide": (5.0, 45.0, 360.0), "middle": (5.0, 5.0, 360.0), "low": (5.0, 45.0, 90.0)}
 # Data sheet of the simulated gyro, and what the peers assume: no errors but its bias.
-PERFECT = Config.model_validate({"sensors": {"gyro": {"scale": 0.0, "skew": 0.0}}})
+PERFECT = Config.model_validate({"sensors": {"gyro": {"scale": 0.0, "skew": 0.0, "filter": 0.0}}})
 _EPOCH_NS = 1_700_000_000_000_000_000
 _FIELD = np.array([227.207, 51.796, 411.731]) * 1e-7  # T, level
 _SOFT = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])

@@ -283,10 +283,10 @@ def turning(
         errors=errors,
     )
     earth = None if accel is None or data.latitude is None else _earth(data.latitude, declination)
-    # A low-pass of half an interval delays by as much; the second moment of its response is the square of that.
+    # A mean up to its stamp is late by half an interval, and has h^2 / 24 more of a filter than a point.
     lag = 0.5 * float(np.median(np.diff(data.gyro_t)))
     delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, lag)))
-    low_pass = replace(FILTER, prior=float(np.hypot(FILTER.prior, 0.5 * lag**2)))
+    low_pass = replace(FILTER, prior=float(np.hypot(FILTER.prior, lag**2 / 6.0)))
     known = tuple(
         Quantity(name, "rad/s", config.prior(name, _BIAS_PRIOR), _BIAS_PRIOR, config.require.get(name, _BIAS_REQUIRE))
         for name in BIAS
