@@ -74,7 +74,8 @@ def diagnose(
     failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": estimate.message})
     if not estimate.converged and not published:
         return by_severity([*hypotheses, failure, *rejections(estimate, limits)])
-    directions = weak_directions(quantities, estimate.covariance, advise)
+    # What data with a fault determine says nothing of what they would without it.
+    directions = () if hypotheses else weak_directions(quantities, estimate.covariance, advise)
     found = [*directions, *contradictions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
         found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
