@@ -48,9 +48,13 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     """The config in a recording's attachment, overridden key by key by a file or another config. Raises InputError."""
     base = _read(attachment, f"attachment {ATTACHMENT}") if attachment is not None else {}
     more: dict[Any, Any] = {}
-    belief = None
+    gaussian_prior = None
     if isinstance(override, Config):
-        belief, more, override = override.belief, override.model_dump(exclude_unset=True), Path("config")
+        gaussian_prior, more, override = (
+            override.gaussian_prior,
+            override.model_dump(exclude_unset=True),
+            Path("config"),
+        )
     elif override is not None:
         more = _read(read_bytes(override, MAX_YAML_BYTES), str(override))
     try:
@@ -64,7 +68,7 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
         where = str(override) if _has(more, ("topics", key)) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
     config = config.of(str(override) if override is not None else f"attachment {ATTACHMENT}")
-    return config if belief is None else config.believing(belief)
+    return config if gaussian_prior is None else config.with_prior(gaussian_prior)
 
 
 def first_error(error: ValidationError) -> tuple[tuple[int | str, ...], str]:

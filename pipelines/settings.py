@@ -26,8 +26,8 @@ from pydantic import (
 )
 from pydantic import Tag as Case
 
-from alidade.pipelines.belief import Belief, independent
 from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.noises import NOISES
 from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.recording.table_topics import TableTopic
@@ -314,7 +314,7 @@ class Config(Section):
     longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None  # deg east
     altitude_m: float | None = None  # above the ellipsoid
     date: Date | None = None  # of the field model; default: the stamps
-    _belief: Belief | None = PrivateAttr(None)
+    _gaussian_prior: GaussianPrior | None = PrivateAttr(None)
     _origin: str = PrivateAttr("")
 
     @property
@@ -334,24 +334,27 @@ class Config(Section):
         return given.sigma if isinstance(given, KnownPrior) else given
 
     @property
-    def belief(self) -> Belief | None:
+    def gaussian_prior(self) -> GaussianPrior | None:
         """Prior means and covariance from elsewhere than the config, as an earlier calibration."""
-        return self._belief
+        return self._gaussian_prior
 
-    def believing(self, belief: Belief) -> Config:
+    def with_prior(self, gaussian_prior: GaussianPrior) -> Config:
         """The same config with what is known from elsewhere; what it says of priors itself goes before that."""
         out = self.model_copy()
-        out._belief = belief
+        out._gaussian_prior = gaussian_prior
         return out
 
     @property
-    def beliefs(self) -> list[Belief]:
+    def gaussian_priors(self) -> list[GaussianPrior]:
         """Priors with means: those given by hand, and what is known from elsewhere of the other parameters."""
         given = {name: prior for name, prior in self.priors.items() if isinstance(prior, KnownPrior)}
         by_hand = independent(list(given), [p.mean for p in given.values()], [p.sigma for p in given.values()])
-        if self._belief is None:
+        if self._gaussian_prior is None:
             return [by_hand] if given else []
-        return [by_hand, self._belief.of([name for name in self._belief.names if name not in self.priors])]
+        return [
+            by_hand,
+            self._gaussian_prior.of([name for name in self._gaussian_prior.names if name not in self.priors]),
+        ]
 
     def topic(self, topic: Topic) -> str:
         """Name of a topic, renamed or default."""

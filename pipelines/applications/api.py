@@ -219,7 +219,7 @@ def load(path: str | Path, config: Settings = None) -> SavedCalibration:
     saved = load_calibration(Path(path), load_config(None, _override(config)))
     known = load_known(Path(path))
     joint = with_covariance(known, Path(path))
-    return saved if joint is known else saved.knowing(joint.belief)
+    return saved if joint is known else saved.knowing(joint.gaussian_prior)
 
 
 def simulate(

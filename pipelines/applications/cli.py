@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.recording.opening import Where
     from alidade.pipelines.reports.result import Calibration
 
-# Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
+# Errors that are printed in one line, by name: to import the second takes gtsam's quarter of a second.
 _TROUBLE = {"InputError": exit_codes.BAD_INPUT, "IndeterminateError": exit_codes.UNDETERMINED}
 
 

@@ -260,7 +260,7 @@ def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[s
 
 
 def _moving_pairs(recording: Recording, topic: str) -> list[tuple[str, str]]:
-    """The pairs of frames of a TFMessage topic that are told of most often, as moving ones are."""
+    """The pairs of frames of a TFMessage topic that occur most often, as moving ones are."""
     try:
         counts = {pair: len(found) for pair, found in recording.transforms(topic).items()}
     except InputError:

@@ -1,4 +1,4 @@
-"""Exit codes of the command line, which a fleet tells for each recording."""
+"""Exit codes of the command line, which a fleet prints for each recording."""
 
 from __future__ import annotations
 

@@ -25,16 +25,15 @@ import numpy as np
 from alidade.pipelines import progress
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.sharing import DAY_S, walk_as_told, walks
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.diagnostics.device_changes import Changes, Rate, changes
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.believing import believing
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import kind
+from alidade.pipelines.estimation.prior_replacement import with_priors
 from alidade.pipelines.estimation.problem import (
     Array,
     ChiSquare,
@@ -42,15 +41,16 @@ from alidade.pipelines.estimation.problem import (
     Parameter,
     Problem,
     Quantity,
+    SqrtInformation,
     Step,
-    Told,
 )
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.reports.joint_report import recording_blocks
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import PartParameter, PartResult
-from alidade.pipelines.solvers.joint import Joined, grown, join, tell
+from alidade.pipelines.solvers.joint import Joined, grown, information_at_levels, join
 
 # The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
 # square), and those that were not tried are foreseen to; so many times they are tried.
@@ -75,14 +75,14 @@ class Alone:
     Attributes:
         calibration: what result.json says of it by itself, without the data behind it.
         day: its date, days since 1970.
-        told: what it says of its numbers.
+        sqrt_info: information about its numbers.
         quantities: of its graph.
         data: the file in which its data wait.
     """
 
     calibration: Calibration
     day: float
-    told: Told
+    sqrt_info: SqrtInformation
     quantities: Mapping[str, Quantity]
     data: Path
 
@@ -90,7 +90,7 @@ class Alone:
     def of(cls, session: Session, calibration: Calibration, data: Path) -> Alone:
         """Of a session's calibration by batch; its data go into a file."""
         estimate = calibration.estimate
-        assert estimate.told is not None
+        assert estimate.sqrt_info is not None
         with data.open("wb") as stream:
             pickle.dump(session.data, stream)
         small = Estimate(
@@ -109,7 +109,7 @@ class Alone:
             calibration.problem,
             steps=_no_steps,
             steps_after=None,
-            onward=None,
+            continuation=None,
             attitudes=None,
             at_gyro_rate=None,
             finer=None,
@@ -117,7 +117,7 @@ class Alone:
         return cls(
             calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
             day=_day(session),
-            told=estimate.told,
+            sqrt_info=estimate.sqrt_info,
             quantities={q.name: q for q in problem.quantities},
             data=data,
         )
@@ -211,19 +211,23 @@ def _rates(method: Method, alone: Sequence[Alone]) -> dict[str, float]:
     return walks(method, alone[0].calibration.config, names)
 
 
-def _with_those_before(session: Session, alone: Sequence[Alone], told: Told) -> dict[str, float]:
+def _with_those_before(session: Session, alone: Sequence[Alone], sqrt_info: SqrtInformation) -> dict[str, float]:
     """A recording's numbers as they are with the recordings before it; none where these are of another device."""
     if not alone or alone[0].calibration.method is not session.method:
         return {}
     rates = _rates(session.method, alone)
-    before = [(each.day, each.told) for each in alone]
-    order = sorted([*before, (_day(session), told)], key=lambda each: each[0])
+    before = [(each.day, each.sqrt_info) for each in alone]
+    order = sorted([*before, (_day(session), sqrt_info)], key=lambda each: each[0])
     joined = join([each for _, each in order], rates, [day for day, _ in order])
     if _far_apart(joined):
         return {}
-    place = next(i for i, (_, each) in enumerate(order) if each is told)
-    belief = joined.all(place)
-    return {name: float(mean) for name, mean in zip(belief.names, belief.mean, strict=True) if name in told.names}
+    place = next(i for i, (_, each) in enumerate(order) if each is sqrt_info)
+    gaussian_prior = joined.all(place)
+    return {
+        name: float(mean)
+        for name, mean in zip(gaussian_prior.names, gaussian_prior.mean, strict=True)
+        if name in sqrt_info.names
+    }
 
 
 def _day(session: Session) -> float:
@@ -240,13 +244,13 @@ def _far_apart(joined: Joined) -> bool:
 
 
 def _walks(alone: Sequence[Alone], rates: Mapping[str, float]) -> dict[str, Rate]:
-    """Kind of numbers -> how far these walk, where that is stated, or asked of the recordings and told by them."""
+    """Kind of numbers -> how far these walk, where that is stated, or estimated from the recordings."""
     config = alone[0].calibration.config
     asked = {kind(name) for name in walk_as_told(config, list(rates))}
     days = [each.day for each in alone]
-    told = _changes(alone, join([each.told for each in alone], rates, days)).rates if asked else {}
+    sqrt_info = _changes(alone, join([each.sqrt_info for each in alone], rates, days)).rates if asked else {}
     stated = {kind(name): Rate(rate, rate) for name, rate in rates.items() if rate}
-    return {**stated, **{which: rate for which, rate in told.items() if which in asked}}
+    return {**stated, **{which: rate for which, rate in sqrt_info.items() if which in asked}}
 
 
 def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
@@ -256,18 +260,18 @@ def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
 
 def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
     """The joint estimate, and by how much it moved last, in sigmas."""
-    told, days = [each.told for each in alone], [each.day for each in alone]
-    joined, step = join(told, rates, days), np.inf
+    sqrt_info, days = [each.sqrt_info for each in alone], [each.day for each in alone]
+    joined, step = join(sqrt_info, rates, days), np.inf
     if _far_apart(joined):
         return joined, 0.0
     for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
         before = joined
         # What is wrong with a linearisation grows with the square of how far it is from there.
-        squares = [joined.distance(i, each) ** 2 for i, each in enumerate(told)]
+        squares = [joined.distance(i, each) ** 2 for i, each in enumerate(sqrt_info)]
         order = sorted(range(len(alone)), key=lambda i: -squares[i])
         for done, i in enumerate(progress.track(order, "joining", len(order)), 1):
-            told[i] = _again(method, alone[i], joined.others(i), rates).with_priors_of(told[i])
-            joined = join(told, rates, days)
+            sqrt_info[i] = _again(method, alone[i], joined.others(i), rates).with_priors_of(sqrt_info[i])
+            joined = join(sqrt_info, rates, days)
             step = before.sigmas_to(joined)
             near, far = (sum(squares[k] for k in some) for some in (order[:done], order[done:]))
             if step * far < _STAYS * near:
@@ -277,10 +281,10 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
     return joined, step
 
 
-def _again(method: Method, alone: Alone, others: Belief, rates: Mapping[str, float]) -> Told:
+def _again(method: Method, alone: Alone, others: GaussianPrior, rates: Mapping[str, float]) -> SqrtInformation:
     """What a recording says, linear where the others have the device to be."""
-    problem = believing(method.graph(alone.loaded(), alone.calibration.config), [others])
-    return tell(problem, alone.calibration.estimate.levels, rates)
+    problem = with_priors(method.graph(alone.loaded(), alone.calibration.config), [others])
+    return information_at_levels(problem, alone.calibration.estimate.levels, rates)
 
 
 def _calibration(
@@ -293,17 +297,17 @@ def _calibration(
 ) -> Calibration:
     """The joint estimate as a calibration: of the device as it was last, with that recording's own numbers."""
     last = len(alone) - 1
-    belief = joined.all(last)
-    found = dict(zip(belief.names, belief.mean.tolist(), strict=True))
+    gaussian_prior = joined.all(last)
+    found = dict(zip(gaussian_prior.names, gaussian_prior.mean.tolist(), strict=True))
     names = tuple(dict.fromkeys([*(q.name for q in problem.quantities), *found]))
     problem = replace(problem, parameters=_with_others(problem, alone, found), premises=())
     quantities = {q.name: q for q in problem.quantities}
-    rows = np.array([names.index(name) for name in belief.names], dtype=np.intp)
+    rows = np.array([names.index(name) for name in gaussian_prior.names], dtype=np.intp)
     values = np.array([found.get(name, quantities[name].prior_mean) for name in names])
     of_device = {name for name, _ in joined.unknowns}
     inflation = np.array([_inflation(name, alone if name in of_device else alone[last:]) for name in names])
     covariance = np.zeros((len(names), len(names)))
-    covariance[np.ix_(rows, rows)] = belief.covariance
+    covariance[np.ix_(rows, rows)] = gaussian_prior.covariance
     extra = np.diag([quantities[name].extra_sigma ** 2 if name in found else 0.0 for name in names])
     covariance = covariance * np.outer(inflation, inflation) + extra
     converged = len(alone) == 1 or step < _STAYS
@@ -343,8 +347,8 @@ def _calibration(
 def _with_extra(shares: Mapping[str, float], k: int, covariance: Array, extra: Array) -> dict[str, float]:
     """Shares of a number's variance with that of what its graph does not model."""
     beyond = float(extra[k, k] / covariance[k, k])
-    told = {source: share * (1.0 - beyond) for source, share in shares.items()}
-    return {**told, "not modelled": beyond} if beyond else told
+    sqrt_info = {source: share * (1.0 - beyond) for source, share in shares.items()}
+    return {**sqrt_info, "not modelled": beyond} if beyond else sqrt_info
 
 
 def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, float]) -> tuple[Parameter, ...]:
@@ -434,11 +438,11 @@ def _combined_levels(each: Sequence[Sequence[Level]]) -> tuple[Level, ...]:
 
 
 def _combined(levels: Sequence[Level]) -> Level:
-    newest, told = levels[-1], [(x.found, x.sigma) for x in levels if x.found is not None and x.sigma]
+    newest, sqrt_info = levels[-1], [(x.found, x.sigma) for x in levels if x.found is not None and x.sigma]
     scale = float(np.mean([level.used for level in levels])) / newest.noise.stated if newest.noise.stated else 1.0
-    if not told:
+    if not sqrt_info:
         return replace(newest, scale=scale, found=None, sigma=None)
-    found, sigma = np.array(told, dtype=float).T
+    found, sigma = np.array(sqrt_info, dtype=float).T
     information = float((sigma**-2.0).sum())
     return replace(newest, scale=scale, found=float((found / sigma**2).sum()) / information, sigma=information**-0.5)
 
@@ -478,7 +482,7 @@ def _facts(facts: Sequence[SessionFacts]) -> SessionFacts:
 def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
     """What a recording has of its own, from all recordings, and what it says of the device by itself."""
     by_itself, part = alone.calibration, joined.parts[i]
-    belief = joined.all(i).of([*part.own, *joined.walking])
+    gaussian_prior = joined.all(i).of([*part.own, *joined.walking])
 
     def number(name: str, value: float, sigma: float) -> PartParameter:
         quantity = alone.quantities[name]
@@ -494,13 +498,15 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
         status=by_itself.status,
         headline=by_itself.headline,
         dof=_freedoms(by_itself),
-        parameters=[number(*each) for each in zip(belief.names, belief.mean, belief.sigmas, strict=True)],
+        parameters=[
+            number(*each) for each in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True)
+        ],
         alone=[PartParameter(name=p.name, value=p.value, sigma=p.sigma, unit=p.unit) for p in found],
     )
 
 
 def _freedoms(by_itself: Calibration) -> float | None:
-    """Degrees of freedom by which a recording tells its own noise; None: it was stated, or there is no chi-square."""
+    """Degrees of freedom of a recording about its own noise; None: it was stated, or there is no chi-square."""
     estimate = by_itself.estimate
     return (
         estimate.chi_square.dof

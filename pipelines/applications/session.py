@@ -20,7 +20,7 @@ import numpy as np
 
 from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
-from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.applications.sharing import device_prior, walks
 from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
 from alidade.pipelines.config import configured, load_config
 from alidade.pipelines.diagnostics.change_test import (
@@ -49,8 +49,8 @@ from alidade.pipelines.estimation.problem import (
     History,
     Problem,
     Quantity,
+    SqrtInformation,
     Step,
-    Told,
 )
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
@@ -239,8 +239,8 @@ class Session:
             InputError: it cannot be used, is another method's, or was made of this recording.
         """
         known, origin = load_known(prior), self.origin
-        belief = device_belief(known, self.method, self.config, origin.sha256(), origin.epoch_ns)
-        return replace(self, config=self.config.believing(belief))
+        gaussian_prior = device_prior(known, self.method, self.config, origin.sha256(), origin.epoch_ns)
+        return replace(self, config=self.config.with_prior(gaussian_prior))
 
     def again(self, recording: Recording) -> Session:
         """The same method and config with another recording, or another part of it. Raises InputError."""
@@ -310,7 +310,7 @@ class Session:
         with self.usual_time("incremental" in solvers):
             return self.judged(solved, {} if self.read_s is None else {"read": self.read_s}, check, report)
 
-    def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
+    def calibrated_beside(self, others: Callable[[SqrtInformation], Mapping[str, float]]) -> Calibration:
         """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
 
         Args:
@@ -437,10 +437,10 @@ class Session:
             return ()
         from alidade.pipelines.solvers.freed import freed_information
 
-        told = freed_information(self._freed[1], estimate)
+        sqrt_info = freed_information(self._freed[1], estimate)
         ratios = estimate.inflations if estimate.sandwich is None else estimate.inflations * estimate.sandwich
         ratio = max((r for r, q in zip(ratios.tolist(), quantities, strict=True) if q.judged), default=1.0)
-        return () if told is None else contradictions(told, self._freed[1].quantities, quantities, ratio)
+        return () if sqrt_info is None else contradictions(sqrt_info, self._freed[1].quantities, quantities, ratio)
 
     @cached_property
     def _freed(self) -> tuple[Config, Problem] | None:
@@ -494,7 +494,7 @@ class Session:
         self,
         solver: str,
         window: float | None,
-        others: Callable[[Told], Mapping[str, float]] | None = None,
+        others: Callable[[SqrtInformation], Mapping[str, float]] | None = None,
         report: bool = True,
     ) -> tuple[Estimate, Problem]:
         problem = self.problem()
@@ -659,7 +659,7 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         )
     raise InputError(
         f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
-        f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
+        f"({ENCODING}): `alidade info` lists them for each method, `topics:` in the config can rename"
         + (f"; nearest is {nearest}" if nearest else "")
     )
 

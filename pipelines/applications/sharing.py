@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
 from alidade.pipelines.reports.known import Known
 from alidade.pipelines.settings import Config
@@ -42,7 +42,7 @@ def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, flo
 
 
 def walk_as_told(config: Config, names: Sequence[str]) -> list[str]:
-    """The parameters whose walk several recordings are to tell."""
+    """The parameters whose walk several recordings are to determine."""
     return [name for name in names if _share(config, name) == "walks"]
 
 
@@ -52,7 +52,7 @@ def _share(config: Config, name: str) -> str | float | None:
     return found[-1] if found else None
 
 
-def device_belief(known: Known, method: Method, config: Config, sha256: str, start_ns: int) -> Belief:
+def device_prior(known: Known, method: Method, config: Config, sha256: str, start_ns: int) -> GaussianPrior:
     """What an earlier calibration says of the device at the time of another recording.
 
     Args:
@@ -64,22 +64,28 @@ def device_belief(known: Known, method: Method, config: Config, sha256: str, sta
 
     Raises:
         InputError: the calibration is another method's, has no sigmas worth the name, or is of this very recording; or
-            how far a parameter walks is to be told.
+            the walk of a parameter is to be estimated.
     """
-    source = known.belief.source
+    source = known.gaussian_prior.source
     known.of_method(method.name)
     if known.solver == "published":
         raise InputError(f"{source}: is of the published solver, whose sigmas make no prior; use batch's")
     if known.sha256 == sha256:
         raise InputError(f"{source}: was made of this very recording, which would count twice; name another one's")
-    rates = walks(method, config, known.belief.names)
-    for name in walk_as_told(config, known.belief.names):
-        raise InputError(f"share: how far {name} walks, only several recordings together tell; give a number")
-    told = [name for name, sigma in zip(known.belief.names, known.belief.sigmas, strict=True) if sigma > 0.0]
-    belief = known.belief.of([name for name in told if name in rates])
+    rates = walks(method, config, known.gaussian_prior.names)
+    for name in walk_as_told(config, known.gaussian_prior.names):
+        raise InputError(f"share: how far {name} walks, only several recordings together determine it; give a number")
+    uncertain = [
+        name for name, sigma in zip(known.gaussian_prior.names, known.gaussian_prior.sigmas, strict=True) if sigma > 0.0
+    ]
+    gaussian_prior = known.gaussian_prior.of([name for name in uncertain if name in rates])
     days = abs(start_ns - known.start_ns) * 1e-9 / DAY_S
-    walked = np.diag([rates[name] ** 2 * days for name in belief.names])
+    walked = np.diag([rates[name] ** 2 * days for name in gaussian_prior.names])
     date = datetime.datetime.fromtimestamp(known.start_ns // 1_000_000_000, datetime.UTC).date()
     verdict = "" if known.status == "calibrated" else f", whose own verdict is {known.status}"
     said = f"that of {Path(source).name}, of {date}{verdict}"
-    return replace(belief, covariance=belief.covariance + walked.reshape(belief.covariance.shape), source=said)
+    return replace(
+        gaussian_prior,
+        covariance=gaussian_prior.covariance + walked.reshape(gaussian_prior.covariance.shape),
+        source=said,
+    )

@@ -1,8 +1,8 @@
 """What the columns of tables are, concluded from their headers and numbers, for people to put under `columns:`.
 
 Names say what a column is; where there are none, numbers do as far as they can: gravity and the earth's field have
-sizes that tell an accelerometer or a magnetometer and its unit. Nothing is taken silently: a proposal comes with its
-reasons, and with what could not be concluded.
+sizes that identify an accelerometer or a magnetometer and its unit. Nothing is taken silently: a proposal comes with
+its reasons, and with what could not be concluded.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from alidade.pipelines import deadline, progress
 from alidade.pipelines.applications.session import Recorded, Session, resolve_method
-from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.applications.sharing import device_prior, walks
 from alidade.pipelines.config import configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
@@ -148,17 +148,21 @@ def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict
 
     if known.solver == "published":
         return None, {}
-    problem = session.problem().near(dict(zip(known.belief.names, known.belief.mean.tolist(), strict=True)))
+    problem = session.problem().near(
+        dict(zip(known.gaussian_prior.names, known.gaussian_prior.mean.tolist(), strict=True))
+    )
     device = walks(session.method, session.config, [q.name for q in problem.quantities])
-    belief = device_belief(known, session.method, session.config, session.origin.sha256(), session.origin.epoch_ns)
+    gaussian_prior = device_prior(
+        known, session.method, session.config, session.origin.sha256(), session.origin.epoch_ns
+    )
     try:
         with progress.doing("solving"):
             estimate = solve_batch(problem, device=device)
     except IndeterminateError:
         return None, {}
     own = problem.numbers(estimate)
-    if not estimate.converged or estimate.told is None:
+    if not estimate.converged or estimate.sqrt_info is None:
         deadline.passed("the solution of this recording")
         return None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
-    return check_calibration(belief, estimate.told, problem.quantities, inflations), own
+    return check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, inflations), own

@@ -2,8 +2,8 @@
 
 If nothing changed, the estimate from what was recorded until t differs from the final one by a normal number with the
 covariance P(t) - P(T): the later estimate uses all that the earlier one does, and more (Hausman 1978, for an estimator
-that is efficient). The largest such difference over the recording is held against what chance does: paths drawn with
-the same covariances, whose steps from moment to moment are independent.
+that is efficient). The largest such difference over the recording is compared with its distribution without a change:
+paths drawn with the same covariances, whose steps from moment to moment are independent.
 
 That takes the priors for true. A parameter far beyond its prior departs from it as it becomes known, and nothing has
 changed: such priors are widened to what was found before anything is compared.
@@ -18,14 +18,15 @@ import numpy as np
 
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.parameters import pull
-from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, StepEstimate, Told
+from alidade.pipelines.estimation.parameters import prior_z_score
+from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, SqrtInformation, StepEstimate
 
-# A recording in which nothing changed is taken for one in which something did so often.
+# Probability of calling a recording changed in which nothing changed.
 LEVEL = 1e-3
 # Paths drawn, a batch at a time.
 _PATHS, _BATCH = 4000, 500
-# Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
+# Directions in which the rest of the recording added less than this share of the variance have no information about a
+# change.
 _LEAST = 1e-3
 # A step between the segments is significant beyond so many sigmas, and material from this share of the requirement on.
 _STEP, _MATERIAL, _SURE = 3.0, 0.5, 2.0
@@ -44,7 +45,7 @@ CHANGE = "change during the recording"
 _BEYOND = 3.0
 # Two moments make no path.
 _FEWEST_MOMENTS = 5
-# Coloured residuals are as many measurements as they are independent stretches. With fewer of these for each number
+# Coloured residuals are as many measurements as they have independent segments. With fewer of these for each number
 # than this, inflated covariances, which hold for long recordings, say too little of how far an estimate may be off.
 _STRETCHES = 3.0
 
@@ -55,7 +56,7 @@ class Stability:
 
     Attributes:
         statistic: its size as a standard normal number, by the cube root of chi-square over its degrees of freedom.
-        level: how often chance alone makes it as large or larger, anywhere in the recording.
+        level: p-value, anywhere in the recording.
         time_s: when, s.
         departures: parameter -> estimate until then less the final one, in the sigmas of that difference; largest
             first.
@@ -124,7 +125,7 @@ def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Seq
     """The most severe finding, of kind `change` or `jump`, on a step that is significant; None where none is.
 
     A change is a step that motion alone shows too, and the same one; it is a NOTE where it is not material. A `jump` is
-    a material one of which motion does not tell whether the mount or the reference made it.
+    a material one that motion attributes neither to the mount nor to the reference.
 
     Args:
         steps: that explain the recording best, the most significant first.
@@ -185,11 +186,11 @@ def with_change(estimate: Estimate, change: Finding) -> Estimate:
     if budget is not None:
         share = dict(zip(estimate.names, step**2 / np.maximum(np.diag(covariance), 1e-300), strict=True))
         budget = {name: _with_share(shares, float(share[name])) for name, shares in budget.items()}
-    told = estimate.told
-    if told is not None:
+    sqrt_info = estimate.sqrt_info
+    if sqrt_info is not None:
         whole = dict(zip(estimate.names, step / estimate.inflations, strict=True))
-        told = _marginalised(told, np.array([whole[name] for name in told.names]))
-    return replace(estimate, covariance=covariance, history=history, budget=budget, told=told)
+        sqrt_info = _marginalised(sqrt_info, np.array([whole[name] for name in sqrt_info.names]))
+    return replace(estimate, covariance=covariance, history=history, budget=budget, sqrt_info=sqrt_info)
 
 
 def _with_share(shares: Mapping[str, float], share: float) -> dict[str, float]:
@@ -200,14 +201,16 @@ def _with_share(shares: Mapping[str, float], share: float) -> dict[str, float]:
     return dict(sorted(whole.items(), key=lambda item: -item[1]))
 
 
-def _marginalised(told: Told, step: Array) -> Told:
+def _marginalised(sqrt_info: SqrtInformation, step: Array) -> SqrtInformation:
     """R (x - a s - at) = d with a unit normal a marginalised out: rows whitened by (I + r r')^-1/2, r = R s."""
-    r = told.R @ step
+    r = sqrt_info.R @ step
     square = float(r @ r)
     if square == 0.0:
-        return told
+        return sqrt_info
     k = (1.0 - 1.0 / np.sqrt(1.0 + square)) / square
-    return replace(told, R=told.R - k * np.outer(r, r @ told.R), d=told.d - k * r * float(r @ told.d))
+    return replace(
+        sqrt_info, R=sqrt_info.R - k * np.outer(r, r @ sqrt_info.R), d=sqrt_info.d - k * r * float(r @ sqrt_info.d)
+    )
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
@@ -222,10 +225,10 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     course = estimate.course
     if course is None:
         return None
-    # What a recording tells of other numbers is as much the noise of its states, which moves the estimate without being
+    # Information about other numbers is as much the noise of its states, which moves the estimate without being
     # chance as the covariances have it.
-    told = [q.determined(sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True)]
-    kept = np.flatnonzero(course.steady & told)
+    sqrt_info = [q.determined(sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True)]
+    kept = np.flatnonzero(course.steady & sqrt_info)
     late = course.time >= _long_enough(estimate, len(kept))
     if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
@@ -248,7 +251,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
 
 
 def _long_enough(estimate: Estimate, numbers: int) -> float:
-    """From when on, s, all families of coloured residuals had stretches enough; infinite where they never do."""
+    """From when on, s, all families of coloured residuals had segments enough; infinite where they never do."""
     latest = -np.inf
     for family, together in estimate.colours.items():
         times = np.sort(estimate.residuals[family].time)
@@ -267,7 +270,9 @@ def _with_priors_as_found(
     Variances above the priors', as terms of second order may make them, count as the priors'.
     """
     estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.inflations, strict=True)
-    size = np.array([pull(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated])
+    size = np.array(
+        [prior_z_score(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated]
+    )
     wide = np.flatnonzero(np.abs(size) >= _BEYOND)
     if not len(wide):
         return values, P
@@ -286,8 +291,8 @@ def _whitening(P: Array, last: Array) -> Array:
     root = np.linalg.cholesky(P + 1e-12 * np.diag(np.diag(P)))
     scaled = np.linalg.solve(root, np.linalg.solve(root, P - last).T)
     eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    told = eigenvalues > _LEAST
-    return np.asarray((vectors[:, told] / np.sqrt(eigenvalues[told])).T @ np.linalg.inv(root))
+    sqrt_info = eigenvalues > _LEAST
+    return np.asarray((vectors[:, sqrt_info] / np.sqrt(eigenvalues[sqrt_info])).T @ np.linalg.inv(root))
 
 
 def _as_normal(square: Array, dof: Array) -> Array:

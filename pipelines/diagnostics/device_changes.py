@@ -2,7 +2,8 @@
 
 A step of one of the device's numbers between two dates is another unknown of the joint system: added to the number in
 all recordings after it. Its estimate from the joint residuals and its sigma are those of least squares with that
-unknown (a score test, exact for a linear system). The largest of all is held against what chance alone does over the
+unknown (a score test, exact for a linear system). The largest of all is compared with its distribution without a change
+over the
 whole history: drawn, since steps at neighbouring dates are nearly the same question. A step that is more than that is
 taken into the system, and the next one looked for.
 
@@ -21,13 +22,13 @@ from typing import Literal
 import numpy as np
 
 from alidade.factors.chi_square import quantile
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.parameters import kind
-from alidade.pipelines.estimation.problem import Array, Quantity, Told
+from alidade.pipelines.estimation.problem import Array, Quantity, SqrtInformation
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.solvers.joint import Joined, join
-from alidade.pipelines.solvers.posterior import told_of
+from alidade.pipelines.solvers.posterior import sqrt_information_of
 
-# How often a history in which nothing changed is taken for one in which something did: by a number, by all at once.
+# Probability of a false alarm: by a number, by all at once.
 LEVEL, _JOINTLY = 0.05, 0.2
 # Histories drawn; beyond so many tests, or where fewer of them would be beyond the limit, chance is bounded instead.
 _DRAWN, _MOST_TESTS, _FEW = 4000, 1500, 40
@@ -88,7 +89,7 @@ class Changes:
     """What a history of recordings says of a device.
 
     Attributes:
-        level: how often chance alone makes any step.
+        level: p-value of any step.
         limit: from so many sigmas on the first step of a number is more than chance.
         found: the steps that are more than chance, in the order in which they were found.
         steps: every number's step after every recording, with nothing else changed.
@@ -116,7 +117,7 @@ def changes(
     asked: Collection[str] | None = None,
     level: float = LEVEL,
 ) -> Changes:
-    """Of the device's numbers that are taken for the same in all recordings.
+    """Of the device's numbers that count as the same in all recordings.
 
     Args:
         joined: the recordings, in the order of their dates.
@@ -133,11 +134,11 @@ def changes(
     questions = [(name, k, after) for after in range(len(joined.parts) - 1) for name, k in steady]
     columns = _columns(joined, questions)
     left, residual = _without(A * joined.scales, columns, b)
-    told = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _TOLD
-    questions = [question for question, yes in zip(questions, told, strict=True) if yes]
+    sqrt_info = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _TOLD
+    questions = [question for question, yes in zip(questions, sqrt_info, strict=True) if yes]
     if not questions:
         return Changes(level)
-    columns, left = columns[:, told], left[:, told]
+    columns, left = columns[:, sqrt_info], left[:, sqrt_info]
     grown = np.array([inflations.get(name, 1.0) for name, _, _ in questions])
     steps, limit = _steps(questions, left, residual, grown), _limit(left, level)
     return Changes(
@@ -320,7 +321,7 @@ class CalibrationCheck:
 
 
 def check_calibration(
-    known: Belief, told: Told, quantities: Sequence[Quantity], inflations: Mapping[str, float]
+    known: GaussianPrior, sqrt_info: SqrtInformation, quantities: Sequence[Quantity], inflations: Mapping[str, float]
 ) -> CalibrationCheck:
     """Test an earlier calibration against a recording of the device, as two recordings of one device are.
 
@@ -328,20 +329,20 @@ def check_calibration(
 
     Args:
         known: of the device, from the earlier calibration; no number is exactly known.
-        told: what the recording says.
+        sqrt_info: information of the recording.
         quantities: of the recording's graph.
         inflations: by what the recording's sigmas are larger because noise is coloured.
     """
     by_name = {q.name: q for q in quantities}
-    known = known.of(told.names)
-    rates = dict.fromkeys([*known.names, *_of_device(told)], 0.0)
-    before = told_of(known, [by_name[name].prior_scale for name in known.names])
-    joined = join([before, told], rates, [0.0, 1.0])
+    known = known.of(sqrt_info.names)
+    rates = dict.fromkeys([*known.names, *_of_device(sqrt_info)], 0.0)
+    before = sqrt_information_of(known, [by_name[name].prior_scale for name in known.names])
+    joined = join([before, sqrt_info], rates, [0.0, 1.0])
     asked = {name for name in known.names if by_name[name].judged}
     return CalibrationCheck(changes(joined, [0.0, 1.0], inflations, asked), by_name)
 
 
-def _of_device(told: Told) -> Collection[str]:
+def _of_device(sqrt_info: SqrtInformation) -> Collection[str]:
     """The numbers whose priors are set apart."""
-    about = (told.prior_R != 0.0).any(axis=0)
-    return [name for name, yes in zip(told.names, about, strict=True) if yes]
+    about = (sqrt_info.prior_R != 0.0).any(axis=0)
+    return [name for name, yes in zip(sqrt_info.names, about, strict=True) if yes]

@@ -13,7 +13,7 @@ from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import Advise, weak_directions
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameters import pull as prior_z_score
+from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 

@@ -29,7 +29,7 @@ class ScaleFactor:
 
 @dataclass(frozen=True)
 class ExactInput:
-    """A number of data or config that the graph takes for exact.
+    """A number of data or config that the graph has no uncertainty of.
 
     Attributes:
         name: as in result.json.

@@ -7,8 +7,8 @@ their variances are, for samples tau0 apart and k = 1 ... n-1,
 
 White noise and random walk are split exactly (the basis is that of the walk's increments), the quantised integral but
 for its ends; the term of B is the flicker of Hosking, "Fractional differencing", Biometrika 1981, and agrees with
-B^2 / (2 pi f) of IEEE Std 952. So every number of the transform tells as much of the coefficients as it can, where
-slopes read from an Allan plot use a few of them; the likelihood is Whittle's (1953), exact for N and K.
+B^2 / (2 pi f) of IEEE Std 952. So every number of the transform counts with all its information about the coefficients,
+where slopes read from an Allan plot use a few of them; the likelihood is Whittle's (1953), exact for N and K.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _N = NOISES.index("N")
 # Numbers of the transform are averaged within bins of this part of an octave.
 _PER_OCTAVE = 16
 # A noise is part of the model when twice the logarithm of the likelihood rises by more than this without bound, and is
-# told when its square is so many of its sigmas from zero.
+# determined when its square is so many of its sigmas from zero.
 _SHOWS, _TOLD = 10.0, 3.0
 # 95 % of chi-square of one degree of freedom on one side.
 _BELOW = 2.706
@@ -43,7 +43,7 @@ _CONFIDENCE = 0.95
 _OFF, _ONCE_IN = 0.1, 3e6
 # The band that is fitted spans at least so many octaves.
 _LEAST_OCTAVES = 4.0
-# A noise counts as able to be told by a longer record up to this length, s.
+# A longer record could determine a noise up to this length, s.
 _LONGEST_RECORD = 30.0 * 86400.0
 # What is taken out with a sinusoid are its neighbours in the transform of the record, so many on either side.
 _BESIDE = 3.0
@@ -59,9 +59,9 @@ class Coefficient:
         name: Q, N, B or K.
         value: its estimate; None when the record does not determine it.
         sigma: of the value, one standard deviation.
-        low, high: 95 % interval; of a noise that is not told, 0 and what it is below with 95 % confidence.
-        needed_s: length of a record, s, that would determine a noise of half that bound; None where the value is told,
-            or no record of a month would.
+        low, high: 95 % interval; of an undetermined noise, 0 and the bound with 95 % confidence.
+        needed_s: length of a record, s, that would determine a noise of half that bound; None where the value is
+            determined, or no record of a month would.
     """
 
     name: str
@@ -296,7 +296,7 @@ def _bound(i: int, bins: _Bins, squares: Array, model: Mask) -> float:
 def _needed(
     i: int, bins: _Bins, squares: Array, model: Mask, square: float, samples: int, interval_s: float
 ) -> float | None:
-    """Length of one record, s, in which noise i of this square beside the others of the model would be told."""
+    """Length of one record, s, in which noise i of this square beside the others of the model would be determined."""
     with_it = model.copy()
     with_it[i] = True
     there = np.where(np.arange(4) == i, square, squares)

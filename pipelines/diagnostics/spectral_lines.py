@@ -45,7 +45,7 @@ class Line:
 
 
 def find_lines(pieces: Sequence[Array], interval_s: float) -> tuple[Line, ...]:
-    """The strongest sinusoids in pieces of a record at rest, by amplitude; none where the record is too short to tell.
+    """The strongest sinusoids in pieces of a record at rest, by amplitude; none where the record is too short.
 
     Args:
         pieces: samples, each piece evenly spaced by interval_s.
@@ -98,7 +98,7 @@ def _less(x: Array, rate: float, resolution: float) -> Array:
     slow = (blocks @ np.cos(rate * within) - 1j * (blocks @ np.sin(rate * within))) * np.exp(-1j * rate * start)
     slow /= np.append(np.full(count - 1, block), len(x) - block * (count - 1))
     offset = 0.0
-    # A short piece cannot tell the rate better than it is known.
+    # A short piece cannot determine the rate better than it is known.
     if count >= _REFINED and np.any(slow):
         spectrum = np.fft.fft(slow, 8 * count)
         offset = 2.0 * np.pi * float(np.fft.fftfreq(8 * count, block)[np.argmax(np.abs(spectrum))])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.diagnostics.diagnose import DEFAULT, Thresholds
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.problem import Array, Quantity, Told
+from alidade.pipelines.estimation.problem import Array, Quantity, SqrtInformation
 from alidade.pipelines.settings import Config
 
 
@@ -45,7 +45,7 @@ def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | Non
 
 
 def contradictions(
-    told: Told,
+    sqrt_info: SqrtInformation,
     freed: Sequence[Quantity],
     quantities: Sequence[Quantity],
     ratio: float = 1.0,
@@ -56,7 +56,7 @@ def contradictions(
     INCONSISTENT where freeing it shifts a required parameter by half of what is required, else a NOTE.
 
     Args:
-        told: information of the graph in which they are free, about the solution with them fixed.
+        sqrt_info: information of the graph in which they are free, about the solution with them fixed.
         freed: quantities of that graph.
         quantities: as they were solved for; what is not among them is fixed.
         ratio: of sigmas to those for white noise of the model.
@@ -64,10 +64,10 @@ def contradictions(
     """
     known = {q.name: q for q in freed}
     free = {q.name for q in quantities if q.prior_sigma != 0.0}
-    inside = np.array([name in free for name in told.names])
+    inside = np.array([name in free for name in sqrt_info.names])
     found: list[Finding] = []
     while not inside.all():
-        gain, x, information, correlation = _each_freed(told, inside)
+        gain, x, information, correlation = _each_freed(sqrt_info, inside)
         z = x * np.sqrt(information) / ratio
         worst = int(np.argmax(np.abs(z)))
         if abs(z[worst]) < limits.prior_z:
@@ -75,18 +75,18 @@ def contradictions(
         fixed = np.flatnonzero(~inside)
         j, shifts = fixed[worst], np.zeros(len(inside))
         shifts[inside], shifts[j] = -gain[:, worst] * x[worst], x[worst]
-        shifts *= told.scales
-        effect = {name: float(shifts[i]) for i, name in enumerate(told.names) if known[name].judged and shifts[i]}
+        shifts *= sqrt_info.scales
+        effect = {name: float(shifts[i]) for i, name in enumerate(sqrt_info.names) if known[name].judged and shifts[i]}
         material = any(abs(shift) >= limits.material * known[name].require for name, shift in effect.items())
         alike = fixed[np.abs(correlation[worst]) > limits.inseparable]
         evidence = {
-            "parameter": told.names[j],
-            "unit": known[told.names[j]].unit,
-            "stated": float(told.at[j]),
-            "value": float(told.at[j] + shifts[j]),
-            "sigma": float(ratio * told.scales[j] / np.sqrt(information[worst])),
+            "parameter": sqrt_info.names[j],
+            "unit": known[sqrt_info.names[j]].unit,
+            "stated": float(sqrt_info.at[j]),
+            "value": float(sqrt_info.at[j] + shifts[j]),
+            "sigma": float(ratio * sqrt_info.scales[j] / np.sqrt(information[worst])),
             "z": float(z[worst]),
-            "inseparable": tuple(sorted(told.names[k] for k in alike if k != j)),
+            "inseparable": tuple(sorted(sqrt_info.names[k] for k in alike if k != j)),
             "effect": effect,
         }
         found.append(Finding("contradiction", Severity.INCONSISTENT if material else Severity.NOTE, evidence))
@@ -94,10 +94,10 @@ def contradictions(
     return tuple(found)
 
 
-def _each_freed(told: Told, inside: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+def _each_freed(sqrt_info: SqrtInformation, inside: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
     """Of f fixed numbers, in units of their scales: H_AA^-1 H_AF (a, f), x (f,), I (f,), correlations (f, f)."""
-    R, a = told.R * told.scales, int(inside.sum())
-    rows = np.column_stack([R[:, inside], R[:, ~inside], told.d])
+    R, a = sqrt_info.R * sqrt_info.scales, int(inside.sum())
+    rows = np.column_stack([R[:, inside], R[:, ~inside], sqrt_info.d])
     T = np.asarray(np.linalg.qr(rows, mode="r"), dtype=float)
     gain: Array = np.linalg.lstsq(T[:a, :a], T[:a, a:-1], rcond=None)[0]
     own, right = T[a:, a:-1], T[a:, -1]

@@ -1,4 +1,4 @@
-"""When a device stood still, told from its samples alone: no noise has to be known, for that is what is looked for.
+"""Static intervals of a device from its samples alone, without knowing their noise.
 
 The samples are cut into blocks of half a second. A block is at rest when every sensor shows in it
 
@@ -7,8 +7,8 @@ The samples are cut into blocks of half a second. A block is at rest when every 
 - samples that differ from one to the next nearly as much as from the mean, von Neumann's ratio, Ann. Math. Stat. 1941
   (a motion is smooth from sample to sample; noise is not, even behind a low-pass filter).
 
-Stretches of two seconds and more count; the block next to a motion does not, for its mean differs. A steady turn looks
-like rest to a gyro: the stretch with the smallest mean rate is at rest, others are if they have the same rate.
+Intervals of two seconds and more count; the block next to a motion does not, for its mean differs. A steady turn looks
+like rest to a gyro: the interval with the smallest mean rate is at rest, others are if they have the same rate.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ _QUIETEST, _LOUDER = 0.05, 2.0
 _MOVED, _MOVED_LIMITS = 4.5, (1.0, 2.5)
 # Mean squared step over twice the variance: 1 in white noise, 0.1 behind a filter of a tenth of half the rate.
 _SMOOTH = 0.02
-# A stretch at rest, s.
+# An interval at rest, s.
 _SHORTEST = 2.0
 # Rates of rests agree to within the first, and are below the second: no bias is so large, rad/s.
 _STEADY, _LARGEST_BIAS = 0.01, 0.2
 
 
 def stretches_at_rest(t: Array, sensors: Sequence[Array], gyro: Array | None = None) -> Array:
-    """Beginnings and ends (P, 2), s, of the stretches at rest, each at a sample; P = 0 where there is none.
+    """Beginnings and ends (P, 2), s, of the static intervals, each at a sample; P = 0 where there is none.
 
     Args:
-        t: (N,) s, increasing; a pause of the recorder ends a stretch.
+        t: (N,) s, increasing; a pause of the recorder ends an interval.
         sensors: (N, k) each, of one device.
-        gyro: that of the sensors which tells a steady turn, (N, 3) rad/s, if there is one.
+        gyro: that of the sensors which measures a steady turn, (N, 3) rad/s, if there is one.
     """
     interval = float(np.median(np.diff(t)))
     size = max(_LEAST, round(_BLOCK / interval))

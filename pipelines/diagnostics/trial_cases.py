@@ -119,7 +119,7 @@ def scale_factors(build: Build, model: FaultModel, data: Any, config: Config) ->
             assert found is not None
             return found
 
-        # Not chi-square, which levels off where most measurements are rejected; near the bottom it tells best.
+        # Not chi-square, which levels off where most measurements are rejected; near the bottom it discriminates best.
         rough = _lowest(lambda more: score_trial(build, *changed(more))[0] ** 2, _FIRST_SCALING)
         if rough:
             more = _lowest(partial(_cost, build, changed), _SECOND_SCALING, rough)

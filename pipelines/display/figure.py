@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 
 from alidade.pipelines.estimation.problem import Array
 
-# The first three are Paul Tol's high-contrast scheme: told apart by the colour-blind, and in grey. On dark ground their
-# lighter forms. "rejected" is kept for what was rejected, the last ones for what stands behind.
+# The first three are Paul Tol's high-contrast scheme: distinguishable for the colour-blind, and in grey. On dark ground
+# their lighter forms. "rejected" is kept for what was rejected, the last ones for what stands behind.
 PALETTE = {
     # Axes of frames, as RViz, ROS and Foxglove have them; plots name them too.
     "x": ("#c62828", "#ff6b6b"),

@@ -82,7 +82,7 @@ class Table:
         rows: cells in the order of the columns; a single cell is a heading for the rows below it.
         id: of the HTML element.
         style: of style.css: dense, lines, many, columns.
-        most_rows: a page folds longer tables; None: never.
+        most_rows: a page collapses longer tables; None: never.
     """
 
     title: str
@@ -105,5 +105,5 @@ class Table:
 
     @property
     def is_folded(self) -> bool:
-        """Whether a page folds it."""
+        """Whether a page collapses it."""
         return self.most_rows is not None and len(self.rows) > self.most_rows

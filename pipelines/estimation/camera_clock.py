@@ -19,8 +19,8 @@ from alidade.pipelines.estimation.robust import fitted
 # A clock is guessed first from as much of a recording as takes it to go wrong by so much, s (sigma), far less than a
 # swing takes, then from so many times as much each time.
 _WRONG_AT_FIRST, _THEN, _PASSES = 0.06, 4.0, 3
-# It is taken for another one than the stamps' beyond so many sigmas.
-_TOLD = 5.0
+# It is another clock than the stamps' beyond so many sigmas.
+_SIGNIFICANT = 5.0
 
 # What misses (n, d) at numbers near some, the last two of which are a clock's offset and skew.
 Miss = Callable[[Array], Array]
@@ -59,7 +59,7 @@ class Keyframes:
 
     Attributes:
         clock: that clock.
-        near: so far off, s, motion around a keyframe still tells what sensors did when its picture was taken.
+        near: so far off, s, motion around a keyframe still gives what sensors measured at its exposure.
     """
 
     clock: Clock
@@ -72,7 +72,7 @@ class Keyframes:
         """
         elapsed = np.array([0.0, time - self.clock.begun])
         sigmas = np.zeros(2) if covariance is None else _sigmas_at(elapsed, covariance)
-        return bool((np.abs(clock.late(elapsed) - self.clock.late(elapsed)) > self.near + _TOLD * sigmas).any())
+        return bool((np.abs(clock.late(elapsed) - self.clock.late(elapsed)) > self.near + _SIGNIFICANT * sigmas).any())
 
 
 def first_span(skew_sigma: float) -> float:
@@ -125,8 +125,8 @@ def guess_clock(
             break
         until *= _THEN
     clock, ends = Clock(begun, *x[-2:].tolist()), np.array([0.0, last])
-    told = (np.abs(clock.late(ends)) > _TOLD * _sigmas_at(ends, covariance[-2:, -2:])).any()
-    return clock if told else Clock(begun)
+    significant = (np.abs(clock.late(ends)) > _SIGNIFICANT * _sigmas_at(ends, covariance[-2:, -2:])).any()
+    return clock if significant else Clock(begun)
 
 
 def _sigmas_at(elapsed: Array, covariance: Array) -> Array:

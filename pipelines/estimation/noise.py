@@ -24,9 +24,9 @@ class Noise:
     Attributes:
         name: as in the config's section `noise`, where it is there.
         stated: its sigma or density before the recording is asked; typical where measurements differ.
-        source: who says so.
+        source: of the stated value.
         known: one sigma of its logarithm; 0: exactly.
-        families: of measurements whose residuals tell of it; none: residuals are not asked.
+        families: of measurements whose residuals estimate it; none: it is not estimated.
         rows: of each measurement that it is of; None: all.
         least: its level is never less than this over what is stated: what else than white noise is in a mean of many
             samples shows in few of them alike.
@@ -71,7 +71,7 @@ class Level:
         found: what the recording alone says; None where it is not asked, or says nothing.
         sigma: one standard deviation of that.
         least: of a process that its sensor's own samples say is smaller than stated: how small, at most. Residuals
-            tell where in between it is, and never that it is larger than stated: coloured noise of other sensors would
+            estimate it in between, and never larger than stated: coloured noise of other sensors would
             raise it without bound. None: of no such process.
     """
 

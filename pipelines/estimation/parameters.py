@@ -256,7 +256,7 @@ def fixed_without_force(spec: ParameterSpec, config: Config, topic: str) -> Find
     return {"fixed_assumptions": [{"parameters": names, "value": 0.0, "why": f"{topic} has no acceleration"}]}
 
 
-def pull(quantity: Quantity, value: float, sigma: float, inflation: float = 1.0) -> float | None:
+def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: float = 1.0) -> float | None:
     """How far the recording takes an assumption from its prior, in sigmas of what it could; None if it says nothing.
 
     With s = sigma / inflation, p the prior's sigma and V = sigma^2 - (s^2 / p)^2 what comes from elsewhere than from

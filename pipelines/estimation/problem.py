@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.gaussian_prior import GaussianPrior
 
 if TYPE_CHECKING:
     import gtsam
@@ -94,7 +94,7 @@ class Quantity:
         require: the accuracy wanted, sigma; infinite: none is.
         extra_sigma: known error that the graph does not model, added in square to the reported sigma.
         prior_mean: of its prior.
-        group: "assumption" for a systematic effect that is a parameter only lest it spoil the others; None for what
+        group: "assumption" for a systematic effect that is estimated only to keep it out of the others; None for what
             is calibrated.
         nuisance: calibrated, but beside the purpose: a value far beyond its prior is a fault, as of an assumption.
         sheet: of an assumption, the data sheet's figure that its prior comes from, as in the config: "gyro.scale".
@@ -282,14 +282,14 @@ class Problem:
             method has no such.
         advice: what to do about a weak direction, given its weights by parameter name.
         dropped: measurements left out before solving, reason -> count.
-        premises: what is taken for granted and a reader has to know, sentences.
+        premises: assumptions that a reader has to know, sentences.
         steps_after: the steps of one measurement or more that are later than a time, s, for graphs whose steps stay
             as they are while the recording grows, but for those of its last second. None: all may change.
-        onward: the graph of a recording that grows, from the data of its end and the time, s, of a keyframe of this
-            graph that is in them and from which on there are steps; -inf: from all data, with all steps. It agrees with
-            this one on variables, and its steps stay as they are, but for the last one and those of the last
+        continuation: the graph of a recording that grows, from the data of its end and the time, s, of a keyframe of
+            this graph that is in them and from which on there are steps; -inf: from all data, with all steps. It agrees
+            with this one on variables, and its steps stay as they are, but for the last one and those of the last
             `unsettled` s. None if there is no such keyframe. Not every graph can be built from the end alone.
-        unsettled: see `onward`, s.
+        unsettled: see `continuation`, s.
         noises: that are in force, with what sensors' own samples say of them.
         constants: numbers of the recording that formulas need beside the parameters, by name.
         keyframes: where they stand; None: there are no pictures with a clock that is estimated.
@@ -299,7 +299,7 @@ class Problem:
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
         may_step: rotations that may change at one moment, as a mount that slips.
         finer: the graph for noise levels, where keyframes stand closer than in this one; None: where this one serves.
-        beliefs: joint priors from elsewhere than data sheets; the last one about a number is in force.
+        gaussian_priors: joint priors from elsewhere than data sheets; the last one about a number is in force.
     """
 
     method: str
@@ -312,7 +312,7 @@ class Problem:
     dropped: Mapping[str, int] = field(default_factory=dict)
     premises: tuple[str, ...] = ()
     steps_after: Callable[[float], Iterator[Step]] | None = None
-    onward: Callable[[Any, float], Problem | None] | None = None
+    continuation: Callable[[Any, float], Problem | None] | None = None
     unsettled: float = 1.0
     noises: tuple[Level, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
@@ -322,14 +322,14 @@ class Problem:
     marginal_likelihood: bool = False
     may_step: tuple[int, ...] = ()
     finer: Callable[[Sequence[Level]], Problem | None] | None = None
-    beliefs: tuple[Belief, ...] = ()
+    gaussian_priors: tuple[GaussianPrior, ...] = ()
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
         """The same problem; rotations are reported by the rotation vectors nearest to these numbers (rad, by name)."""
-        onward, finer = self.onward, self.finer
+        continuation, finer = self.continuation, self.finer
 
         def grown(data: Any, time: float) -> Problem | None:
-            more = onward(data, time) if onward is not None else None
+            more = continuation(data, time) if continuation is not None else None
             return None if more is None else more.near(numbers)
 
         def closer(levels: Sequence[Level]) -> Problem | None:
@@ -340,7 +340,7 @@ class Problem:
         return replace(
             self,
             parameters=parameters,
-            onward=None if onward is None else grown,
+            continuation=None if continuation is None else grown,
             finer=None if finer is None else closer,
         )
 
@@ -365,10 +365,10 @@ class Problem:
         return tuple(q for p in self.parameters for q in p.quantities)
 
     def prior_covariance(self, names: Sequence[str], sigmas: Array) -> Array:
-        """(m, m) prior covariance of some reported numbers: their sigmas (m,) with the correlations of `beliefs`."""
+        """(m, m) prior covariance of some numbers: their sigmas (m,) with the correlations of `gaussian_priors`."""
         covariance = np.diag(np.square(sigmas))
-        for belief in self.beliefs:
-            known = belief.of(names)
+        for gaussian_prior in self.gaussian_priors:
+            known = gaussian_prior.of(names)
             at = np.array([list(names).index(name) for name in known.names], dtype=np.intp)
             covariance[at], covariance[:, at] = 0.0, 0.0
             covariance[np.ix_(at, at)] = known.covariance
@@ -440,7 +440,7 @@ class Course:
 
 
 @dataclass(frozen=True)
-class Pull:
+class InfluentialMeasurement:
     """What a measurement does to the parameter that it moves most.
 
     Attributes:
@@ -448,7 +448,7 @@ class Pull:
         time: s, its own, or that of the last reading in it.
         parameter: its name.
         sigmas: how far the measurement takes it, in the parameter's sigmas; left out, it would be back by that, and by
-            more where few others tell of it.
+            more where few others observe it.
     """
 
     family: str
@@ -458,19 +458,19 @@ class Pull:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What a graph says of its reported numbers, linear about the estimate: R (x - at) = d, rows of unit variance.
+class SqrtInformation:
+    """Information of a recording about the free reported numbers: R (x - at) = d, rows of unit variance.
 
-    Numbers that are fixed are left out.
+    It is linear about the estimate.
 
     Attributes:
         names: (n,) of the numbers.
         at: (n,) the estimate.
-        R: (r, n) all that the graph says but for the priors about numbers of the device alone.
+        R: (r, n) of measurements and all priors but those of the device.
         d: (r,).
-        prior_R: (p, n) these priors.
+        prior_R: (p, n) of the device's priors.
         prior_d: (p,).
-        scales: (n,) the usual priors' sigmas, so that angles, rates and seconds can be told beside each other.
+        scales: (n,) the usual priors' sigmas, so that angles, rates and seconds are comparable.
     """
 
     names: tuple[str, ...]
@@ -481,8 +481,8 @@ class Told:
     prior_d: Array
     scales: Array
 
-    def with_priors_of(self, other: Told) -> Told:
-        """The same with the device's priors as they are in another telling of the same graph."""
+    def with_priors_of(self, other: SqrtInformation) -> SqrtInformation:
+        """This information with the device's priors as another linearisation of the same graph has them."""
         return replace(self, prior_R=other.prior_R, prior_d=other.prior_d + other.prior_R @ (other.at - self.at))
 
 
@@ -538,7 +538,7 @@ class StepEstimate:
         return min(self.fall, self.by_motion) / self.ratio**2 if self.agrees else 0.0
 
 
-# Ratio of sandwich to nominal sigmas from which on it counts: over 25 blocks chance makes 1.3 in one of a hundred.
+# Ratio of sandwich to nominal sigmas from which on it counts: 1.3 over 25 blocks has p = .01.
 SLOW_ERROR = 1.3
 
 
@@ -552,7 +552,7 @@ class Estimate:
         values: (n,).
         covariance: (n, n), joint, of the reported numbers, everything else marginalised out. Rows of fixed quantities
             are zero. Directions without any information have the variance of a very wide prior, never infinity.
-        converged: whether the solver says so; `message` says how or why not.
+        converged: whether the solver converged; `message`: how, or why not.
         residuals: family -> residuals of measurements at the estimate; innovations if `has_innovations`.
         chi_square: None for solvers that have none.
         history: values and sigmas from what was recorded until each moment.
@@ -571,7 +571,7 @@ class Estimate:
             looked for.
         steps: those that explain the recording best, the most significant first; None: not looked for.
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
-        told: what the graph says without the device's priors; None: not asked for.
+        sqrt_info: information without the device's priors; None: not asked for.
         second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
         concluded: whether an incremental solver's run ended with the solution of all rows together.
         seconds: phase -> wall time.
@@ -591,14 +591,14 @@ class Estimate:
     attitudes: Attitudes | None = None
     budget: Mapping[str, Mapping[str, float]] | None = None
     moved: Mapping[str, Mapping[str, float]] | None = None
-    strongest: tuple[Pull, ...] | None = None
+    strongest: tuple[InfluentialMeasurement, ...] | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
     levels: tuple[Level, ...] = ()
     colours: Mapping[str, float] = field(default_factory=dict)
     inflation: Array | None = None
     sandwich: Array | None = None
     steps: tuple[StepEstimate, ...] | None = None
-    told: Told | None = None
+    sqrt_info: SqrtInformation | None = None
     second: Minimum | None = None
     concluded: bool = False
     seconds: Mapping[str, float] = field(default_factory=dict)

@@ -15,7 +15,7 @@ _SETTLED = 0.05
 
 
 def robust_sigma(values: Array) -> float:
-    """Standard deviation of zero-mean normal numbers, told from their median so that outliers do not count."""
+    """Standard deviation of zero-mean normal numbers by their median absolute value, which outliers do not move."""
     return float(np.median(np.abs(values), overwrite_input=True)) / 0.6745 if values.size else 0.0
 
 

@@ -1,7 +1,7 @@
 """A gyro bias that walks, with its mean over the session as the reported parameter.
 
-The bias is constant over stretches, one node each, joined by the random walk. A second chain carries the mean of the
-bias up to the end of each stretch, so that batch and smoothers with a window report the same session mean without
+The bias is constant over segments, one node each, joined by the random walk. A second chain carries the mean of the
+bias up to the end of each segment, so that batch and smoothers with a window report the same session mean without
 holding every node.
 """
 
@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 from alidade.pipelines.estimation.linear import linear_factor
 from alidade.pipelines.estimation.problem import Array, Factor, Step
 
-# A stretch may bend the angle by this fraction of what gyro noise does over it ...
+# The bias walk over a segment moves the angle by this fraction of what gyro noise does ...
 _FRACTION = 0.2
 # ... and is never longer than this, s, so that the bias over time can be seen.
 _LONGEST = 10.0
-# The last stretch is at least this share of the others, and as much longer at most.
+# The last segment is at least this share of the others, and as much longer at most.
 _SHORTEST = 0.1
 # What follows without error, a bias that does not walk and the mean of the nodes, is given these shares of what gyro
-# noise leaves unknown of a stretch's bias, which keeps the arithmetic well conditioned.
+# noise leaves unknown of a segment's bias, which keeps the arithmetic well conditioned.
 _SLACK = 1e-4
 _MEAN_SLACK = 1e-2
 
-# The first stretch's node, which is the whole bias where it does not walk.
+# The first segment's node, which is the whole bias where it does not walk.
 FIRST = int(gtsam.symbol("b", 0))
 
 
@@ -40,10 +40,10 @@ class WalkingBias:
     """Nodes of a bias over [0, duration].
 
     Attributes:
-        edges: (J + 1,) s, ends of the stretches.
+        edges: (J + 1,) s, ends of the segments.
         walk: rad/s/sqrt(s).
         density: of the gyro's white noise, rad/s/sqrt(Hz).
-        stop: s, where the last stretch really ends.
+        stop: s, where the last segment really ends.
     """
 
     edges: Array
@@ -55,17 +55,17 @@ class WalkingBias:
     def over(
         cls, start: float, stop: float, middles: Array, walk: float, density: float, begun: Array | None = None
     ) -> WalkingBias:
-        """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz)).
+        """Segments short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz)).
 
         All are of one length, so that those behind stay as they are while a recording grows; but one that holds none
-        of the times at which the bias is asked for is part of the stretch before it.
+        of the times at which the bias is asked for is part of the segment before it.
 
         Args:
             start, stop: s.
             middles: (n,) s, the times at which `node_at` will be asked, increasing; every node is in force at one.
             walk, density: as above.
             begun: (n,) s, where the nodes before begin in a recording that still grows, the one in force at `start`
-                the last: the others follow, and the last of all is as short as it may be, lest it change.
+                the last: the others follow, and the last of all is as short as it may be, so that it does not change.
         """
         known = np.array([start]) if begun is None else begun
         if walk <= 0.0:
@@ -91,7 +91,7 @@ class WalkingBias:
         return int(gtsam.symbol("b", node))
 
     def mean_key(self, node: int) -> int:
-        """Variable of the mean up to the end of a node's stretch; the first stretch's mean is its node."""
+        """Variable of the mean up to the end of a node's segment; the first segment's mean is its node."""
         return self.key(0) if node == 0 else int(gtsam.symbol("m", node))
 
     def begin(self, step: Step, node: int, guess: Array) -> None:
@@ -101,13 +101,13 @@ class WalkingBias:
             step.factors.append(self._walk_factor(node))
 
     def end(self, step: Step, node: int, guess: Array) -> None:
-        """Add the mean up to the end of a node's stretch to a step; the first stretch's mean is its node."""
+        """Add the mean up to the end of a node's segment to a step; the first segment's mean is its node."""
         if node > 0:
             step.initial.insert(self.mean_key(node), guess)
             step.factors.append(self._mean_factor(node))
 
     def keep(self, step: Step, nodes: range, means: range) -> None:
-        """Keep nodes, and means up to the end of stretches, alive until the step; a bias of one node never ages."""
+        """Keep nodes, and means up to the end of segments, alive until the step; a bias of one node never ages."""
         if self.nodes > 1:
             keys = [*map(self.key, nodes), *map(self.mean_key, means)]
             step.timestamps.update(dict.fromkeys(keys, step.time))
@@ -120,18 +120,18 @@ class WalkingBias:
         blocks = {self.key(node - 1): -np.eye(3), self.key(node): np.eye(3)}
         return Factor.process_of("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))
 
-    def _unknown(self, stretch: float) -> float:
-        """Sigma that gyro noise leaves to the bias of a stretch (s), rad/s."""
-        return self.density / float(np.sqrt(stretch))
+    def _unknown(self, segment: float) -> float:
+        """Sigma that gyro noise leaves to the bias of a segment (s), rad/s."""
+        return self.density / float(np.sqrt(segment))
 
     def _mean_factor(self, node: int) -> Factor:
-        """Defines the mean at the end of a node's stretch from the one before and the node."""
+        """Defines the mean at the end of a node's segment from the one before and the node."""
         end = self.stop if node == self.nodes - 1 else self.edges[node + 1]
-        whole, stretch = end - self.edges[0], end - self.edges[node]
-        share = float(stretch / whole)
-        # Within the stretch the walk's own mean departs from the node's constant by this much.
-        departure = self.walk * np.sqrt(stretch / 12.0) * share
-        sigma = float(np.hypot(departure, _MEAN_SLACK * self._unknown(stretch) * share))
+        whole, segment = end - self.edges[0], end - self.edges[node]
+        share = float(segment / whole)
+        # Within the segment the walk's own mean departs from the node's constant by this much.
+        departure = self.walk * np.sqrt(segment / 12.0) * share
+        sigma = float(np.hypot(departure, _MEAN_SLACK * self._unknown(segment) * share))
         blocks = {self.mean_key(node): 1.0, self.mean_key(node - 1): share - 1.0, self.key(node): -share}
         factor = linear_factor(
             {key: scale * np.eye(3) for key, scale in blocks.items()}, dict.fromkeys(blocks, np.zeros(3)), sigma

@@ -128,9 +128,9 @@ class Method:
 
     def graph(self, data: Any, config: Config) -> Problem:
         """The factor graph with the config's prior means and covariances applied. Raises as `problem` does."""
-        from alidade.pipelines.estimation.believing import believing
+        from alidade.pipelines.estimation.prior_replacement import with_priors
 
-        return believing(self.problem(data, config), config.beliefs)
+        return with_priors(self.problem(data, config), config.gaussian_priors)
 
     def simulate(self, scenario: Any, seed: int, images: bool = False) -> Simulated:
         """Data and truth in memory of a scenario. Raises InputError when there is no simulator, or it refuses."""

@@ -71,9 +71,9 @@ def _topics(found: Any, offset: int) -> Iterator[tuple[str, series.Topic]]:
         yield name, _READERS[found.name](found.data, offset)
     for column in _TEMPERATURES & found.data.keys():
         celsius = found.data[column].astype(float)
-        told = np.isfinite(celsius)
-        if told.any():
-            yield f"{name}/{column}", series.TemperatureSeries(_stamps(found.data, offset)[told], celsius[told])
+        known = np.isfinite(celsius)
+        if known.any():
+            yield f"{name}/{column}", series.TemperatureSeries(_stamps(found.data, offset)[known], celsius[known])
 
 
 def _unix_offset(topics: list[Any]) -> int:

@@ -16,12 +16,12 @@ import numpy as np
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from alidade.factors import so3
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import invalid
@@ -102,12 +102,12 @@ class SavedCalibration(_Record, SensorValues):
     formulas: list[str] = []
     constants: dict[str, float] = {}
     _config: Config = PrivateAttr(default_factory=Config)
-    _belief: Belief | None = PrivateAttr(default=None)
+    _gaussian_prior: GaussianPrior | None = PrivateAttr(default=None)
 
-    def knowing(self, belief: Belief) -> SavedCalibration:
+    def knowing(self, gaussian_prior: GaussianPrior) -> SavedCalibration:
         """The same with the joint distribution that result.json beside the file has."""
         known = self.model_copy()
-        known._belief = belief
+        known._gaussian_prior = gaussian_prior
         return known
 
     @property
@@ -116,11 +116,11 @@ class SavedCalibration(_Record, SensorValues):
         return {**self.constants, **{name: parameter.value for name, parameter in self.parameters.items()}}
 
     def _joint(self) -> tuple[Sequence[str], Array]:
-        if self._belief is None:
+        if self._gaussian_prior is None:
             raise InputError(
                 "calibration.yaml has no joint covariance: result.json is not beside it, or of another one"
             )
-        return self._belief.names, self._belief.covariance
+        return self._gaussian_prior.names, self._gaussian_prior.covariance
 
     def to_dict(self) -> dict[str, Any]:
         """The content of calibration.yaml."""

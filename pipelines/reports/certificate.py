@@ -179,7 +179,7 @@ def _read_fields(path: Path | None) -> Fields:
 
 def _earlier(path: Path, method: str) -> dict[str, float]:
     known = load_known(path).of_method(method)
-    return dict(zip(known.belief.names, known.belief.mean.tolist(), strict=True))
+    return dict(zip(known.gaussian_prior.names, known.gaussian_prior.mean.tolist(), strict=True))
 
 
 def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[Row]:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines.belief import Belief, independent
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.files import MAX_RESULT_BYTES, read_bytes
+from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import read_result, result_json
@@ -31,7 +31,7 @@ class Known:
         method, solver, status: of the calibration.
         sha256: of its recording.
         start_ns: of its recording, Unix ns.
-        belief: about its parameters.
+        gaussian_prior: of its parameters.
         constants: that its formulas need beside them.
     """
 
@@ -40,13 +40,13 @@ class Known:
     status: Status
     sha256: str
     start_ns: int
-    belief: Belief
+    gaussian_prior: GaussianPrior
     constants: Mapping[str, float] = field(default_factory=dict)
 
     def of_method(self, name: str) -> Known:
         """Itself. Raises InputError when it is another method's calibration."""
         if self.method != name:
-            raise InputError(f"{self.belief.source}: is a calibration of {self.method}, not of {name}")
+            raise InputError(f"{self.gaussian_prior.source}: is a calibration of {self.method}, not of {name}")
         return self
 
 
@@ -59,7 +59,11 @@ def with_covariance(known: Known, path: Path) -> Known:
         joint = load_known(beside)
     except InputError:
         return known
-    same = (joint.sha256, joint.solver, joint.belief.names) == (known.sha256, known.solver, known.belief.names)
+    same = (joint.sha256, joint.solver, joint.gaussian_prior.names) == (
+        known.sha256,
+        known.solver,
+        known.gaussian_prior.names,
+    )
     return joint if same else known
 
 
@@ -70,7 +74,10 @@ def saved_of(known: Known, path: Path) -> SavedCalibration:
     parameters = {
         name: SavedParameter(value=value, sigma=sigma, unit="", verdict=None)
         for name, value, sigma in zip(
-            known.belief.names, known.belief.mean.tolist(), known.belief.sigmas.tolist(), strict=True
+            known.gaussian_prior.names,
+            known.gaussian_prior.mean.tolist(),
+            known.gaussian_prior.sigmas.tolist(),
+            strict=True,
         )
     }
     start = datetime.datetime.fromtimestamp(known.start_ns // 1_000_000_000, datetime.UTC).isoformat()
@@ -111,18 +118,20 @@ def _of_result(path: Path, text: str) -> Known:
     asymmetry, negative = np.abs(scaled - scaled.T).max(initial=0.0), -np.linalg.eigvalsh(scaled).min(initial=0.0)
     if np.diag(covariance).min(initial=0.0) < 0.0 or max(asymmetry, negative) > _ROUNDING:
         raise InputError(f"{path}: not a result.json: its covariance is none")
-    belief = Belief(names, np.array([p.value for p in result.parameters]), covariance, str(path))
+    gaussian_prior = GaussianPrior(names, np.array([p.value for p in result.parameters]), covariance, str(path))
     start = _nanoseconds(result.session.start, f"{path}: not a result.json: session.start")
     constants = result.constants or {}
-    return Known(result.method, result.solver, result.status, result.session.sha256, start, belief, constants)
+    return Known(result.method, result.solver, result.status, result.session.sha256, start, gaussian_prior, constants)
 
 
 def _of_calibration(path: Path) -> Known:
     saved = load_calibration(path)
     given = saved.parameters
-    belief = independent(list(given), [p.value for p in given.values()], [p.sigma for p in given.values()], str(path))
+    gaussian_prior = independent(
+        list(given), [p.value for p in given.values()], [p.sigma for p in given.values()], str(path)
+    )
     start = _nanoseconds(saved.recording.start, f"{path}: not a calibration.yaml: recording.start")
-    return Known(saved.method, saved.solver, saved.status, saved.recording.sha256, start, belief)
+    return Known(saved.method, saved.solver, saved.status, saved.recording.sha256, start, gaussian_prior)
 
 
 def _nanoseconds(start: str, where: str) -> int:

@@ -24,7 +24,7 @@ from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameters import pull
+from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
@@ -115,7 +115,7 @@ class Calibration(SensorValues):
                 require=q.require if q.judged else None,
                 observability=given.get(q.name),
                 group=q.group,
-                pull=None if q.group is None else pull(q, float(value), float(sigma), float(inflation)),
+                pull=None if q.group is None else prior_z_score(q, float(value), float(sigma), float(inflation)),
                 inflation=float(inflation),
             )
             for q, value, sigma, inflation in rows

@@ -250,7 +250,7 @@ def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) ->
 
 def _jump(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
     size, sigma = (to_digits_of(math.degrees(e[name]), math.degrees(e["sigma"])) for name in ("size", "sigma"))
-    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}: mount or reference, the motion does not tell."
+    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}: mount or reference: the motion does not decide."
 
 
 def _when(e: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """Files that belong together, written whole or not at all.
 
 Processes that write into one folder wait for each other: the files there are those of one of them, never of two. A
-command that finds the results of another that ended first leaves them and says so. A process that is killed leaves
+command that finds the results of another that ended first leaves them with a message. A process that is killed leaves
 those of before, or none.
 """
 

@@ -4,7 +4,7 @@ Outliers are found by graduated non-convexity (`robust`), noise levels by restri
 (`noise_estimation`), other minima are looked at where a method says that they may be, weak directions stay at their
 priors (`weak_directions`). What is reported follows from one factorisation at the end (`posterior`).
 
-Of two minima whose measurements are explained alike only their priors tell which is meant. The likelihood ratio of two
+Of two minima whose measurements are explained alike only their priors differ. The likelihood ratio of two
 points that are not nested has no distribution of its own; `BatchConfig.close` is where one number off by its prior
 would be excluded at one percent.
 """
@@ -32,7 +32,7 @@ from alidade.pipelines.estimation.problem import (
     Minimum,
     Problem,
     Residuals,
-    Told,
+    SqrtInformation,
 )
 from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
@@ -62,10 +62,11 @@ class BatchConfig:
 
     Attributes:
         robust: how minima and outliers are looked for.
-        close: chi-square above the least below which another minimum is told: 99 % quantile of one degree of freedom.
+        close: chi-square above the least below which another minimum is reported: 99 % quantile of one degree of
+            freedom.
         followed: chi-square above the least up to which values are followed to their minimum, which takes off far less.
         different: part of its prior scale by which a number of another solution differs.
-        influential: number of the most influential measurements that are told.
+        influential: number of the most influential measurements that are reported.
     """
 
     robust: RobustConfig = field(default_factory=RobustConfig)
@@ -152,7 +153,7 @@ def solve_batch(
     budget: bool = False,
     changed: Iterable[tuple[str, Problem]] = (),
     device: Collection[str] = (),
-    elsewhere: Callable[[Told], Mapping[str, float]] | None = None,
+    elsewhere: Callable[[SqrtInformation], Mapping[str, float]] | None = None,
     engine: EngineName = "auto",
 ) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
@@ -178,7 +179,7 @@ def solve_batch(
     found = time.perf_counter()
     estimate = _estimate(solved, config, budget, changed)
     if device:
-        estimate = replace(estimate, told=_told(solved, device, elsewhere))
+        estimate = replace(estimate, sqrt_info=_told(solved, device, elsewhere))
     done = time.perf_counter()
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
 
@@ -340,7 +341,9 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     return dict(zip(influence.names, moves.tolist(), strict=True))
 
 
-def _told(solved: Solved, device: Collection[str], elsewhere: Callable[[Told], Mapping[str, float]] | None) -> Told:
+def _told(
+    solved: Solved, device: Collection[str], elsewhere: Callable[[SqrtInformation], Mapping[str, float]] | None
+) -> SqrtInformation:
     """What a graph says, linear about its solution or where the reported numbers are to be."""
     compiled, engine, values = solved.compiled, solved.engine, solved.values
     own = sqrt_information(compiled.problem, engine, values, compiled.current_keys, device)

@@ -53,13 +53,13 @@ class SecondOrder:
         more = _covariance(directions) - _covariance(linear)
         own = WeakDirections.of(R, reported.prior, reported.calibrated).weak
         ways, sizes, _ = np.linalg.svd(directions.weak - own @ (own.T @ directions.weak), full_matrices=False)
-        bent = ways[:, sizes > APART]
+        curved = ways[:, sizes > APART]
         unit = linear.strong / linear.sigmas
         share = np.linalg.eigvalsh(unit.T @ more @ unit).max(initial=0.0)
         variances, axes = np.linalg.eigh(more)
         # Beyond the priors slopes do not go on as they begin.
-        covariance = (axes * np.clip(variances, 0.0, 1.0)) @ axes.T + bent @ bent.T
-        return cls(covariance, np.inf if bent.shape[1] else float(share))
+        covariance = (axes * np.clip(variances, 0.0, 1.0)) @ axes.T + curved @ curved.T
+        return cls(covariance, np.inf if curved.shape[1] else float(share))
 
 
 def _covariance(directions: WeakDirections) -> Array:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.estimation.problem import Pull
+from alidade.pipelines.estimation.problem import InfluentialMeasurement
 from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, Factorization
@@ -152,7 +152,9 @@ def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[s
     return list(zip(labels, squares.reshape(-1, squares.shape[2]), strict=True))
 
 
-def most_influential(influence: Influence, sigmas: Mapping[str, float], count: int) -> tuple[Pull, ...]:
+def most_influential(
+    influence: Influence, sigmas: Mapping[str, float], count: int
+) -> tuple[InfluentialMeasurement, ...]:
     """The measurements that move a number most, in its sigmas, each with that number.
 
     A measurement with the right side b, minus its whitened residuals, moves the numbers by its columns of L times b; at
@@ -179,7 +181,7 @@ def most_influential(influence: Influence, sigmas: Mapping[str, float], count: i
         first = np.argsort(-np.abs(moved), kind="stable")[:count].tolist()
         found += [(float(moved[i]), group.family, float(group.model.time[i]), names[int(which[i])]) for i in first]
     found.sort(key=lambda each: -abs(each[0]))
-    return tuple(Pull(family, time, name, move) for move, family, time, name in found[:count])
+    return tuple(InfluentialMeasurement(family, time, name, move) for move, family, time, name in found[:count])
 
 
 def autocorrelation(whitened: Array) -> Array:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.estimation.problem import Estimate, Problem, Told
+from alidade.pipelines.estimation.problem import Estimate, Problem, SqrtInformation
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
@@ -21,7 +21,7 @@ from alidade.pipelines.solvers.posterior import Reported, followed, sqrt_informa
 _STEPS = 3
 
 
-def freed_information(freed: Problem, estimate: Estimate) -> Told | None:
+def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | None:
     """Square-root information of a graph about the solution of another one, in which some numbers were fixed.
 
     Noise levels and rejected measurements are the solution's. Levels that a misfit has raised hide its cause: where

@@ -26,7 +26,7 @@ from alidade.pipelines.solvers.smoother import Smoother, linear_graph_of, orderi
 
 # Steps in a row that are rejected whole before one is taken nevertheless: by then it is the prediction that is wrong.
 MAX_REJECTED_IN_A_ROW = 10
-# Probability with which chance alone makes a binomial test fire.
+# Significance of the binomial tests.
 FALSE_ALARM = 1e-3
 # Outliers are a minority of every family of measurements.
 MAX_OUTLIER_SHARE = 0.5
@@ -159,7 +159,7 @@ class InnovationGate:
     def too_few_to_decide(self) -> bool:
         """Whether a family has rejections among so few measurements that outliers may be its majority.
 
-        Which of them are wrong cannot be told then: those that are may agree by chance.
+        The wrong ones cannot be identified then: they may agree by chance.
         """
         return any(
             rejected > 0 and 1.0 - binomial_tail(rejected + 1, count, MAX_OUTLIER_SHARE) > FALSE_ALARM

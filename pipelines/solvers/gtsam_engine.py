@@ -1,4 +1,4 @@
-"""The same problem eliminated by gtsam: for graphs that are no chain, and as the answer that the chain is held against.
+"""The same problem eliminated by gtsam: for graphs that are no chain, and as the reference of the chain.
 
 Models are evaluated as for the chain; every measurement becomes a gtsam.JacobianFactor about its own variables. All but
 the last bias node and the shared unknowns are eliminated by QR in an order of gtsam's choice (COLAMD), and what is left

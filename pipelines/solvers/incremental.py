@@ -432,7 +432,7 @@ class IncrementalSolver:
         """Values and covariance, weak directions at their priors.
 
         Unless `decided`, so are numbers for which second order does not go far enough yet, and all numbers while
-        outliers cannot be told from measurements.
+        outliers cannot be separated from measurements.
         """
         posterior = self._posterior()
         unknown = np.zeros(len(posterior.covariance), dtype=bool)

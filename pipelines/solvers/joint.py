@@ -3,7 +3,7 @@
 Numbers of the device are one unknown, or one for each recording where they walk between dates; those of a recording are
 its own. Each recording's own numbers are eliminated first, so that what is left is as small as the device.
 
-    joined = join([first.told, second.told], rates, days)
+    joined = join([first.sqrt_info, second.sqrt_info], rates, days)
     joined.device(0), joined.own(0)         # the numbers of the first recording, from all recordings
     joined.others(0)                        # what the others say of the device as it was then
 """
@@ -16,9 +16,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, Problem, Told
+from alidade.pipelines.estimation.problem import Array, Problem, SqrtInformation
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.solvers.batch import minimum
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.posterior import fewest, sqrt_information
@@ -59,17 +59,17 @@ class Part:
     scales: Array
 
     @classmethod
-    def of(cls, told: Told, device: Mapping[str, float]) -> Part:
+    def of(cls, sqrt_info: SqrtInformation, device: Mapping[str, float]) -> Part:
         """y and z are the numbers themselves, not steps from an estimate."""
-        shared = [i for i, name in enumerate(told.names) if name in device]
-        own = [i for i, name in enumerate(told.names) if name not in device]
-        n, scales = len(own), told.scales[shared]
-        whole = np.column_stack([told.R[:, own + shared], told.d + told.R @ told.at])
+        shared = [i for i, name in enumerate(sqrt_info.names) if name in device]
+        own = [i for i, name in enumerate(sqrt_info.names) if name not in device]
+        n, scales = len(own), sqrt_info.scales[shared]
+        whole = np.column_stack([sqrt_info.R[:, own + shared], sqrt_info.d + sqrt_info.R @ sqrt_info.at])
         triangle = np.linalg.qr(whole).R
         R, d = fewest(triangle[n:, n:-1], triangle[n:, -1], scales)
         return cls(
-            names=tuple(told.names[i] for i in shared),
-            own=tuple(told.names[i] for i in own),
+            names=tuple(sqrt_info.names[i] for i in shared),
+            own=tuple(sqrt_info.names[i] for i in own),
             R=R,
             d=d,
             S=triangle[:n, n:-1],
@@ -99,20 +99,20 @@ class Joined:
     values: Array
     covariance: Array
 
-    def device(self, recording: int) -> Belief:
+    def device(self, recording: int) -> GaussianPrior:
         """The device's numbers as they are in a recording."""
-        return self._belief(recording, self.values, self.covariance)
+        return self._gaussian_prior(recording, self.values, self.covariance)
 
-    def others(self, recording: int) -> Belief:
+    def others(self, recording: int) -> GaussianPrior:
         """The same without that recording: what all others and the priors say."""
         rows = [each for i, each in enumerate(self.rows) if i != recording]
-        return self._belief(recording, *_solved(rows, self.scales))
+        return self._gaussian_prior(recording, *_solved(rows, self.scales))
 
-    def own(self, recording: int) -> Belief:
+    def own(self, recording: int) -> GaussianPrior:
         """A recording's own numbers, from all recordings."""
         return self.all(recording).of(self.parts[recording].own)
 
-    def all(self, recording: int) -> Belief:
+    def all(self, recording: int) -> GaussianPrior:
         """The device's numbers as they are in a recording, those that only others know as they were last, its own."""
         part = self.parts[recording]
         names, gain, inverse = self._of_unknowns(recording)
@@ -120,7 +120,7 @@ class Joined:
         own = slice(len(names) - len(part.own), None)
         covariance[own, own] += inverse @ inverse.T
         mean[own] += inverse @ part.e
-        return Belief(names, mean, covariance)
+        return GaussianPrior(names, mean, covariance)
 
     def budget(self, recording: int, recordings: Sequence[str]) -> dict[str, dict[str, float]]:
         """Number of `all` -> source -> its share of the number's variance, the largest first; shares sum to one.
@@ -164,11 +164,11 @@ class Joined:
         about = [np.flatnonzero(row > _ROUNDING * row.max(initial=0.0)) for row in size]
         return [f"prior of {self.unknowns[k[0]][0]}" if len(k) == 1 else "prior" for k in about]
 
-    def distance(self, recording: int, told: Told) -> float:
-        """How far from the joint estimate a recording's telling is linear, in the sigmas of what it says."""
+    def distance(self, recording: int, sqrt_info: SqrtInformation) -> float:
+        """Distance of the joint estimate from a recording's linearisation point, in the recording's sigmas."""
         known = self.all(recording)
         means = dict(zip(known.names, known.mean.tolist(), strict=True))
-        return float(np.linalg.norm(told.R @ ([means[name] for name in told.names] - told.at)))
+        return float(np.linalg.norm(sqrt_info.R @ ([means[name] for name in sqrt_info.names] - sqrt_info.at)))
 
     @property
     def walking(self) -> tuple[str, ...]:
@@ -188,9 +188,9 @@ class Joined:
         left = b - fitted @ (fitted.T @ b)
         return float(left @ left), len(b) - fitted.shape[1]
 
-    def _belief(self, recording: int, values: Array, covariance: Array) -> Belief:
+    def _gaussian_prior(self, recording: int, values: Array, covariance: Array) -> GaussianPrior:
         at = np.array(self._places(recording), dtype=np.intp)
-        return Belief(
+        return GaussianPrior(
             self.parts[recording].names, values[at], covariance[np.ix_(at, at)], "that of the other recordings"
         )
 
@@ -210,7 +210,7 @@ def grown(sigmas: Sequence[float], inflations: Sequence[float]) -> float:
     return float(np.average(factors**2, weights=own**-2.0) ** 0.5)
 
 
-def tell(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> Told:
+def information_at_levels(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> SqrtInformation:
     """What a problem says of its numbers, linear about its solution with noise levels that are known.
 
     Raises:
@@ -221,15 +221,15 @@ def tell(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> 
     return sqrt_information(problem, solution.engine, solution.values, compiled.current_keys, device)
 
 
-def join(tellings: Sequence[Told], rates: Mapping[str, float], days: Sequence[float]) -> Joined:
+def join(informations: Sequence[SqrtInformation], rates: Mapping[str, float], days: Sequence[float]) -> Joined:
     """Put recordings together.
 
     Args:
-        tellings: what each says, in the order of their dates.
+        informations: of each, in the order of their dates.
         rates: of the device's numbers, how far they walk in the root of a day; 0: not at all.
         days: of the recordings, from any.
     """
-    parts = [Part.of(each, rates) for each in tellings]
+    parts = [Part.of(each, rates) for each in informations]
     unknowns: dict[Unknown, float] = {}
     for i, part in enumerate(parts):
         for name, scale in zip(part.names, part.scales, strict=True):
@@ -244,7 +244,7 @@ def join(tellings: Sequence[Told], rates: Mapping[str, float], days: Sequence[fl
         return out
 
     rows = [(spread(part.R, part.names, i), part.d) for i, part in enumerate(parts)]
-    rows += [_walks(places, rates, days), _priors(tellings, rates, spread)]
+    rows += [_walks(places, rates, days), _priors(informations, rates, spread)]
     scales = np.array(list(unknowns.values()))
     return Joined(parts, tuple(unknowns), rows, scales, *_solved(rows, scales))
 
@@ -263,12 +263,14 @@ def _walks(places: Mapping[Unknown, int], rates: Mapping[str, float], days: Sequ
 
 
 def _priors(
-    tellings: Sequence[Told], rates: Mapping[str, float], spread: Callable[[Array, Sequence[str], int], Array]
+    informations: Sequence[SqrtInformation],
+    rates: Mapping[str, float],
+    spread: Callable[[Array, Sequence[str], int], Array],
 ) -> tuple[Array, Array]:
     """The device's priors, each as the first recording has it that knows the number."""
     rows, rights = [], []
     covered: set[str] = set()
-    for i, each in enumerate(tellings):
+    for i, each in enumerate(informations):
         of_device = [k for k, name in enumerate(each.names) if name in rates]
         names = [each.names[k] for k in of_device]
         R = each.prior_R[:, of_device]

@@ -213,7 +213,7 @@ class Layout:
 
 
 def _alike(values: gtsam.Values, key: Index, letter: Index) -> list[Index]:
-    """Variables of one letter, or single ones where letters do not tell what they are."""
+    """Variables of one letter, or single ones where letters do not say what they are."""
     dims = values.dims()
     dim = np.array([dims[k] for k in key.tolist()])
     groups: list[Index] = []

@@ -43,7 +43,7 @@ from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Va
 if TYPE_CHECKING:
     import gtsam
 
-# Families whose residuals say nothing about the noise of the recording.
+# Families whose residuals have no information about measurement noise.
 NOT_MEASURED = ("prior", "definition")
 # The shared variables of a row about nodes alone cancel to this share of its largest coefficient.
 CANCELLED = 1e-9

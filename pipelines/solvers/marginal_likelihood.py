@@ -41,7 +41,7 @@ Outliers = Mapping[int, NDArray[np.bool_]]
 OUTLIER_GATES = 3.0
 # By which the variance of a measurement without a say is multiplied, where it cannot be infinite.
 _NO_SAY = 1e12
-# Keyframes that are enough to tell levels: of a longer recording half of them are the liveliest.
+# Keyframes that determine levels well enough: of a longer recording half of them are the liveliest.
 ENOUGH_KEYFRAMES = 6000
 # Newton steps, none longer than this in the logarithm of a level; one that lowers -2 log L by less is the last: levels
 # are then within .2 of their sigmas, as random signs have them.
@@ -55,7 +55,7 @@ _CERTAIN = 3.0
 _MOST_ROUNDS, _WIDENING_ROUNDS, _STEADY = 8, 2, 0.02
 # Of the gate, where measurements that are widened lie at most.
 _INSIDE = 0.9
-# Random right sides that tell traces: a quarter of a level's own sigma.
+# Random right sides that estimate traces: a quarter of a level's own sigma.
 _SIGNS = 24
 # Innovations are predicted from so many keyframes before at least, in pieces of so many.
 _WARM_UP, _PIECE = 50, 100
@@ -433,7 +433,7 @@ def estimate_levels(
         chain: the problem about a solution.
         levels: to begin with.
         widening: group -> (n,) as it is, None: none.
-        rejected: group -> (n,) measurements that are taken for outliers, which have no say.
+        rejected: group -> (n,) measurements that are rejected as outliers.
 
     Raises:
         IndeterminateStateError: states or parameters are not determined at the levels to begin with.
@@ -451,8 +451,8 @@ def estimate_levels(
         return found
     used = _maximum(some, own, found.levels, free, closely)
     pairs = zip(used.levels, found.levels, strict=True)
-    told = tuple(replace(now, found=then.found, sigma=then.sigma) for now, then in pairs)
-    return replace(used, levels=told)
+    known = tuple(replace(now, found=then.found, sigma=then.sigma) for now, then in pairs)
+    return replace(used, levels=known)
 
 
 def _maximum(
@@ -501,7 +501,7 @@ def widened(
     """By group, by how much its measurements are widened at some levels (n,), and which are outliers (n,).
 
     An outlier is what was rejected and, without any say of its own, lies beyond `OUTLIER_GATES` gates of the solution:
-    an innovation would not tell, for the first measurements of all nothing is known before.
+    the innovation of the first measurements has no prediction.
 
     Raises:
         IndeterminateStateError: states or parameters are not determined without what was rejected.
@@ -605,7 +605,7 @@ def _by_row(chain: LinearChain, of: Mapping[int, NDArray[Any]] | None, otherwise
 
 
 def _present(chain: LinearChain, level: Level) -> bool:
-    """Whether rows tell of a noise."""
+    """Whether any rows have a noise."""
     return any(
         rows.family in level.noise.families and (rows.beside is not None or not level.noise.beside)
         for rows in chain.rows

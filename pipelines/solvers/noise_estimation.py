@@ -39,7 +39,7 @@ class NoiseConfig:
         max_solutions: solutions with other levels.
         negligible: change of a level's logarithm below which levels stay.
         misplaced: ratio of the root mean square to the typical residual beyond which the gate is in the wrong place:
-            outliers are taken for measurements, or measurements for outliers. The typical one does not mind.
+            outliers pass as measurements, or measurements are rejected. The typical residual is robust to that.
         min_residuals: of fewer there is no typical one.
         max_additional: bound of the logarithm of a noise beside others, over what was stated.
         clipped: of a noise beside others a residual counts as no more than this, in sigmas; `clipped_square` is what
@@ -203,9 +203,9 @@ def _refined(
     if first and typical > 0.0 and not config.misplaced**-2 < square / typical < config.misplaced**2:
         square = typical
     found = max(level.scale * float(np.sqrt(max(square / redundancy, 0.0))), config.least)
-    told = replace(level, found=found, sigma=found * (2.0 * redundancy) ** -0.5)
-    scale = float(np.exp(_level(float(np.log(level.scale)), square, redundancy, told.known)))
-    return replace(told, scale=max(scale, level.noise.least, config.least))
+    known = replace(level, found=found, sigma=found * (2.0 * redundancy) ** -0.5)
+    scale = float(np.exp(_level(float(np.log(level.scale)), square, redundancy, known.known)))
+    return replace(known, scale=max(scale, level.noise.least, config.least))
 
 
 def _found_beside(
@@ -246,7 +246,7 @@ def _shape(group: Group) -> tuple[int, int]:
 def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float, config: NoiseConfig) -> Level:
     """A process at the level that its residuals have, between what its samples say and what was stated.
 
-    Where measurements take most of the redundancy its squares hardly tell the levels between: it stays as stated if
+    Where measurements take most of the redundancy its squares hardly determine levels in between: it stays as stated if
     these fit, else it is taken down to its samples and up from there as far as its residuals ask for.
     """
     assert level.least is not None

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.belief import Belief, root_of_information
-from alidade.pipelines.estimation.problem import ChiSquare, Problem, Told
+from alidade.pipelines.estimation.problem import ChiSquare, Problem, SqrtInformation
+from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, Factorization, System
@@ -385,7 +385,7 @@ def sqrt_information(
     current_keys: Mapping[int, int],
     device: Collection[str],
     at: Mapping[str, float] | None = None,
-) -> Told:
+) -> SqrtInformation:
     """Square-root information about the free reported numbers, priors of the device set apart.
 
     Args:
@@ -425,7 +425,7 @@ def sqrt_information(
             groups.append(group)
     found = reported.root(engine.with_groups(groups).at(values)[0].eliminate().root)
     rows, d = fewest(found.R / reported.scale, found.d, reported.scale)
-    return Told(
+    return SqrtInformation(
         names=tuple(reported.names[i] for i in reported.free),
         at=reported.numbers[reported.free],
         R=rows,
@@ -464,15 +464,23 @@ def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray((about & named).any(axis=1) & ~(about & ~named).any(axis=1))
 
 
-def told_of(belief: Belief, scales: Sequence[float]) -> Told:
-    """A belief, none of whose numbers is exactly known, as rows of unit variance; `scales` (n,) of the usual priors."""
-    n, sigmas = len(belief.names), belief.sigmas
-    R = root_of_information(belief.covariance / np.outer(sigmas, sigmas), sigmas)
-    return Told(belief.names, belief.mean, R, np.zeros(n), np.empty((0, n)), np.empty(0), np.array(scales, dtype=float))
+def sqrt_information_of(gaussian_prior: GaussianPrior, scales: Sequence[float]) -> SqrtInformation:
+    """A Gaussian prior without fixed numbers as rows of unit variance; `scales` (n,) of the usual priors."""
+    n, sigmas = len(gaussian_prior.names), gaussian_prior.sigmas
+    R = root_of_information(gaussian_prior.covariance / np.outer(sigmas, sigmas), sigmas)
+    return SqrtInformation(
+        gaussian_prior.names,
+        gaussian_prior.mean,
+        R,
+        np.zeros(n),
+        np.empty((0, n)),
+        np.empty(0),
+        np.array(scales, dtype=float),
+    )
 
 
 def fewest(R: Array, d: Array, scales: Array) -> tuple[Array, Array]:
-    """As few rows that say the same, what nothing is told of left out."""
+    """As few rows of the same information, without columns that have none."""
     if not len(R):
         return R, d
     u, s, vt = np.linalg.svd(R * scales, full_matrices=False)

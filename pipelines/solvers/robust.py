@@ -10,7 +10,7 @@ of a family rejected, it begins again with measurements soft enough that priors 
 
 Outliers are a minority. A family of measurements of which more than half are rejected, beyond what chance could make
 of one in which every second is an outlier (binomial in the normal approximation, one sided, p = `max_chance`), has
-another noise than stated, or its model is wrong: all of it counts then, and chi-square says so.
+another noise than stated, or its model is wrong: all of it counts then, which chi-square shows.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def _norms(group: Group, values: Values) -> Array:
 
 
 def _mostly_rejected(engine: Engine, values: Values, chance: float) -> set[str]:
-    """Families of which more than half are rejected, by more than chance makes of an even one."""
+    """Families that lose more than half of their measurements significantly (binomial test against one half)."""
     counts: dict[str, list[int]] = {}
     for group in engine.groups:
         if group.loss is not None:

@@ -17,7 +17,7 @@ by `python -m benchmarks.young` (mean NEES against its two-sided 99.9 % interval
   without `curvature` the NEES of 10 numbers was 53,000, 990, 94 at the first three moments, that of the indexer's 17 at
   rest 149, 124, 51; with it 9 to 11, and 19 to 21.
 - Assumed sensor errors (`Reported.calibrated`) are never weak: they are small, so that linear theory holds for them.
-  Held at their priors they cost ordinary recordings what they tell: sigmas of a head's time offset and of a gimbal's
+  Fixed at their priors they cost ordinary recordings information: sigmas of a head's time offset and of a gimbal's
   mounting angles were 1.9 times as wide. Now all are what the linear system says.
 
 Everything follows from the square-root information R u = d of the reported numbers.

@@ -24,7 +24,7 @@ _FRESH_NS = 200_000_000
 _MISFIT_SIGMAS, _MISFIT_PX, _MISFIT_SHARE = 5.0, 0.5, 0.03
 
 UNSEEN = "no tag of the body seen well"
-AMBIGUOUS = "planar flip could not be told"
+AMBIGUOUS = "planar flip ambiguous"
 MISFIT = "tags do not fit the layout"
 
 

@@ -162,15 +162,15 @@ class Camera:
             J[..., :2] = scale[..., None, None] * np.eye(2)
             J[..., :2] += ((slope * z / square) - scale)[..., None, None] * out[..., :, None] * out[..., None, :]
             J[..., 2] = -(slope * rho / square)[..., None] * out
-            bent = scale[..., None] * flat
+            distorted = scale[..., None] * flat
         else:
             z = np.where(z > 0, z, np.nan)
             flat = points[..., :2] / z[..., None]
-            bent, by_flat = self._distort(flat)
+            distorted, by_flat = self._distort(flat)
             J = np.empty((*points.shape[:-1], 2, 3))
             J[..., :2] = by_flat / z[..., None, None]
             J[..., 2] = -(J[..., :2] @ flat[..., None])[..., 0]
-        return bent * self.focal + self.centre, self.focal[:, None] * J
+        return distorted * self.focal + self.centre, self.focal[:, None] * J
 
     def by_intrinsics(self, points: Array) -> Array:
         """Jacobian (..., 2, 4 + n) of the pixels of points, shape (..., 3), by `intrinsics`; NaN behind the camera."""

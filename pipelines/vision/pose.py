@@ -1,4 +1,4 @@
-"""Pose of a rigid body of AprilTags from one picture, with its covariance; planar flips are told or resolved."""
+"""Pose of a rigid body of AprilTags from one picture, with its covariance; planar flips are resolved or reported."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class BodyPose:
         rms_px: the same over all tags.
         rejected: ids of tags that disagree grossly with the others.
         ambiguity: odds (likelihood ratio, 0 to 1) of the flipped pose against this one; 0 where there is none.
-        ambiguous: the flip could not be told, neither from the corners nor from an expected attitude.
+        ambiguous: the flip could not be resolved, neither from the corners nor from an expected attitude.
     """
 
     cRb: Array
@@ -110,7 +110,7 @@ class BodyPose:
 
     @property
     def decided(self) -> bool:
-        """The corners alone tell the pose from its flip."""
+        """The corners alone distinguish the pose from its flip."""
         return self.ambiguity <= _AMBIGUOUS
 
 
@@ -296,7 +296,7 @@ def _colmap_camera(camera: Camera) -> Any:
 def _refine(camera: Camera, tags: TagBody, pixels: Array, cRb: Array, position: Array) -> _Fit | None:
     import pycolmap
 
-    # A pose that the corners leave open is no fault; its covariance says so.
+    # A pose that the corners leave open is no fault; its covariance has it.
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR
     options = pycolmap.AbsolutePoseRefinementOptions()
     options.gradient_tolerance = 1e-5

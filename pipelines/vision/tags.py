@@ -121,11 +121,11 @@ def _parameters(window: int) -> Any:
 
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window
-    # Small tags: more pixels a cell when the bits are read, and 4 of 36 bits may be wrong (36h11 tells 5 wrong ones).
+    # Small tags: more pixels a cell when the bits are read, and 4 of 36 bits may be wrong (36h11 detects 5 wrong ones).
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.errorCorrectionRate = 0.8
     # The outline of the white margin, 0.03 to 0.04 of the tag's perimeter away, is another quad: by default the two are
-    # taken for one, and the tag is lost when the outline comes near the picture's border.
+    # detected as one, and the tag is lost when the outline comes near the picture's border.
     parameters.minMarkerDistanceRate = 0.03
     parameters.minDistanceToBorder = 0
     return parameters
@@ -253,7 +253,7 @@ def _sample(picture: Picture, where: Array) -> tuple[Array, NDArray[np.bool_]]:
 def _levels(grey: Array, where: NDArray[np.bool_], s: Array) -> tuple[Array, Array]:
     """Grey levels beside each cut, (k, e, c), smoothed along the edge by a straight line, and their scatter, (k, e).
 
-    Means of the samples `where`, (k, e, samples). The line goes through medians, so that dirt does not pull it.
+    Means of the samples `where`, (k, e, samples). The line goes through medians, which dirt does not move.
     """
     beside = np.einsum("ecs,kes->kec", grey, where / where.sum(axis=2, keepdims=True))
     third = len(s) // 3

@@ -33,7 +33,7 @@ _FEATURES, _FEWEST = 300, 20
 _WINDOW, _ROUND_TRIP = 15, 0.5
 # A picture is poor when fewer than this share of the target's features agree, or when they scatter more than this, px.
 _AGREE, _SCATTER_PX = 0.35, 0.6
-# Sigma of a tag's corner, px, below which scatter cannot be told from luck.
+# Sigma of a tag's corner, px, below which scatter is not significant.
 _FLOOR_PX = 0.01
 
 
@@ -245,7 +245,7 @@ class _Texture:
 def _turn(match: _Match, camera: Camera) -> tuple[Array, Array]:
     """ckRc0 (4,) that turns the first directions into those now, and the covariance of a turn in c, (3, 3) rad^2."""
     n = len(match.now)
-    # A direction tells nothing of a turn about itself.
+    # A direction has no information about a turn about itself.
     information = n * np.eye(3) - match.now.T @ match.now
     sigma = match.sigma_px / float(camera.focal.mean())
     return so3.align(match.now, match.first), np.asarray(sigma**2 * np.linalg.inv(information))

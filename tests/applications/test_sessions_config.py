@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from alidade.pipelines.belief import independent
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.gaussian_prior import independent
 from alidade.pipelines.methods.cube.recording import CubeConfig, field_date
 from alidade.pipelines.methods.head.recording import HEAD_IMU, HeadConfig
 from alidade.pipelines.methods.los.recording import GIMBAL
@@ -34,11 +34,11 @@ head: {board: {tag_family: 36h11, tags: {0: {size: 0.04, rotation: [1, 0, 0, 0],
 
 
 def test_a_config_as_override_keeps_what_an_earlier_calibration_knows() -> None:
-    known = load_config(b"method: los").believing(independent(["delta_px"], [0.01], [1e-3], "earlier"))
-    (_, belief) = load_config(FULL, known).beliefs
-    assert (belief.names, belief.source) == ((), "earlier"), "priors of the config win"
-    (_, belief) = load_config(b"latitude_deg: 40.0", known).beliefs
-    assert (belief.names, belief.mean.tolist()) == (("delta_px",), [0.01])
+    known = load_config(b"method: los").with_prior(independent(["delta_px"], [0.01], [1e-3], "earlier"))
+    (_, gaussian_prior) = load_config(FULL, known).gaussian_priors
+    assert (gaussian_prior.names, gaussian_prior.source) == ((), "earlier"), "priors of the config win"
+    (_, gaussian_prior) = load_config(b"latitude_deg: 40.0", known).gaussian_priors
+    assert (gaussian_prior.names, gaussian_prior.mean.tolist()) == (("delta_px",), [0.01])
 
 
 def test_every_key_of_the_format() -> None:

@@ -27,7 +27,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
-from alidade.pipelines.estimation.problem import Array, Told
+from alidade.pipelines.estimation.problem import Array, SqrtInformation
 from alidade.pipelines.recording.opening import group_recordings
 from alidade.pipelines.reports.joint_report import forecasts, recording_blocks
 from alidade.pipelines.reports.result import Calibration
@@ -150,24 +150,24 @@ def test_errors_are_as_large_as_their_covariance_says() -> None:
     assert nees.consistent, nees
 
 
-def linear(rng: np.random.Generator, names: tuple[str, ...], truth: Array, device: int) -> Told:
+def linear(rng: np.random.Generator, names: tuple[str, ...], truth: Array, device: int) -> SqrtInformation:
     """A recording that says something of its numbers, those of the device first; the estimate is anywhere."""
     n = len(names)
     R, at = rng.standard_normal((n, n)) + 2.0 * np.eye(n), rng.standard_normal(n)
     d = R @ (truth - at) + rng.standard_normal(n)
     prior = np.eye(n)[:device] / 3.0
-    return Told(names, at, R, d, prior, -prior @ at, np.ones(n))
+    return SqrtInformation(names, at, R, d, prior, -prior @ at, np.ones(n))
 
 
 def test_joining_is_least_squares_of_everything() -> None:
     """Two numbers of the device, one that walks, one of the recording: against all unknowns in one system."""
     rng, names, days = np.random.default_rng(3), ("a", "b", "walking", "own"), [0.0, 4.0, 13.0]
     rates = {"a": 0.0, "b": 0.0, "walking": 0.2}
-    told = [linear(rng, names, np.array([1.0, -1.0, 0.5, i]), 3) for i in range(3)]
-    joined = join(told, rates, days)
+    sqrt_info = [linear(rng, names, np.array([1.0, -1.0, 0.5, i]), 3) for i in range(3)]
+    joined = join(sqrt_info, rates, days)
     # Unknowns: a, b, then walking and own of each recording.
     rows, rights = [], []
-    for i, each in enumerate(told):
+    for i, each in enumerate(sqrt_info):
         place = np.zeros((4, 8))
         place[[0, 1, 2, 3], [0, 1, 2 + 2 * i, 3 + 2 * i]] = 1.0
         rows.append(each.R @ place)
@@ -184,10 +184,10 @@ def test_joining_is_least_squares_of_everything() -> None:
     x, P = np.linalg.solve(A.T @ A, A.T @ b), np.linalg.inv(A.T @ A)
     for i in range(3):
         at = [0, 1, 2 + 2 * i, 3 + 2 * i]
-        belief = joined.all(i)
-        assert belief.names == names
-        np.testing.assert_allclose(belief.mean, x[at], atol=1e-10)
-        np.testing.assert_allclose(belief.covariance, P[np.ix_(at, at)], atol=1e-10)
+        gaussian_prior = joined.all(i)
+        assert gaussian_prior.names == names
+        np.testing.assert_allclose(gaussian_prior.mean, x[at], atol=1e-10)
+        np.testing.assert_allclose(gaussian_prior.covariance, P[np.ix_(at, at)], atol=1e-10)
     # What the others say and what the recording says make the whole again.
     others, own = joined.others(1), joined.parts[1]
     information = np.linalg.inv(others.covariance) + own.R.T @ own.R
@@ -320,8 +320,8 @@ def test_how_far_it_walks_is_told_by_the_recordings() -> None:
     assert found.changes.rates["theta"].upper > rate
     own = [next(p for p in part.parameters if p.name == "theta_y") for part in found.recordings]
     assert len({p.value for p in own}) == 8
-    (told,) = [text for name, text in forecasts(found) if name == "theta_y"]
-    assert "within what is required for" in told
+    (sqrt_info,) = [text for name, text in forecasts(found) if name == "theta_y"]
+    assert "within what is required for" in sqrt_info
     (shown,) = [each for each in recording_blocks(found) if isinstance(each, Plot) and each.title.startswith("theta")]
     (band,) = [mark for mark in shown.figure.named("theta_y") if mark.kind == "band"]
     # From the first recording on, and on beyond the last, ever wider.

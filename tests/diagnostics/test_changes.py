@@ -15,7 +15,7 @@ from alidade.pipelines.applications.joint import calibrate_together
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.device_changes import LEVEL, Changes, changes
-from alidade.pipelines.estimation.problem import Array, Told
+from alidade.pipelines.estimation.problem import Array, SqrtInformation
 from alidade.pipelines.reports.joint_report import forecasts
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.joint import join
@@ -25,35 +25,37 @@ NAMES = ("arm_mount_x", "arm_mount_y", "arm_mount_z", "own")
 RATES = dict.fromkeys(NAMES[:3], 0.0)
 
 
-def history(rng: np.random.Generator, n: int, step: float = 0.0, walk: float = 0.0) -> list[Told]:
+def history(rng: np.random.Generator, n: int, step: float = 0.0, walk: float = 0.0) -> list[SqrtInformation]:
     """Recordings that each know the device to one sigma; half way through its y makes a step."""
-    told, device = [], np.zeros(3)
+    sqrt_info, device = [], np.zeros(3)
     for i in range(n):
         device = device + walk * rng.standard_normal(3) + np.array([0.0, step * (i == n // 2), 0.0])
-        told.append(one(rng, device))
-    return told
+        sqrt_info.append(one(rng, device))
+    return sqrt_info
 
 
-def one(rng: np.random.Generator, device: Array) -> Told:
+def one(rng: np.random.Generator, device: Array) -> SqrtInformation:
     """A recording by itself, its own number told along with the device's."""
     R = np.eye(4)
     R[3, 1] = 0.7
     truth = np.append(device, rng.standard_normal())
     prior = np.eye(4)[:3] / 100.0
-    return Told(NAMES, np.zeros(4), R, R @ truth + rng.standard_normal(4), prior, np.zeros(3), np.full(4, 100.0))
+    return SqrtInformation(
+        NAMES, np.zeros(4), R, R @ truth + rng.standard_normal(4), prior, np.zeros(3), np.full(4, 100.0)
+    )
 
 
-def of(told: list[Told]) -> Changes:
-    days = [float(i) for i in range(len(told))]
-    return changes(join(told, RATES, days), days, {})
+def of(sqrt_info: list[SqrtInformation]) -> Changes:
+    days = [float(i) for i in range(len(sqrt_info))]
+    return changes(join(sqrt_info, RATES, days), days, {})
 
 
 def test_a_step_is_least_squares_of_both_sides() -> None:
     """Of a number known by itself: mean after less mean before, with the sigma of that."""
     rng = np.random.default_rng(0)
-    told = history(rng, 6, step=4.0)
-    values = np.array([each.d[0] for each in told])
-    found = of(told)
+    sqrt_info = history(rng, 6, step=4.0)
+    values = np.array([each.d[0] for each in sqrt_info])
+    found = of(sqrt_info)
     step = next(s for s in found.steps if s.name == "arm_mount_x" and s.after == 1)
     assert step.sigma == pytest.approx((1.0 / 2.0 + 1.0 / 4.0) ** 0.5, rel=1e-3)
     assert step.size == pytest.approx(values[2:].mean() - values[:2].mean(), abs=1e-3)
@@ -68,9 +70,9 @@ def test_two_steps_are_two() -> None:
 
 
 def test_coloured_noise_makes_steps_less_sure() -> None:
-    told = history(np.random.default_rng(2), 6, step=5.0)
+    sqrt_info = history(np.random.default_rng(2), 6, step=5.0)
     days = [float(i) for i in range(6)]
-    plain, grown = (changes(join(told, RATES, days), days, dict.fromkeys(NAMES, by)) for by in (1.0, 3.0))
+    plain, grown = (changes(join(sqrt_info, RATES, days), days, dict.fromkeys(NAMES, by)) for by in (1.0, 3.0))
     assert plain.any
     assert not grown.any
     assert grown.steps[0].sigma == pytest.approx(3.0 * plain.steps[0].sigma)
@@ -159,6 +161,6 @@ def test_a_change_is_told_in_words_and_numbers(moved: Calibration, tmp_path: Pat
 
 
 def test_when_it_leaves_what_is_required_is_told(moved: Calibration) -> None:
-    told = dict(forecasts(moved))
-    assert "in the root of a day (at most" in told["theta_y"]
-    assert "within what is required" in told["theta_y"]
+    sqrt_info = dict(forecasts(moved))
+    assert "in the root of a day (at most" in sqrt_info["theta_y"]
+    assert "within what is required" in sqrt_info["theta_y"]

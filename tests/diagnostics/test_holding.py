@@ -10,11 +10,11 @@ import pytest
 
 from alidade import calibrate, simulate
 from alidade import open as opened
-from alidade.pipelines.applications.sharing import device_belief, walks
-from alidade.pipelines.belief import Belief
+from alidade.pipelines.applications.sharing import device_prior, walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.device_changes import LEVEL, CalibrationCheck, check_calibration
-from alidade.pipelines.estimation.problem import Quantity, Told
+from alidade.pipelines.estimation.problem import Quantity, SqrtInformation
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.simulation.simulated import Simulated
@@ -70,12 +70,16 @@ def one(value: float, sigma: float, shift: float, rng: np.random.Generator) -> C
     """A number known to sigma, and a recording that says as much of it, shifted."""
     quantity = Quantity("mount", "rad", 0.1, 0.1, 1e-2)
     own = Quantity("bias", "rad/s", 0.1, 0.1, 1e-2)
-    known = Belief(("mount",), np.array([value + sigma * rng.standard_normal()]), np.array([[sigma**2]]), "march")
+    known = GaussianPrior(
+        ("mount",), np.array([value + sigma * rng.standard_normal()]), np.array([[sigma**2]]), "march"
+    )
     R = np.array([[1.0 / sigma, 0.3 / sigma], [0.0, 1.0 / sigma]])
     truth = np.array([value + shift, 0.02])
     prior = np.array([[10.0, 0.0]])
-    told = Told(("mount", "bias"), truth, R, rng.standard_normal(2), prior, -prior @ truth, np.array([0.1, 0.1]))
-    return check_calibration(known, told, (quantity, own), {})
+    sqrt_info = SqrtInformation(
+        ("mount", "bias"), truth, R, rng.standard_normal(2), prior, -prior @ truth, np.array([0.1, 0.1])
+    )
+    return check_calibration(known, sqrt_info, (quantity, own), {})
 
 
 def test_verdicts_are_as_sure_as_stated() -> None:
@@ -94,8 +98,10 @@ def test_verdicts_are_as_sure_as_stated() -> None:
 
 def test_a_recording_that_says_nothing_gives_no_verdict() -> None:
     quantity = Quantity("mount", "rad", 0.1, 0.1, 1e-2)
-    known = Belief(("mount",), np.zeros(1), np.array([[1e-6]]), "march")
-    nothing = Told(("mount",), np.zeros(1), np.empty((0, 1)), np.empty(0), np.eye(1) * 10.0, np.zeros(1), np.ones(1))
+    known = GaussianPrior(("mount",), np.zeros(1), np.array([[1e-6]]), "march")
+    nothing = SqrtInformation(
+        ("mount",), np.zeros(1), np.empty((0, 1)), np.empty(0), np.eye(1) * 10.0, np.zeros(1), np.ones(1)
+    )
     assert check_calibration(known, nothing, (quantity,), {}).verdict == "unknown"
 
 
@@ -112,10 +118,12 @@ def test_head_mounts_that_turned_are_noticed(tmp_path: Path) -> None:
         session = opened(simulate("head", shape, seed=2))
         problem = session.problem()
         device = walks(session.method, session.config, [q.name for q in problem.quantities])
-        belief = device_belief(load_known(tmp_path / "result.json"), session.method, session.config, "another", 0)
+        gaussian_prior = device_prior(
+            load_known(tmp_path / "result.json"), session.method, session.config, "another", 0
+        )
         estimate = solve_batch(problem, device=device)
-        assert estimate.told is not None
-        verdicts.append(check_calibration(belief, estimate.told, problem.quantities, {}))
+        assert estimate.sqrt_info is not None
+        verdicts.append(check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, {}))
     assert [each.verdict for each in verdicts] == ["holds", "changed"]
     assert any(s.name == "helmet_mount_y" and abs(np.rad2deg(s.size) - 0.3) < 0.12 for s in verdicts[1].changes.found)
 

@@ -14,8 +14,8 @@ from alidade.pipelines.diagnostics import change_test
 from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Severity
-from alidade.pipelines.estimation.parameters import pull
-from alidade.pipelines.estimation.problem import Array, Course, Estimate, History, Quantity, Told
+from alidade.pipelines.estimation.parameters import prior_z_score
+from alidade.pipelines.estimation.problem import Array, Course, Estimate, History, Quantity, SqrtInformation
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
@@ -139,7 +139,7 @@ def test_numbers_far_beyond_their_priors_have_wider_ones(departure: float, exces
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
     assert (np.diagonal(covariance, axis1=1, axis2=2) <= 4.0 * departure**2 * (1.0 + excess)).all()
     if not excess:
-        sizes = [pull(q, v, s) for q, v, s in zip(quantities, estimate.values, estimate.sigmas, strict=True)]
+        sizes = [prior_z_score(q, v, s) for q, v, s in zip(quantities, estimate.values, estimate.sigmas, strict=True)]
         information = np.linalg.inv(P) - np.diag(1.0 - np.array(sizes, dtype=float) ** -2)
         np.testing.assert_allclose(covariance[-1], np.linalg.inv(information), rtol=1e-6)
         gradient = np.linalg.inv(P) @ course.values[-1]
@@ -182,23 +182,33 @@ def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> No
     assert small.severity == Severity.NOTE
     assert list(small.evidence["steps"]) == ["a", "b"]
     R = np.linalg.cholesky(np.linalg.inv(0.01 * np.eye(2))).T
-    told = Told(("a", "b"), np.zeros(2), R, np.array([1.0, 2.0]), np.empty((0, 2)), np.empty(0), np.ones(2))
+    sqrt_info = SqrtInformation(
+        ("a", "b"), np.zeros(2), R, np.array([1.0, 2.0]), np.empty((0, 2)), np.empty(0), np.ones(2)
+    )
     history = History(np.array([10.0, 40.0]), np.zeros((2, 2)), np.full((2, 2), 0.1))
     budget = {"a": {"vision": 1.0}, "b": {"vision": 1.0}}
     narrow = Estimate(
-        "batch", ("a", "b"), np.zeros(2), 0.01 * np.eye(2), True, "", history=history, budget=budget, told=told
+        "batch",
+        ("a", "b"),
+        np.zeros(2),
+        0.01 * np.eye(2),
+        True,
+        "",
+        history=history,
+        budget=budget,
+        sqrt_info=sqrt_info,
     )
     wide = with_change(narrow, small)
     step = np.array([0.4, 0.3])
     expected = 0.01 * np.eye(2) + np.outer(step, step)
     np.testing.assert_allclose(wide.covariance, expected)
     assert wide.history is not None
-    assert wide.told is not None
+    assert wide.sqrt_info is not None
     assert wide.budget is not None
     np.testing.assert_allclose(wide.history.sigmas[0], [0.1, 0.1])
     np.testing.assert_allclose(wide.history.sigmas[1], np.sqrt(np.diag(expected)))
-    np.testing.assert_allclose(np.linalg.inv(wide.told.R.T @ wide.told.R), expected)
-    np.testing.assert_allclose(np.linalg.solve(wide.told.R, wide.told.d), np.linalg.solve(R, told.d))
+    np.testing.assert_allclose(np.linalg.inv(wide.sqrt_info.R.T @ wide.sqrt_info.R), expected)
+    np.testing.assert_allclose(np.linalg.solve(wide.sqrt_info.R, wide.sqrt_info.d), np.linalg.solve(R, sqrt_info.d))
     assert wide.budget["a"] == pytest.approx({CHANGE: 0.16 / 0.17, "vision": 0.01 / 0.17})
     large = change_finding(found, {"a": SplitHalf(0.0, 0.05, 0.7, 0.05)}, quantities)
     assert large is not None
@@ -221,8 +231,8 @@ def test_a_slip_is_seen_while_it_is_recorded() -> None:
     run, alarms = watched(session(0, 0.8, IDEAL, vision_rate_hz=4.0))
     assert run.recorder.rows.array[-1, 0] > 55.0
     assert alarms
-    told, when = alarms[0]
-    assert told < 46.0
+    sqrt_info, when = alarms[0]
+    assert sqrt_info < 46.0
     assert when == pytest.approx(30.0, abs=6.0)
     found = stability(run.finish(0.0), run.problem.quantities)
     assert found is not None

@@ -10,7 +10,7 @@ import pytest
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config
 from alidade.pipelines.estimation.finding import Severity
-from alidade.pipelines.estimation.problem import Quantity, Told
+from alidade.pipelines.estimation.problem import Quantity, SqrtInformation
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.sentences import sentence
@@ -80,9 +80,9 @@ def test_the_score_of_a_fixed_number_is_what_it_is_alone_freed() -> None:
     names = ("a", "d", "b", "c")
     y = A @ truth + rng.normal(size=200)
     fixed_at = np.append(np.linalg.lstsq(A[:, :2], y)[0], [0.0, 0.0])
-    told = Told(names, fixed_at, A, y - A @ fixed_at, np.empty((0, 4)), np.empty(0), np.ones(4))
+    sqrt_info = SqrtInformation(names, fixed_at, A, y - A @ fixed_at, np.empty((0, 4)), np.empty(0), np.ones(4))
     freed = [Quantity(name, "", None, 1.0, 0.1) for name in names]
-    (found,) = contradictions(told, freed, freed[:2])
+    (found,) = contradictions(sqrt_info, freed, freed[:2])
     alone, *_ = np.linalg.lstsq(A[:, :3], y)
     covariance = np.linalg.inv(A[:, :3].T @ A[:, :3])
     evidence = found.evidence

@@ -80,10 +80,10 @@ def test_the_steps_of_the_end_are_those_of_the_whole(name: str, rates: dict[str,
     data = chosen.simulate(settings, 3).data
     config = Config()
     start = chosen.problem(data, config)
-    assert start.onward is not None
-    whole = start.onward(data, -np.inf)
+    assert start.continuation is not None
+    whole = start.continuation(data, -np.inf)
     assert whole is not None
-    assert whole.onward is not None
+    assert whole.continuation is not None
     assert whole.steps_after is not None
     values, wanted = _values(whole), {step.time: step for step in whole.steps(1)}
     times = list(wanted)
@@ -91,8 +91,8 @@ def test_the_steps_of_the_end_are_those_of_the_whole(name: str, rates: dict[str,
     problem, base = whole, next(t for t in times if t >= times[0] + 10.0)
     taken = 0
     for stop in (22.0, 31.0, 45.5, 60.1):
-        assert problem.onward is not None
-        grown = problem.onward(_between(name, data, base - 2.0, stop), base)
+        assert problem.continuation is not None
+        grown = problem.continuation(_between(name, data, base - 2.0, stop), base)
         assert grown is not None
         assert grown.steps_after is not None
         if start.keyframes is not None:
@@ -108,5 +108,5 @@ def test_the_steps_of_the_end_are_those_of_the_whole(name: str, rates: dict[str,
             taken += 1
         problem, base = grown, steps[-5].time
     assert taken > 0.7 * len(times)
-    assert problem.onward is not None
-    assert problem.onward(data, base + 1e-4) is None, "there is no keyframe"
+    assert problem.continuation is not None
+    assert problem.continuation(data, base + 1e-4) is None, "there is no keyframe"

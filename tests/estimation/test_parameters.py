@@ -16,7 +16,7 @@ from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.parameters import ParameterSpec, pull, quantities
+from alidade.pipelines.estimation.parameters import ParameterSpec, prior_z_score, quantities
 from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
@@ -67,12 +67,12 @@ def test_an_accuracy_wanted_brings_a_verdict() -> None:
     assert judge((replace(x, require=math.inf), y), np.diag([4e-6, 1e-4]), None, None).status == "calibrated"
 
 
-def test_pull() -> None:
+def test_prior_z_score() -> None:
     q = Quantity("gyro_scale_x", "", 1e-2, 1e-2, math.inf, group="assumption")
-    assert pull(q, 6e-3, 8e-3) == pytest.approx(1.0)
-    assert pull(q, -2e-2, 1e-6) == pytest.approx(-2.0, rel=1e-6)
-    assert pull(q, 1e-4, 0.985e-2) is None
-    assert pull(replace(q, prior_sigma=0.0), 0.0, 0.0) is None
+    assert prior_z_score(q, 6e-3, 8e-3) == pytest.approx(1.0)
+    assert prior_z_score(q, -2e-2, 1e-6) == pytest.approx(-2.0, rel=1e-6)
+    assert prior_z_score(q, 1e-4, 0.985e-2) is None
+    assert prior_z_score(replace(q, prior_sigma=0.0), 0.0, 0.0) is None
 
 
 def test_unknown_figures_are_named() -> None:

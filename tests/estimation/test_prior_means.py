@@ -18,12 +18,12 @@ from alidade import Config
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.sharing import walks
-from alidade.pipelines.belief import Belief, independent
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.believing import believing
+from alidade.pipelines.estimation.prior_replacement import with_priors
 from alidade.pipelines.estimation.priors import vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.batch import solve_batch
@@ -44,18 +44,18 @@ def as_stated(problem: Problem) -> Problem:
 
 def believed(problem: Problem, sigma: float = SIGMA) -> Problem:
     names = [f"helmet_mount_{axis}" for axis in "xyz"]
-    return believing(problem, [independent(names, MOUNT.tolist(), [sigma] * 3)])
+    return with_priors(problem, [independent(names, MOUNT.tolist(), [sigma] * 3)])
 
 
 def test_a_prior_with_a_mean_is_a_measurement_of_it() -> None:
     """The posterior is that without the default prior, with another measurement: to first order the closed form."""
     problem = as_stated(head_problem())
-    wide = believing(problem, [independent([f"helmet_mount_{a}" for a in "xyz"], [0.0] * 3, [1e2] * 3)])
+    wide = with_priors(problem, [independent([f"helmet_mount_{a}" for a in "xyz"], [0.0] * 3, [1e2] * 3)])
     alone, both = solve_batch(wide), solve_batch(believed(problem))
     rows = [alone.names.index(f"helmet_mount_{axis}") for axis in "xyz"]
     # Where it agrees, nothing moves but the sigmas.
     agreeing = solve_batch(
-        believing(problem, [independent([alone.names[i] for i in rows], alone.values[rows].tolist(), [SIGMA] * 3)])
+        with_priors(problem, [independent([alone.names[i] for i in rows], alone.values[rows].tolist(), [SIGMA] * 3)])
     )
     expected = np.linalg.inv(np.linalg.inv(alone.covariance[np.ix_(rows, rows)]) + np.eye(3) / SIGMA**2)
     np.testing.assert_allclose(agreeing.values, alone.values, atol=1e-3 * alone.sigmas.min())
@@ -71,13 +71,13 @@ def test_a_sigma_of_zero_fixes_a_parameter_where_it_is_said_to_be() -> None:
 
 
 _SINGULAR = np.outer([1e-3, 2e-3, 1e-3], [1e-3, 2e-3, 1e-3])
-NONSENSE: dict[str, tuple[Belief, str]] = {
+NONSENSE: dict[str, tuple[GaussianPrior, str]] = {
     "a value of 1e300": (independent(["helmet_mount_x"], [1e300], [1e-3]), "far from anything"),
     "a value in microradians of a million": (independent(["helmet_mount_x"], [1e10], [1e-3]), "far from anything"),
     "a sigma of 1e150": (independent(["helmet_mount_x"], [0.0], [1e150]), "far from anything"),
     "a sigma of 1e-150": (independent(["helmet_mount_x"], [0.0], [1e-150]), "0 fixes it"),
     "a singular covariance": (
-        Belief(("helmet_mount_x", "helmet_mount_y", "helmet_mount_z"), np.zeros(3), _SINGULAR, "x.json"),
+        GaussianPrior(("helmet_mount_x", "helmet_mount_y", "helmet_mount_z"), np.zeros(3), _SINGULAR, "x.json"),
         "x.json: the covariance is singular",
     ),
 }
@@ -85,15 +85,15 @@ NONSENSE: dict[str, tuple[Belief, str]] = {
 
 @pytest.mark.parametrize("case", NONSENSE)
 def test_a_prior_of_which_no_solution_can_be_made_is_one_line(case: str) -> None:
-    belief, said = NONSENSE[case]
+    gaussian_prior, said = NONSENSE[case]
     with pytest.raises(InputError, match=said):
-        believing(head_problem(), [belief])
+        with_priors(head_problem(), [gaussian_prior])
 
 
 def test_incremental_takes_the_same_prior() -> None:
     simulated = alidade.simulate("indexer", FOUR_POSITIONS, seed=1)
     problem, truth = alidade.open(simulated).problem(), simulated.truth["theta_y"]
-    problem = believing(problem, [independent(["theta_y"], [truth + 3e-6], [1e-7])])
+    problem = with_priors(problem, [independent(["theta_y"], [truth + 3e-6], [1e-7])])
     batch, incremental = (solve(problem) for solve in (solve_batch, solve_incremental))
     row = batch.names.index("theta_y")
     assert abs(batch.values[row] - truth) > 2e-6  # the prior counts
@@ -106,7 +106,7 @@ def test_the_rest_of_a_prior_of_several_numbers_stays() -> None:
     problem = as_stated(head_problem())
     before, after = (
         solve_batch(problem),
-        solve_batch(believing(problem, [independent(["time_offset"], [0.004], [1e-6])])),
+        solve_batch(with_priors(problem, [independent(["time_offset"], [0.004], [1e-6])])),
     )
     at = {name: i for i, name in enumerate(after.names)}
     assert after.values[at["time_offset"]] == pytest.approx(0.004, abs=3e-6)
@@ -118,11 +118,11 @@ def test_the_rest_of_a_prior_of_several_numbers_stays() -> None:
 def test_what_is_fixed_today_stays_fixed_and_tells_of_the_others() -> None:
     """Believed together with another number: that one follows, as the belief conditioned on what is fixed."""
     names = ("helmet_mount_x", "camera_mount_x")
-    tight = Belief(names, np.array([0.06, 0.02]), 1e-8 * np.array([[1.0, 0.99], [0.99, 1.0]]), "yesterday's")
+    tight = GaussianPrior(names, np.array([0.06, 0.02]), 1e-8 * np.array([[1.0, 0.99], [0.99, 1.0]]), "yesterday's")
     fixed = Config.model_validate({"priors": {"camera_mount_x": 0.0}})
     simulated = alidade.simulate("head", {"duration_s": 10.0}, seed=1)
     session = alidade.open(simulated, config=fixed)
-    estimate = solve_batch(believing(session.problem(), [tight]))
+    estimate = solve_batch(with_priors(session.problem(), [tight]))
     value = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
     assert value["camera_mount_x"] == pytest.approx(0.0, abs=1e-9)
 
@@ -169,7 +169,7 @@ def _begins_twice() -> Problem:
 
 def test_a_joint_prior_of_parameters_that_begin_in_different_steps() -> None:
     mean, covariance = np.array([0.3, -0.2]), np.array([[0.04, 0.03], [0.03, 0.09]])
-    problem = believing(_begins_twice(), [Belief(("first", "second"), mean, covariance)])
+    problem = with_priors(_begins_twice(), [GaussianPrior(("first", "second"), mean, covariance)])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for step in problem.steps(1):
         values.insert(step.initial)
@@ -185,8 +185,8 @@ def test_a_joint_prior_of_parameters_that_begin_in_different_steps() -> None:
 
 def test_a_joint_prior_in_the_later_steps_of_a_recording_that_grows() -> None:
     """Its second half is the conditional of what begins, given what began before."""
-    belief = Belief(("first", "second"), np.zeros(2), np.array([[0.04, 0.03], [0.03, 0.09]]))
-    problem = believing(_begins_twice(), [belief])
+    gaussian_prior = GaussianPrior(("first", "second"), np.zeros(2), np.array([[0.04, 0.03], [0.03, 0.09]]))
+    problem = with_priors(_begins_twice(), [gaussian_prior])
     assert problem.steps_after is not None
     whole, late = list(problem.steps(1))[3], next(problem.steps_after(2.0))
     values = gtsam.Values(late.initial)
@@ -271,7 +271,7 @@ def test_what_walks_is_known_less_well_after_a_while(earlier: tuple[Calibration,
 
 def test_how_far_it_walks_is_not_told_by_one_recording(earlier: tuple[Calibration, Path]) -> None:
     config = load_config(b"share: {theta_*: walks}")
-    with pytest.raises(InputError, match="how far theta_x walks, only several recordings together tell"):
+    with pytest.raises(InputError, match="how far theta_x walks, only several recordings together determine it"):
         alidade.open(alidade.simulate("indexer", COARSE, seed=2), config=config, prior=earlier[1] / "result.json")
 
 

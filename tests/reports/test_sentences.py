@@ -85,7 +85,7 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "jump",
         Severity.WEAK,
         {"since_s": 117.5, "time_s": 117.6, "size": 0.0105, "sigma": 0.0018},
-        "Vision jumped by 0.60 ± 0.10 deg at 118 s: mount or reference, the motion does not tell.",
+        "Vision jumped by 0.60 ± 0.10 deg at 118 s: mount or reference: the motion does not decide.",
     ),
     (
         "device_change",

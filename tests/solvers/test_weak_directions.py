@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from alidade.pipelines import methods
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.believing import believing
+from alidade.pipelines.estimation.prior_replacement import with_priors
 from alidade.pipelines.estimation.problem import Array, Problem
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
@@ -174,7 +174,7 @@ def test_weak_direction_keeps_its_correlated_prior() -> None:
     data, _ = simulate_los(scenario, 0)
     graph = methods.method("los").graph(data, load_config(los_config(scenario).encode()))
     covariance = np.deg2rad(5.0) ** 2 * np.array([[1.0, 0.99], [0.99, 1.0]])
-    known = believing(graph, [Belief(("delta_px", "delta_gx"), np.zeros(2), covariance, "an earlier one")])
+    known = with_priors(graph, [GaussianPrior(("delta_px", "delta_gx"), np.zeros(2), covariance, "an earlier one")])
     wide = np.ones(2) / np.sqrt(2.0)
     for estimate in (solve_batch(known, budget=True), solve_incremental(known, 1.0)):
         at = [estimate.names.index(name) for name in ("delta_px", "delta_gx")]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib import import_module
 from typing import Any
 
+from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.methods.cube.scenario import CubeScenario
@@ -34,8 +34,6 @@ SCENARIOS: dict[str, Any] = {
 @cache
 def problem(name: str) -> Problem:
     """The problem of a scenario."""
-    method = name.split()[0].rstrip(",")
-    found = import_module(f"alidade.pipelines.methods.{method}.simulation").simulated(SCENARIOS[name], 3)
-    graph = import_module(f"alidade.pipelines.methods.{method}.graph")
-    made: Problem = graph.problem(found.data, load_config(found.config.encode()))
-    return made
+    method = methods.method(name.split()[0].rstrip(","))
+    found = method.simulate(SCENARIOS[name], 3)
+    return method.problem(found.data, load_config(found.config.encode()))

@@ -36,14 +36,14 @@ from alidade.pipelines.applications.fleet.store import (
     settings_key,
 )
 from alidade.pipelines.applications.sharing import walks
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.reports.known import load_known
 
 if TYPE_CHECKING:
-    from alidade.pipelines.estimation.problem import Told
+    from alidade.pipelines.estimation.problem import SqrtInformation
     from alidade.pipelines.reports.result import Calibration
 
 
@@ -273,17 +273,17 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _says(calibration: Calibration) -> Told:
+def _says(calibration: Calibration) -> SqrtInformation:
     """Information of a calibration about its numbers; of solvers without it, from their covariance."""
-    from alidade.pipelines.solvers.posterior import told_of
+    from alidade.pipelines.solvers.posterior import sqrt_information_of
 
     estimate = calibration.estimate
-    if estimate.told is not None:
-        return estimate.told
+    if estimate.sqrt_info is not None:
+        return estimate.sqrt_info
     scales = {q.name: q.prior_scale for q in calibration.problem.quantities}
     known = [name for name, sigma in zip(estimate.names, estimate.sigmas, strict=True) if sigma > 0.0]
-    belief = Belief(estimate.names, estimate.values, estimate.covariance).of(known)
-    return told_of(belief, [scales[name] for name in belief.names])
+    gaussian_prior = GaussianPrior(estimate.names, estimate.values, estimate.covariance).of(known)
+    return sqrt_information_of(gaussian_prior, [scales[name] for name in gaussian_prior.names])
 
 
 def _placed(name: str, result: RecordingResult, named: Mapping[str, str]) -> UnitResult:

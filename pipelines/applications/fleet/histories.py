@@ -1,7 +1,7 @@
 """Units that were recorded several times: whether they changed, as several recordings of one device are judged.
 
 The recordings of a unit are joined as `calibrate` joins them, linear about each one's own estimate. What belongs to a
-recording is its own; priors and assumptions count once. What chance makes is counted over all units of the fleet.
+recording is its own; priors and assumptions count once. Significance is counted over all units of the fleet.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from alidade.pipelines.applications.fleet.store import UnitResult
 from alidade.pipelines.applications.fleet.tables import Row
 from alidade.pipelines.applications.sharing import DAY_S
 from alidade.pipelines.diagnostics.device_changes import Change, Changes, changes
-from alidade.pipelines.estimation.problem import Told
+from alidade.pipelines.estimation.problem import SqrtInformation
 from alidade.pipelines.solvers.joint import grown, join
 
 
@@ -58,27 +58,27 @@ class History:
         return tuple(found.get((step.name, step.after), step) for step in self.changes.steps)
 
 
-def packed(told: Told) -> str:
+def packed(sqrt_info: SqrtInformation) -> str:
     """What a recording says of its numbers, as text."""
-    triangle = np.linalg.qr(np.column_stack([told.R, told.d])).R
+    triangle = np.linalg.qr(np.column_stack([sqrt_info.R, sqrt_info.d])).R
     with io.BytesIO() as stream:
         np.savez_compressed(
             stream,
-            names=np.array(told.names),
-            at=told.at,
+            names=np.array(sqrt_info.names),
+            at=sqrt_info.at,
             whole=triangle,
-            prior_R=told.prior_R,
-            prior_d=told.prior_d,
-            scales=told.scales,
+            prior_R=sqrt_info.prior_R,
+            prior_d=sqrt_info.prior_d,
+            scales=sqrt_info.scales,
         )
         return base64.b64encode(stream.getvalue()).decode()
 
 
-def unpacked(text: str) -> Told:
+def unpacked(text: str) -> SqrtInformation:
     """The other way round."""
     with np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False) as each:
         whole = each["whole"]
-        return Told(
+        return SqrtInformation(
             names=tuple(each["names"].tolist()),
             at=each["at"],
             R=whole[:, :-1],

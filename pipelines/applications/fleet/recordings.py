@@ -169,7 +169,7 @@ def _recorded(path: Path) -> dict[str, str]:
                 own = {**_custom(record.metadata.get("serialized_metadata", "")), **record.metadata}
                 found |= {key: value for key, value in own.items() if value}
         except Exception:
-            # A damaged file fails in any way here. What is wrong with it is told when its messages are read.
+            # A damaged file fails in any way here. Its error is reported when its messages are read.
             return {}
     return found
 

@@ -60,7 +60,7 @@ class Bridge(Stream):
     Args:
         url: ws://host:port or wss://.
         folder: where they are kept; None: nowhere.
-        say: is told when the bridge answers and when it does not.
+        say: called when the bridge answers and when it does not.
     """
 
     def __init__(self, url: str, folder: Path | None, say: Callable[[str], None]) -> None:
@@ -143,11 +143,11 @@ class Bridge(Stream):
             return []  # counted by `_advertised`, which reads every text
 
     def _advertised(self, text: str) -> list[tuple[int, dict[str, str]]]:
-        """The channels that a bridge tells of in a message and that are of use, with its numbers."""
+        """The channels that a bridge advertises in a message and that are of use, with its numbers."""
         found = []
         try:
-            told = read_message(text)
-            channels = told.get("channels") if told.get("op") == "advertise" else []
+            message = read_message(text)
+            channels = message.get("channels") if message.get("op") == "advertise" else []
             if not isinstance(channels, list):
                 raise RefusedError("channels that are no list")
         except RefusedError as error:

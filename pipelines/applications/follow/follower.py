@@ -1,9 +1,9 @@
 """Follows a growing recording: looks at it again and again, and hands what is new to the incremental solver.
 
 A look costs what is new, not what was there: once the solver has marginalised the past out, data are read and the graph
-is built from there on alone (Problem.onward). Methods whose past may still change, as with turns and poses under way,
-and errors taken from pictures of a first target, are read whole; their looks are followed by longer pauses, so that
-following never takes more than a third of a core for reading.
+is built from there on alone (Problem.continuation). Methods whose past may still change, as with turns and poses under
+way, and errors taken from pictures of a first target, are read whole; their looks are followed by longer pauses, so
+that following never takes more than a third of a core for reading.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _MARGINS = (2.0, 20.0)
 _LONG_AGO = 1.5
 # While a long recording is caught up with, the view is renewed this often, s.
 _VIEW = 1.0
-# Times are differences of stamps, which are whole ns: they are told apart beyond this, s.
+# Times are differences of stamps, which are whole ns: they differ beyond this, s.
 _ROUNDING = 1e-9
 _CLOCK = "time_offset", "clock_skew"
 _MISPLACED = "by now pictures are taken farther from their stamps than motion around these can be carried"
@@ -116,7 +116,7 @@ class Follower:
         if settings.checkpoint is not None and settings.window is None:
             raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
         if settings.prior is not None:
-            load_known(settings.prior)  # told now, not when the recording has begun
+            load_known(settings.prior)  # refused now, not when the recording has begun
 
     def follow(self) -> Calibration:
         """Until the recording is finished, stops growing, or `stopped`; then the calibration by all there is.
@@ -196,15 +196,15 @@ class Follower:
     def _guessed_before(self, session: Session) -> Problem | None:
         """The graph from the first guesses of a look before, where that is not long ago: they take most of the time."""
         run = self._run
-        if run is None or run.problem.onward is None or run.time > _LONG_AGO * self._guessed:
+        if run is None or run.problem.continuation is None or run.time > _LONG_AGO * self._guessed:
             self._guessed = 0.0 if run is None else run.time
             return None
-        return run.problem.onward(session.data, -np.inf)
+        return run.problem.continuation(session.data, -np.inf)
 
     def _end_alone(self) -> tuple[Problem, Iterator[Step]] | None:
         """The graph from where the past was marginalised out, and its new steps; None where that is too little."""
         run, session = self._run, self._session
-        if run is None or run.marginal is None or run.problem.onward is None or session is None:
+        if run is None or run.marginal is None or run.problem.continuation is None or session is None:
             return None
         for margin in _MARGINS:
             since = self._epoch_ns + self._delay_ns + round((run.marginal.time - margin) * 1e9)
@@ -212,7 +212,7 @@ class Follower:
             if len(self._growing.attachments) != self._attachments:
                 return None
             late = session.again(recording)
-            problem = run.problem.onward(late.data, run.marginal.time)
+            problem = run.problem.continuation(late.data, run.marginal.time)
             if problem is not None and problem.steps_after is not None:
                 self._delay_ns = _min_delay_ns(late)
                 self._collect(late)
@@ -371,4 +371,4 @@ def _names(problem: Problem) -> list[str]:
 
 def _that_grows(problem: Problem, session: Session) -> Problem:
     """The graph of all data in the form in which a recording that grows is continued, if it has one."""
-    return (problem.onward and problem.onward(session.data, -np.inf)) or problem
+    return (problem.continuation and problem.continuation(session.data, -np.inf)) or problem

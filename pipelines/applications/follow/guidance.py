@@ -1,4 +1,4 @@
-"""What the person recording is told: what is known by now, what has been collected, and what is still missing."""
+"""Guidance for the person recording: what is known by now, what has been collected, and what is still missing."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class View:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The state in words, as clients are told it."""
+        """The state in words, as clients receive it."""
         return {
             "time_s": self.time,
             "status": self.status,

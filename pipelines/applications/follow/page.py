@@ -5,9 +5,9 @@
 
 One document without anything from elsewhere, and server-sent events that each have the whole state, so that whoever
 comes late, or comes back, has it at once. On the loopback interface whoever asks is answered if they ask for this
-machine by name, lest other pages in the browser read along. On any other address only who has come by the one-time
-token is; what it was traded for is kept in a cookie. Connections are bounded in number, and in time until they have
-shown that they may read; wrong tokens are counted by address.
+machine by name, so that other pages in the browser cannot read along. On any other address only who has come by the
+one-time token is; what it was traded for is kept in a cookie. Connections are bounded in number, and in time until they
+have shown that they may read; wrong tokens are counted by address.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 HOST, PORT = "127.0.0.1", 8766
 
-# A client is told of what is new this often, and of nothing new that often, s: the page takes longer silence for a dead
+# A client is sent what is new this often, and of nothing new that often, s: the page takes longer silence for a dead
 # connection.
 _GLANCE, _ALIVE = 0.2, 2.0
 # Browsers that have lost the server come back after this, ms.
@@ -72,7 +72,7 @@ class LivePage:
         is_open: to others than this machine, by a token.
 
     Args:
-        say: is told where the next device finds the page once a token has been used.
+        say: called with where the next device finds the page once a token has been used.
         host: address of this machine to be reached by; the loopback one is for this machine alone.
         port: 0: any that is free.
         name: of the recording.

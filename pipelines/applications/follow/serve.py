@@ -130,7 +130,7 @@ class LiveServer:
         self._log("/status", _STATUS, {}, view.summary, at)
 
     def _advertise(self, topic: str, schema: dict[str, Any], metadata: dict[str, str]) -> int:
-        """The number of a topic's channel; a new one is told to everybody."""
+        """The number of a topic's channel; a new one is announced to everybody."""
         with self._changed:
             if topic not in self._channels:
                 self._channels[topic] = {
@@ -227,7 +227,7 @@ class _Client:
     def __init__(self) -> None:
         self.wanted: dict[int, int] = {}
         self.sent: dict[int, int] = {}  # subscription -> number of the last message
-        self.channels = 0  # told of
+        self.channels = 0  # announced
         self.gone = False
 
     def take(self, text: str | bytes) -> None:
@@ -235,15 +235,15 @@ class _Client:
         if isinstance(text, bytes):
             return
         try:
-            told = read_message(text)
-            subscribed = {read_id(one["id"]): read_id(one["channelId"]) for one in told.get("subscriptions", [])}
-            unsubscribed = [read_id(number) for number in told.get("subscriptionIds", [])]
+            message = read_message(text)
+            subscribed = {read_id(one["id"]): read_id(one["channelId"]) for one in message.get("subscriptions", [])}
+            unsubscribed = [read_id(number) for number in message.get("subscriptionIds", [])]
         except (RefusedError, KeyError, TypeError):
             return
         for number in (*subscribed, *unsubscribed):
             self.wanted.pop(number, None)
             self.sent.pop(number, None)
-        if told.get("op") == "subscribe":
+        if message.get("op") == "subscribe":
             room = MAX_SUBSCRIPTIONS - len(self.wanted)
             self.wanted |= dict(list(subscribed.items())[:room])
 

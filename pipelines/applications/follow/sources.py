@@ -64,7 +64,7 @@ class Source(AbstractContextManager["Source"]):
         parts = self.parts
         try:
             closed = bool(parts) and is_closed(parts[-1])
-        except OSError:  # gone since, or no more files may be opened: nothing tells
+        except OSError:  # gone since, or no more files may be opened: no way to know
             return False
         return closed and (not self.path.is_dir() or (self.path / "metadata.yaml").is_file())
 
@@ -80,7 +80,7 @@ class Stream(Source):
     Args:
         name: what it is called.
         folder: where to; None: a temporary one.
-        say: is told what goes wrong.
+        say: called with what goes wrong.
 
     Raises InputError when the folder cannot be made.
     """
@@ -161,7 +161,7 @@ class Replay(Stream):
         path: of the file.
         speed: how many times as fast.
         folder: where it is written; None: a temporary one.
-        say: is told what goes wrong.
+        say: called with what goes wrong.
 
     Raises:
         InputError: it is no MCAP file, or the speed is not above zero.
@@ -194,7 +194,7 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
     Args:
         what: its name.
         folder: where streams are kept; None: nowhere.
-        say: is told of connections, and what goes wrong with them.
+        say: called with connections and their failures.
 
     Raises:
         InputError: a folder cannot be written, a library is not installed, or what is there is a device or a pipe.

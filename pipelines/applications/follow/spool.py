@@ -26,7 +26,7 @@ class Spool:
 
     Args:
         path: of the file.
-        say: is told when there is no room, and when there is again.
+        say: called when there is no room, and when there is again.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:

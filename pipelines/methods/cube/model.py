@@ -29,8 +29,8 @@ from alidade.factors.tags import TagAttitudeFactor
 from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor
 from alidade.factors.turns import GyroRotationFactor, Samples, Turns
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.believing import believing
 from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.prior_replacement import with_priors
 from alidade.pipelines.estimation.priors import rotation_about, vector_about
 from alidade.pipelines.estimation.problem import Array, Attitudes, ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
@@ -60,7 +60,7 @@ from alidade.pipelines.methods.cube.recording import (
 )
 from alidade.pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
 from alidade.pipelines.methods.cube.static_poses import SeenTags, StaticPoses, static_poses, turn
-from alidade.pipelines.methods.cube.tags import layout_belief, tag_place_key
+from alidade.pipelines.methods.cube.tags import layout_prior, tag_place_key
 from alidade.pipelines.methods.cube.wandering import GaussMarkovDeviation, deviation_key, sum_key
 from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
 from alidade.pipelines.settings import Config
@@ -85,7 +85,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         InputError: there is no static pose, the position is unknown, the date is outside the field model, or no tag of
             the cube is seen well though there is a camera.
     """
-    model, layout = prepare(data, config), layout_belief(config)
+    model, layout = prepare(data, config), layout_prior(config)
     graph = Problem(
         method="cube",
         parameters=model.parameters.all,
@@ -99,7 +99,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=ChainLayout(states="xdepR" if model.reference.moves else "xdep"),
     )
-    return graph if layout is None or data.camera is None else believing(graph, [layout])
+    return graph if layout is None or data.camera is None else with_priors(graph, [layout])
 
 
 def _steps(model: Model, _: int) -> Iterator[Step]:

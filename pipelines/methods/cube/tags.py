@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.belief import Belief
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.cube.recording import (
     TAG_DETECTIONS,
     CubeConfig,
@@ -190,16 +190,16 @@ def tag_places(config: Config) -> tuple[Parameter, ...]:
     return tuple(Parameter(tag_place_key(tag), tuple(quantity(tag, a) for a in "xyz")) for tag in sorted(cube.tags))
 
 
-def layout_belief(config: Config) -> Belief | None:
+def layout_prior(config: Config) -> GaussianPrior | None:
     """What the layout's covariance says of tags and of the camera, but for numbers with a prior given elsewhere."""
     cube = config.section(CubeConfig)
     if cube.covariance is None:
         return None
-    elsewhere = {*config.priors, *(name for belief in config.beliefs for name in belief.names)}
+    elsewhere = {*config.priors, *(name for gaussian_prior in config.gaussian_priors for name in gaussian_prior.names)}
     of_camera = CAMERA_NUMBERS if cube.covariance.camera else ()
     names = (*(f"tag_{tag}_{number}" for tag in cube.covariance.tags for number in _NUMBERS), *of_camera)
     told = {*(f"tag_{tag}_{number}" for tag in _told(cube) for number in _NUMBERS), *of_camera}
-    whole = Belief(names, np.zeros(len(names)), cube.covariance.matrix, "the covariance of the tags' layout")
+    whole = GaussianPrior(names, np.zeros(len(names)), cube.covariance.matrix, "the covariance of the tags' layout")
     return whole.of(told - elsewhere)
 
 

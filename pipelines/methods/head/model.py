@@ -96,7 +96,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         advice=_advice,
         dropped=data.dropped,
         premises=() if data.platform_t is not None else (_AT_REST,),
-        onward=partial(_onward, config, model),
+        continuation=partial(_continuation, config, model),
         unsettled=temperature.unsettled(data.temperature),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.picture, model.clock.begun),
@@ -141,7 +141,7 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     return {level.noise.name: level for level in found}
 
 
-def _onward(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
+def _continuation(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
     """The graph of the end of a growing recording; see Problem.onward."""
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time < data.vision_t[0]):

@@ -98,7 +98,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         advice=_advice,
         dropped=dropped,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
-        onward=partial(_onward, config, model) if data.error_cov is None else None,
+        continuation=partial(_continuation, config, model) if data.error_cov is None else None,
         unsettled=max(_SETTLED if model.around is None else SMOOTHING, temperature.unsettled(data.temperature)),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.sight, model.clock.begun),
@@ -118,7 +118,7 @@ def _noises(data: LosData, config: Config) -> dict[str, Level]:
     return {level.noise.name: level for level in found}
 
 
-def _onward(config: Config, model: _Model, data: LosData, time: float) -> Problem | None:
+def _continuation(config: Config, model: _Model, data: LosData, time: float) -> Problem | None:
     """The graph of the end of a growing recording; see Problem.onward."""
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time not in data.image_t):

@@ -60,7 +60,7 @@ class Layout:
         cameras, given_cameras: as used in the end, and as given.
         camera_sigma: (c, n) of their intrinsics, None if not adjusted.
         line_time, line_time_sigma: (c,) s, from one row of a picture to the next, where it moves and pictures are close
-            enough in time to tell; about 0 with a sigma of 30 us.
+            enough in time; about 0 with a sigma of 30 us.
         bend: sigma of a tag's corners against a flat square, each way, as a share of its size.
         with_camera: (6 (n - 1) + 3, the same) covariance of the tags, of the focal length, as a share, and of the
             centre, px, where the one camera that there is was adjusted; else None.
@@ -92,8 +92,8 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
         refine_camera: adjust the cameras' intrinsics too, about those given.
 
     Raises:
-        InputError: no picture shows the first tag with another, or the pictures do not tell the layout from its mirror
-            image.
+        InputError: no picture shows the first tag with another, or the pictures do not distinguish the layout from its
+            mirror image.
     """
     unplaced = _apart(gathered(shots, given), given)
     body: TagBody | None = None
@@ -142,7 +142,7 @@ def _reached(sights: Sights, tags: int) -> NDArray[np.bool_]:
 
 
 def _wrong(views: Gathered, fit: Fit) -> dict[int, str]:
-    """Tags whose pose is not to be believed."""
+    """Tags whose pose is ambiguous or inconsistent."""
     body, sights = fit.bundle.body, views.sights
     n = len(body.ids)
     shown, used = np.bincount(sights.tag, minlength=n), np.bincount(fit.sights.tag, minlength=n)
@@ -156,7 +156,7 @@ def _wrong(views: Gathered, fit: Fit) -> dict[int, str]:
             )
         elif not reached[k]:
             out[tag] = (
-                f"in {shown[k]} pictures, but in none with placed tags that tells the flip of all it shows; take "
+                f"in {shown[k]} pictures, but in none with placed tags that resolves the flip of all it shows; take "
                 "pictures from nearer, or that show more tags"
             )
         elif not flip_told(fit, views.view, k):

@@ -15,7 +15,7 @@ from alidade.pipelines.vision.layout.sights import Array, Bundle, Rows, Sights
 
 # What a calibration of a camera is good to: focal lengths as a share, centre, distortion at the picture's corner.
 _FOCAL, _CENTRE_PX, _DISTORTION_PX = 5e-3, 5.0, 1.0
-# Of a shutter that may roll, s from one row to the next: what is not told by pictures has this sigma.
+# Of a shutter that may roll, s from one row to the next: what pictures do not determine has this sigma.
 LINE_TIME = 3e-5
 
 

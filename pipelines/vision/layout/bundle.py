@@ -132,10 +132,10 @@ def _with_additional(
     precision = np.where(additional.free, additional.sigma, 1.0) ** -2.0
     flat = weighted.reshape(-1, n).T
     own = flat @ C.reshape(-1, n) + np.diag(precision)
-    pull = flat @ rows.miss.ravel() + precision * additional.off(bundle)
+    right = flat @ rows.miss.ravel() + precision * additional.off(bundle)
     return (
         np.block([[information, mixed.T], [mixed, own]]),
-        np.concatenate([gradient, pull]),
+        np.concatenate([gradient, right]),
         np.concatenate([across, with_pictures.transpose(0, 2, 1)], axis=2),
     )
 

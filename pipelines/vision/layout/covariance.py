@@ -32,7 +32,7 @@ from alidade.pipelines.vision.pose import SQUARE
 
 # A correlation within this many of its sigmas of zero has died out; the first one is asked to be beyond more of them.
 _DIED_OUT, _COLOURED = 2.0, 4.0
-# Numbers seen again where nothing moved, from which on they tell what they have in common.
+# Numbers seen again where nothing moved, from which on their common error is estimated.
 _FEWEST = 100
 # A tag's variance beyond the common one by this many of its sigmas is its own.
 _CLEARLY = 2.0
@@ -49,7 +49,7 @@ _LEVELS = np.geomspace(1e-5, 3e-2, 400)
 _ROUNDING = 1e-9
 
 
-def _bends() -> Array:
+def _deformations() -> Array:
     """(6, 4, 3) of unit length: size, height over width, shear, keystone along x and along y, twist.
 
     With the six numbers of a pose these are all that four corners may be off by.
@@ -63,12 +63,12 @@ def _bends() -> Array:
     return np.asarray(out / np.linalg.norm(out, axis=(1, 2), keepdims=True))
 
 
-BENDS = _bends()
+DEFORMATIONS = _deformations()
 
 
 @dataclass(frozen=True, eq=False)
 class Bending:
-    """What bent tags do to a layout.
+    """Effect of deformed tags on a layout.
 
     Attributes:
         level: sigma of a corner, each way, as a share of the tag's size.
@@ -112,9 +112,9 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
     curved = fit.curvature[sights.picture]
     information = normal_equations(bundle, sights, rows, curved, fixed, fit.additional).information
     white: Array = np.asarray(np.linalg.inv(information), dtype=float)
-    own, by_bends = _eliminated(fit, fixed)
-    bent = bending(rows.miss, by_bends, own, white)
-    found = _sandwich(fit, own, view, white) + bent.spread
+    own, by_deformation = _eliminated(fit, fixed)
+    deformation = bending(rows.miss, by_deformation, own, white)
+    found = _sandwich(fit, own, view, white) + deformation.spread
     correction = None
     free = fit.additional.free
     if free.any():
@@ -129,7 +129,7 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
         inflation[tag] = np.sqrt(np.trace(np.linalg.solve(white[at, at], found[at, at])) / 6.0)
     sigma = np.zeros(len(free))
     sigma[free] = np.sqrt(np.diag(found)[tags:])
-    return Covariance(found[:tags, :tags], found, sigma, inflation, bent.level, correction)
+    return Covariance(found[:tags, :tags], found, sigma, inflation, deformation.level, correction)
 
 
 def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
@@ -144,33 +144,33 @@ def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Arr
     q, free = len(information), additional.sigma[additional.free]
     prior = np.zeros(q)
     prior[q - len(free) :] = free**-2.0
-    # In units of A + P, which is positive definite even where pictures alone tell nothing.
+    # In units of A + P, which is positive definite even where pictures alone have no information.
     L = np.linalg.cholesky(information)
     back = np.linalg.inv(L)
     P = back * prior @ back.T
     A, S = np.eye(q) - P, L.T @ found @ L + _LEAST_VARIANCE * np.eye(q)
     weighed = A @ np.linalg.inv(S)
     covariance = np.linalg.inv(weighed @ A + P)
-    pull = np.zeros(q)
-    pull[q - len(free) :] = prior[q - len(free) :] * additional.off(fit.bundle)[additional.free]
-    step = -covariance @ ((np.eye(q) - weighed) @ (back @ pull))
+    right = np.zeros(q)
+    right[q - len(free) :] = prior[q - len(free) :] * additional.off(fit.bundle)[additional.free]
+    step = -covariance @ ((np.eye(q) - weighed) @ (back @ right))
     return np.asarray(back.T @ covariance @ back), np.asarray(back.T @ step)
 
 
 def _eliminated(fit: Fit, fixed: int) -> tuple[Array, Array]:
-    """Errors by all that is adjusted and pictures share, (m, 8, q), and by tags' bends, without pictures' poses."""
+    """Errors by all shared unknowns, (m, 8, q), and by tags' deformations, pictures' poses eliminated."""
     bundle, sights, rows = fit.bundle, fit.sights, fit.rows
     normal = normal_equations(bundle, sights, rows, np.ones(len(sights)), fixed, fit.additional)
     shared = shared_rows(bundle, sights, rows, fit.additional)[..., normal.free]
     m, tags = len(sights), len(bundle.body.ids)
-    of_tags = np.zeros((m, 8, tags, len(BENDS)))
+    of_tags = np.zeros((m, 8, tags, len(DEFORMATIONS)))
     of_tags[np.arange(m), :, sights.tag] = bend_rows(bundle, sights, rows)
-    bends = of_tags.reshape(m, 8, -1)
-    across = np.zeros((len(bundle.cRb), 6, bends.shape[2]))
-    np.add.at(across, sights.picture, np.swapaxes(rows.by_picture, 1, 2) @ bends)
+    deformed = of_tags.reshape(m, 8, -1)
+    across = np.zeros((len(bundle.cRb), 6, deformed.shape[2]))
+    np.add.at(across, sights.picture, np.swapaxes(rows.by_picture, 1, 2) @ deformed)
     return (
         shared - rows.by_picture @ (normal.inverse @ normal.across)[sights.picture],
-        bends - rows.by_picture @ (normal.inverse @ across)[sights.picture],
+        deformed - rows.by_picture @ (normal.inverse @ across)[sights.picture],
     )
 
 
@@ -256,32 +256,32 @@ def _variances(fit: Fit, taken: Array) -> Array:
 
 
 def bend_rows(bundle: Bundle, sights: Sights, rows: Rows) -> Array:
-    """Jacobian (m, 8, 6) of the errors by what each tag's corners are off along `BENDS`, as shares of its size."""
+    """Jacobian (m, 8, 6) of the errors by deformations of each tag along `DEFORMATIONS`, as shares of its size."""
     m = len(sights)
     by_corner = rows.by_tag[..., 3:].reshape(m, 4, 2, 3) @ so3.matrix(bundle.body.bRt[sights.tag])[:, None]
-    by_bends = np.einsum("mkij,bkj,m->mkib", by_corner, BENDS, bundle.body.size[sights.tag])
-    return by_bends.reshape(m, 8, len(BENDS))
+    by_deformation = np.einsum("mkij,bkj,m->mkib", by_corner, DEFORMATIONS, bundle.body.size[sights.tag])
+    return by_deformation.reshape(m, 8, len(DEFORMATIONS))
 
 
-def bending(miss: Array, by_bends: Array, own: Array, white: Array) -> Bending:
+def bending(miss: Array, by_deformation: Array, own: Array, white: Array) -> Bending:
     """The most likely level, and its effect.
 
-    Errors are linear in the bends x, and x in their gradient g = J x, J the information on x with all else eliminated:
-    along the axes of J a component of g has the variance l + l^2 level^2, l its information.
+    Errors are linear in the deformations x, and x in their gradient g = J x, J the information on x with all else
+    eliminated: along the axes of J a component of g has the variance l + l^2 level^2, l its information.
 
     Args:
         miss: (m, 8) errors of the adjusted bundle.
-        by_bends: (m, 8, 6 n) with the pictures' poses eliminated.
+        by_deformation: (m, 8, 6 n) with the pictures' poses eliminated.
         own: (m, 8, q) likewise, by all that is adjusted and that pictures share.
         white: (q, q) covariance of these, were errors independent.
     """
-    across = np.tensordot(own, by_bends, ((0, 1), (0, 1)))
+    across = np.tensordot(own, by_deformation, ((0, 1), (0, 1)))
     moved = white @ across
-    J = np.tensordot(by_bends, by_bends, ((0, 1), (0, 1))) - across.T @ moved
+    J = np.tensordot(by_deformation, by_deformation, ((0, 1), (0, 1))) - across.T @ moved
     information, axes = np.linalg.eigh(J)
-    gradient = axes.T @ np.tensordot(by_bends, miss, ((0, 1), (0, 1)))
-    told = information > _ROUNDING * information.max()
-    variance = information[told] + (information[told] * _LEVELS[:, None]) ** 2
-    unlikely = (np.log(variance) + gradient[told] ** 2 / variance).sum(axis=1)
+    gradient = axes.T @ np.tensordot(by_deformation, miss, ((0, 1), (0, 1)))
+    known = information > _ROUNDING * information.max()
+    variance = information[known] + (information[known] * _LEVELS[:, None]) ** 2
+    unlikely = (np.log(variance) + gradient[known] ** 2 / variance).sum(axis=1)
     level = float(_LEVELS[(unlikely + (np.log(_LEVELS / _PAPER) / _ROUGHLY) ** 2).argmin()])
     return Bending(level, level**2 * np.asarray(moved @ moved.T))

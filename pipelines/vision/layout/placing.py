@@ -35,13 +35,13 @@ _LEAST_DAMPING = 1e-9
 _ON_THE_WAY = 4
 # Poses closer than this, rad, are one.
 _ONE_POSE = 1e-3
-# Twice the logarithm of the odds, a thousand to one, from which a flip is told.
-_TOLD = 2.0 * float(np.log(1e3))
+# Twice the logarithm of the odds, a thousand to one, from which a flip is resolved.
+_DECIDED = 2.0 * float(np.log(1e3))
 # Poses closer than this, rad, are one, or on the way to it.
 _SAME = 0.05
 # Tags are placed from at most so many views, and those that show a pair of tags seen in no more than so many.
 _MOST, _RARE = 250, 10
-# Views that are asked whether a tag's flip is told.
+# Views that decide about a tag's flip.
 _HEARD = 40
 
 
@@ -76,28 +76,28 @@ def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
     """The most likely bundle of all tags; `body` is where they are, None if that is not known yet.
 
     Raises:
-        InputError: the pictures do not tell the layout from its mirror image.
+        InputError: the pictures do not distinguish the layout from its mirror image.
     """
     sights = views.sights
     found = flips(views.start, sights)
     sights = replace(sights, sigma=sights.sigma * lone_scale(views.start, sights, found))
     if body is None:
-        few = _telling(sights, views.view)
+        few = _decisive(sights, views.view)
         body = _in_frame(grown(views.start, sights[few], found[few]), views.start.body)
     body = _right_side_out(replace(views.start, body=body), sights, found)
     start = replace(views.start, body=body)
-    told = sides(start, sights, found, FAR)
-    decided = told.cost[:, 1] - told.cost[:, 0] > _TOLD
+    poses = sides(start, sights, found, FAR)
+    decided = poses.cost[:, 1] - poses.cost[:, 0] > _DECIDED
     whole = np.flatnonzero(together(sights) & decided[sights.picture])
     if not len(whole):
         raise InputError(
-            "no picture tells the poses of the tags in it from their planar flips; take pictures from nearer, or that "
+            "no picture distinguishes its tags' poses from their planar flips; take pictures from nearer, or that "
             "show more tags on different faces"
         )
-    return replace(fitted(with_pictures(start, told), sights[whole], 0, nothing(start)), whole=whole)
+    return replace(fitted(with_pictures(start, poses), sights[whole], 0, nothing(start)), whole=whole)
 
 
-def _telling(sights: Sights, view: Index) -> Index:
+def _decisive(sights: Sights, view: Index) -> Index:
     """Sights of the pictures from which tags are placed: one of each view, and not too many."""
     first = np.unique(view, return_index=True)[1]
     if len(first) > _MOST:
@@ -133,7 +133,7 @@ def _right_side_out(start: Bundle, sights: Sights, found: Flips) -> TagBody:
         costs.append(float(loss(rows.squares, FAR).sum()))
     best = int(np.argmin(costs))
     apart = _angles(bodies[0].bRt, bodies[1].bRt).max()
-    if apart > _SAME and abs(costs[1] - costs[0]) < _TOLD:
+    if apart > _SAME and abs(costs[1] - costs[0]) < _DECIDED:
         raise InputError(
             "the pictures fit the tags and their mirror image alike, an edge seen from outside and one seen from "
             "inside; take pictures from nearer, where perspective shows"
@@ -142,7 +142,7 @@ def _right_side_out(start: Bundle, sights: Sights, found: Flips) -> TagBody:
 
 
 def flip_told(fit: Fit, view: Index, tag: int) -> bool:
-    """Whether the pictures tell the pose of a tag, by its index, from every other that they may fit; see `vote`.
+    """Whether the pictures distinguish the pose of a tag, by its index, from every other that they may fit; see `vote`.
 
     Pictures in which nothing moved count once.
     """
@@ -151,11 +151,11 @@ def flip_told(fit: Fit, view: Index, tag: int) -> bool:
     mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _HEARD)).round().astype(np.intp)]
     pictures = fit.sights.picture[mine]
     others = fit.sights[np.isin(fit.sights.picture, pictures) & (fit.sights.tag != tag)]
-    told = sides(fit.bundle, others, flips(fit.bundle, others), FAR)
+    poses = sides(fit.bundle, others, flips(fit.bundle, others), FAR)
     seen = fit.sights[mine]
-    bRt, _, cost = vote(fit.bundle, seen, flips(fit.bundle, seen), told)
+    bRt, _, cost = vote(fit.bundle, seen, flips(fit.bundle, seen), poses)
     now = _angles(bRt, fit.bundle.body.bRt[tag]) < _SAME
-    return bool(now.any() and (now.all() or cost[~now].min() - cost[now].min() > _TOLD))
+    return bool(now.any() and (now.all() or cost[~now].min() - cost[now].min() > _DECIDED))
 
 
 def _angles(p: Array, q: Array) -> Array:
@@ -175,17 +175,17 @@ def grown(bundle: Bundle, sights: Sights, found: Flips) -> TagBody:
     shared = joint(sights, n)
     seed = int((shared.sum(axis=1) - np.diag(shared)).argmax())
     bundle, placed = replace(bundle, body=body), np.arange(n) == seed
-    told = _sides(bundle, sights, found, placed)
+    poses = _sides(bundle, sights, found, placed)
     while (tag := _next(sights, placed)) is not None:
-        bundle = _placed(bundle, sights, found, told, tag)
+        bundle = _placed(bundle, sights, found, poses, tag)
         placed[tag] = True
         bundle = _settled(bundle, sights, _sides(bundle, sights, found, placed), placed, seed)
-        told = _sides(bundle, sights, found, placed)
+        poses = _sides(bundle, sights, found, placed)
     return bundle.body
 
 
 def mirrored(body: TagBody, about: int) -> TagBody:
-    """The body inside out: what a camera far away cannot tell from it. Tag number `about` stays."""
+    """The body inside out: what a camera far away cannot distinguish from it. Tag number `about` stays."""
     aRb = so3.inverse(body.bRt[about])
     turned = so3.multiply(aRb, body.bRt) * [1.0, -1.0, -1.0, 1.0]
     place = so3.rotate(aRb, body.position - body.position[about]) * [1.0, 1.0, -1.0]
@@ -193,9 +193,9 @@ def mirrored(body: TagBody, about: int) -> TagBody:
     return replace(body, bRt=so3.multiply(back, turned), position=body.position[about] + so3.rotate(back, place))
 
 
-def with_pictures(bundle: Bundle, told: Sides) -> Bundle:
+def with_pictures(bundle: Bundle, poses: Sides) -> Bundle:
     """The bundle with the better pose of each picture."""
-    return replace(bundle, cRb=told.cRb[:, 0], position=told.position[:, 0])
+    return replace(bundle, cRb=poses.cRb[:, 0], position=poses.position[:, 0])
 
 
 def together(sights: Sights) -> NDArray[np.bool_]:
@@ -223,12 +223,12 @@ def _sides(bundle: Bundle, sights: Sights, found: Flips, placed: NDArray[np.bool
     return sides(bundle, sights[keep], found[keep], FAR)
 
 
-def _settled(bundle: Bundle, sights: Sights, told: Sides, placed: NDArray[np.bool_], seed: int) -> Bundle:
+def _settled(bundle: Bundle, sights: Sights, poses: Sides, placed: NDArray[np.bool_], seed: int) -> Bundle:
     """A few steps of adjustment of what is placed."""
     seen = sights[placed[sights.tag]]
     seen = seen[together(seen)]
     number = np.cumsum(placed) - 1
-    start = with_pictures(replace(bundle, body=part(bundle.body, placed)), told)
+    start = with_pictures(replace(bundle, body=part(bundle.body, placed)), poses)
     seen = replace(seen, tag=number[seen.tag])
     after, _ = adjusted(start, seen, int(number[seed]), nothing(start), FAR, _ON_THE_WAY)
     bRt, position = bundle.body.bRt.copy(), bundle.body.position.copy()
@@ -236,10 +236,10 @@ def _settled(bundle: Bundle, sights: Sights, told: Sides, placed: NDArray[np.boo
     return replace(bundle, body=replace(bundle.body, bRt=bRt, position=position))
 
 
-def _placed(bundle: Bundle, sights: Sights, found: Flips, told: Sides, tag: int) -> Bundle:
+def _placed(bundle: Bundle, sights: Sights, found: Flips, poses: Sides, tag: int) -> Bundle:
     """The bundle with one more tag where most pictures agree that it is."""
-    rows = np.flatnonzero((sights.tag == tag) & np.isfinite(told.cost[sights.picture, 0]))
-    bRt, position, _ = vote(bundle, sights[_some(rows, _PICTURES)], found[_some(rows, _PICTURES)], told)
+    rows = np.flatnonzero((sights.tag == tag) & np.isfinite(poses.cost[sights.picture, 0]))
+    bRt, position, _ = vote(bundle, sights[_some(rows, _PICTURES)], found[_some(rows, _PICTURES)], poses)
     turned, places = bundle.body.bRt.copy(), bundle.body.position.copy()
     turned[tag], places[tag] = bRt[0], position[0]
     return replace(bundle, body=replace(bundle.body, bRt=turned, position=places))
@@ -252,26 +252,26 @@ def _some(rows: Index, most: int) -> Index:
     return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]
 
 
-def vote(bundle: Bundle, sights: Sights, found: Flips, told: Sides) -> tuple[Array, Array, Array]:
+def vote(bundle: Bundle, sights: Sights, found: Flips, poses: Sides) -> tuple[Array, Array, Array]:
     """Proposals for the pose of one tag, refined: bRt (h, 4), position (h, 3) and cost (h,), by ascending cost.
 
     The error of a picture's own pose is part of a corner's: its covariance is that of both.
 
     Args:
         bundle: cameras and body.
-        sights: of this tag, in pictures whose poses are told by others.
+        sights: of this tag, in pictures whose poses others determine.
         found: of the same sights.
-        told: of all pictures.
+        poses: of all pictures.
     """
-    cRb, position = told.cRb[sights.picture], told.position[sights.picture]
-    there = np.isfinite(told.cost[sights.picture])
+    cRb, position = poses.cRb[sights.picture], poses.position[sights.picture]
+    there = np.isfinite(poses.cost[sights.picture])
     bRc = so3.inverse(cRb)[:, :, None]
     proposals = so3.multiply(bRc, found.cRt[:, None]).reshape(-1, 4)
     places = so3.rotate(bRc, found.place[:, None] - position[:, :, None]).reshape(-1, 3)
     keep = _some(np.flatnonzero(np.repeat(there.ravel(), 2)), _PROPOSALS)
     bRt, place = proposals[keep], places[keep]
-    known = told.information[sights.picture] + 1e-12 * np.eye(6)
-    odds = np.where(there, told.cost[sights.picture] - told.cost[sights.picture, :1], np.inf)
+    known = poses.information[sights.picture] + 1e-12 * np.eye(6)
+    odds = np.where(there, poses.cost[sights.picture] - poses.cost[sights.picture, :1], np.inf)
     cost, going = np.zeros(len(keep)), np.arange(len(keep))
     for round_ in range(_ROUNDS + 1):
         far = FAR * 4.0 ** max(0, 4 - round_)

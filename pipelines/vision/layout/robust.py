@@ -24,7 +24,7 @@ _ROUNDS, _SETTLED = 12, 1e-3
 # A tag in a picture whose corners miss by this many times the picture's sigma is a false detection.
 _FAR = 4.0
 _MEDIAN_OF_SEVEN = 6.35
-# Pictures farther apart than this, s, tell nothing of the motion in each other.
+# Pictures farther apart than this, s, have no information about each other's motion.
 _APART = 0.25
 # A polynomial is laid through so many pictures before and after, and through all within this time, s.
 _BESIDE, _NEAR = 2, 0.12

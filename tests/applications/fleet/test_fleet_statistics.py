@@ -11,8 +11,8 @@ from alidade.pipelines.applications.fleet.analysis import Population, counting, 
 from alidade.pipelines.applications.fleet.attention import units_of_interest
 from alidade.pipelines.applications.fleet.histories import History, change_table, histories, packed
 from alidade.pipelines.applications.fleet.store import ParameterNumbers, UnitResult
-from alidade.pipelines.belief import independent
-from alidade.pipelines.solvers.posterior import told_of
+from alidade.pipelines.gaussian_prior import independent
+from alidade.pipelines.solvers.posterior import sqrt_information_of
 
 
 @pytest.mark.parametrize("dof", [3, 6, 36])
@@ -116,7 +116,7 @@ def a_fleet(
             says = independent(["a", "b"], [a, b], [sigma, sigma])
             results[f"{unit}-{date}"] = {
                 "device": {"a": 0.0},
-                "told": packed(told_of(says, [1.0, 1.0])),
+                "told": packed(sqrt_information_of(says, [1.0, 1.0])),
                 "unit": f"U{unit}",
                 "date": 86400.0 * 30.0 * date,
                 "method": "head",
@@ -158,7 +158,7 @@ def test_a_unit_that_drifts_slowly_is_found() -> None:
 
 def test_a_step_of_one_unit_is_found_and_where() -> None:
     results = a_fleet(1, units=1, dates=2)
-    results["0-1"]["told"] = packed(told_of(independent(["a", "b"], [1.0, 5.0], [1e-3, 1e-3]), [1.0, 1.0]))
+    results["0-1"]["told"] = packed(sqrt_information_of(independent(["a", "b"], [1.0, 5.0], [1e-3, 1e-3]), [1.0, 1.0]))
     _, (history,) = judged(results)
     assert [(step.name, history.after(step)) for step in history.found] == [("a", ("0-1",))]
 
@@ -170,7 +170,7 @@ def test_numbers_that_differ_in_every_unit_differ_by_nature() -> None:
     for result in results.values():
         p = result["parameters"]["a"]
         p["value"] += 0.05 * rng.standard_normal()
-        result["told"] = packed(told_of(independent(["a"], [p["value"]], [p["sigma"]]), [1.0]))
+        result["told"] = packed(sqrt_information_of(independent(["a"], [p["value"]], [p["sigma"]]), [1.0]))
     (a, _), found = judged(results)
     assert not any(h.found for h in found)
     assert a.repeatability is not None

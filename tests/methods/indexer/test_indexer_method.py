@@ -13,7 +13,7 @@ from alidade.factors.chi_square import quantile
 from alidade.factors.indexer import mounting
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import rms
-from alidade.pipelines.estimation.parameters import pull
+from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods.indexer.model import problem
 from alidade.pipelines.methods.indexer.parameters import indexer_parameters
@@ -167,7 +167,7 @@ def test_encoder_errors_are_told_by_the_recording() -> None:
     effects = {"encoder_inner_z_cos": 5e-5, "encoder_delay": 1e-2}
     estimate, error = _effect(1, **effects)
     assert np.abs(error / estimate.sigmas).max() < 3.5
-    pulls = {q.name: pull(q, v, s) for q, v, s in _reported(estimate)}
+    pulls = {q.name: prior_z_score(q, v, s) for q, v, s in _reported(estimate)}
     assert pulls["encoder_inner_z_cos"] == pytest.approx(10.0, rel=0.05)
     assert pulls["encoder_delay"] == pytest.approx(10.0, rel=0.05)
     assert all(abs(p or 0.0) < 3.0 for name, p in pulls.items() if name not in effects)

@@ -15,7 +15,7 @@ _LEAST = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class GaussianPrior:
     """A Gaussian over reported numbers, in place of the priors that these have otherwise.
 
     Attributes:
@@ -30,19 +30,19 @@ class Belief:
     covariance: Array
     source: str = ""
 
-    def of(self, names: Collection[str]) -> Belief:
+    def of(self, names: Collection[str]) -> GaussianPrior:
         """What it says of those of these numbers that it knows."""
         kept = [i for i, name in enumerate(self.names) if name in names]
         rows = np.array(kept, dtype=np.intp)
         known = tuple(self.names[i] for i in kept)
-        return Belief(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source)
+        return GaussianPrior(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source)
 
-    def given_others(self, names: Collection[str]) -> Belief:
+    def given_others(self, names: Collection[str]) -> GaussianPrior:
         """These of its numbers, all others exactly at their means."""
         one, other = (np.array([(n in names) is among for n in self.names], dtype=bool) for among in (True, False))
         shared, C = self.covariance[np.ix_(one, other)], self.of(names)
         rest = np.linalg.pinv(self.covariance[np.ix_(other, other)], hermitian=True)
-        return Belief(C.names, C.mean, C.covariance - shared @ rest @ shared.T, self.source)
+        return GaussianPrior(C.names, C.mean, C.covariance - shared @ rest @ shared.T, self.source)
 
     @property
     def sigmas(self) -> Array:
@@ -50,9 +50,13 @@ class Belief:
         return np.sqrt(np.diag(self.covariance))
 
 
-def independent(names: Sequence[str], mean: Sequence[float], sigmas: Sequence[float], source: str = "") -> Belief:
+def independent(
+    names: Sequence[str], mean: Sequence[float], sigmas: Sequence[float], source: str = ""
+) -> GaussianPrior:
     """Numbers of which each is known by itself."""
-    return Belief(tuple(names), np.array(mean, dtype=float), np.diag(np.square(np.array(sigmas, dtype=float))), source)
+    return GaussianPrior(
+        tuple(names), np.array(mean, dtype=float), np.diag(np.square(np.array(sigmas, dtype=float))), source
+    )
 
 
 def root_of_information(correlation: Array, sigmas: Array) -> Array:

@@ -1,7 +1,7 @@
-"""Beliefs in place of a graph's own priors.
+"""Gaussian priors on reported numbers in place of a method's own priors.
 
-A belief is about reported numbers, and so is its factor. The method's own priors lose the rows that are about nothing
-but numbers that are believed; rows that tie these to others stay.
+The factor of such a prior is about reported numbers. The method's own priors lose the rows that are about replaced
+numbers alone; rows that tie these to others stay.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.belief import Belief, root_of_information
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.priors import pinned
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
 
 # Gives the steps before some.
 Earlier = Callable[[], Iterable[Step]]
 
 # Elements of a prior's row below this share of its largest are rounding.
 _ROUNDING = 1e-9
-# First values farther from what is believed than this, in sigmas, are moved there, in so many steps.
+# First values farther from the prior mean than this, in sigmas, are moved there, in so many steps.
 _APART, _MOVES = 3.0, 5
 # In units of a number's usual prior: means and sigmas beyond, sigmas below and not 0, and combinations of numbers known
 # so much better than these themselves are slips, by which no linear system in double precision can be solved.
 _FARTHEST, _LEAST_SIGMA, _LEAST_CORRELATED = 1e6, 1e-10, 1e-12
 
 
-def believing(problem: Problem, beliefs: Sequence[Belief]) -> Problem:
-    """The problem with beliefs in place of its priors of the same numbers.
+def with_priors(problem: Problem, gaussian_priors: Sequence[GaussianPrior]) -> Problem:
+    """Replace a problem's priors of some numbers by Gaussian priors.
 
-    A number that the problem fixes stays fixed unless the belief is the config's own, and what is believed of others
-    follows from that.
+    A number that the problem fixes stays fixed unless the prior is the config's own; the priors of others are
+    conditioned on that.
 
     Raises:
         InputError: a number is to be fixed elsewhere than at 0 that the graph leaves out where it is fixed.
     """
-    for belief in beliefs:
-        problem = _believing(problem, belief)
+    for gaussian_prior in gaussian_priors:
+        problem = _with_prior(problem, gaussian_prior)
     return problem
 
 
@@ -75,50 +75,50 @@ def about_alone(
     return np.asarray((rows & among).any(axis=1) & ~(rows & others).any(axis=1))
 
 
-def _believing(problem: Problem, belief: Belief, before: Earlier = tuple) -> Problem:
-    """The problem with one belief; `before` are the steps before its own, of a recording that grows."""
+def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier = tuple) -> Problem:
+    """Replace priors by one Gaussian prior; `before` are the steps before its own, of a recording that grows."""
     own = {q.name: q for q in problem.quantities}
-    for name, mean, sigma in zip(belief.names, belief.mean, belief.sigmas, strict=True):
+    for name, mean, sigma in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True):
         if name not in own and sigma == 0.0 and mean != 0.0:
             raise InputError(
                 f"priors.{name}: where it is fixed it is left out of the graph, which takes it for 0; give it a sigma"
             )
-    known, by_hand = belief.of(own), not belief.source
+    known, by_hand = gaussian_prior.of(own), not gaussian_prior.source
     _require_sense(known, own)
     replaced = frozenset(name for name in known.names if by_hand or own[name].prior_sigma != 0.0)
     if not replaced:
         return problem
-    believed = {
+    replacements = {
         name: replace(own[name], prior_mean=float(mean), prior_sigma=float(sigma))
         for name, mean, sigma in zip(known.names, known.mean, known.sigmas, strict=True)
         if name in replaced
     }
     means = dict(zip(known.names, known.mean.tolist(), strict=True))
     parameters = tuple(
-        replace(p, quantities=tuple(believed.get(q.name, q) for q in p.quantities)).near(means)
+        replace(p, quantities=tuple(replacements.get(q.name, q) for q in p.quantities)).near(means)
         for p in problem.parameters
     )
-    told = _Told(parameters, known, replaced)
-    steps, after, onward, finer = problem.steps, problem.steps_after, problem.onward, problem.finer
-    premise = f"The prior of {len(replaced)} parameters is {belief.source}." if belief.source else ""
+    factors = _PriorFactors(parameters, known, replaced)
+    steps, after, continuation, finer = problem.steps, problem.steps_after, problem.continuation, problem.finer
+    premise = f"The prior of {len(replaced)} parameters is {gaussian_prior.source}." if gaussian_prior.source else ""
     return replace(
         problem,
         parameters=parameters,
-        beliefs=(*problem.beliefs, known.given_others(replaced)),
-        steps=lambda chunk: told.steps(steps(chunk), before),
-        steps_after=None if after is None else lambda time: told.steps(after(time), lambda: _until(steps, time)),
-        onward=None
-        if onward is None
-        else lambda data, time: _grown(onward(data, time), belief, lambda: _until(steps, time)),
-        finer=None if finer is None else lambda levels: _grown(finer(levels), belief, tuple),
+        gaussian_priors=(*problem.gaussian_priors, known.given_others(replaced)),
+        steps=lambda chunk: factors.steps(steps(chunk), before),
+        steps_after=None if after is None else lambda time: factors.steps(after(time), lambda: _until(steps, time)),
+        continuation=None
+        if continuation is None
+        else lambda data, time: _grown(continuation(data, time), gaussian_prior, lambda: _until(steps, time)),
+        finer=None if finer is None else lambda levels: _grown(finer(levels), gaussian_prior, tuple),
         premises=(*problem.premises, *filter(None, [premise])),
     )
 
 
-def _require_sense(belief: Belief, own: Mapping[str, Quantity]) -> None:
+def _require_sense(gaussian_prior: GaussianPrior, own: Mapping[str, Quantity]) -> None:
     """Raise InputError for a mean, a sigma or a covariance of which no solution can be made."""
-    where = belief.source or "priors"
-    for name, mean, sigma in zip(belief.names, belief.mean, belief.sigmas, strict=True):
+    where = gaussian_prior.source or "priors"
+    for name, mean, sigma in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True):
         scale, unit = own[name].prior_scale, own[name].unit
         if not (abs(mean) <= _FARTHEST * scale and sigma <= _FARTHEST * scale):
             raise InputError(
@@ -126,15 +126,15 @@ def _require_sense(belief: Belief, own: Mapping[str, Quantity]) -> None:
             )
         if 0.0 < sigma < _LEAST_SIGMA * scale:
             raise InputError(f"{where}: {name}: a sigma of {sigma:g} {unit} is less than any; 0 fixes it")
-    sigmas = belief.sigmas
+    sigmas = gaussian_prior.sigmas
     free = sigmas > 0.0
-    correlation = belief.covariance[np.ix_(free, free)] / np.outer(sigmas[free], sigmas[free])
+    correlation = gaussian_prior.covariance[np.ix_(free, free)] / np.outer(sigmas[free], sigmas[free])
     if np.linalg.eigvalsh(correlation).min(initial=1.0) < _LEAST_CORRELATED:
         raise InputError(f"{where}: the covariance is singular: a combination of its numbers is known exactly")
 
 
-def _grown(problem: Problem | None, belief: Belief, before: Earlier) -> Problem | None:
-    return None if problem is None else _believing(problem, belief, before)
+def _grown(problem: Problem | None, gaussian_prior: GaussianPrior, before: Earlier) -> Problem | None:
+    return None if problem is None else _with_prior(problem, gaussian_prior, before)
 
 
 def _until(steps: Callable[[int], Iterator[Step]], time: float) -> Iterator[Step]:
@@ -143,21 +143,21 @@ def _until(steps: Callable[[int], Iterator[Step]], time: float) -> Iterator[Step
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
-    """A belief as factors, and the steps that take them: each variable's conditional on those that begin before it.
+class _PriorFactors:
+    """A Gaussian prior as factors of steps: each variable's conditional on the variables that begin before it.
 
     Attributes:
         parameters: of the problem, with the priors now in force.
-        belief: about some of their numbers.
+        gaussian_prior: about some of their numbers.
         replaced: those of them that have no other prior.
     """
 
     parameters: Sequence[Parameter]
-    belief: Belief
+    gaussian_prior: GaussianPrior
     replaced: Collection[str]
 
     def steps(self, steps: Iterable[Step], before: Earlier = tuple) -> Iterator[Step]:
-        """The steps, with the belief in place of priors where its variables begin.
+        """The steps, with the Gaussian prior in place of priors where its variables begin.
 
         Args:
             steps: in time order.
@@ -176,11 +176,11 @@ class _Told:
 
     @cached_property
     def _concerned(self) -> list[Parameter]:
-        """The parameters that the belief is about."""
-        return [p for p in self.parameters if any(q.name in self.belief.names for q in p.quantities)]
+        """The parameters that the Gaussian prior is about."""
+        return [p for p in self.parameters if any(q.name in self.gaussian_prior.names for q in p.quantities)]
 
     def _begin(self, step: Step, begun: gtsam.Values) -> list[Parameter]:
-        """Add the parameters that begin in a step to those that have begun, at the belief's mean; returns these."""
+        """Add the parameters that begin in a step to those that have begun, at the prior mean; returns these."""
         new = [p for p in self.parameters if step.initial.exists(p.key)]
         for p in new:
             begun.insert(p.key, _value(step.initial, p.key))
@@ -189,7 +189,7 @@ class _Told:
         return new
 
     def _changed(self, step: Step, begun: gtsam.Values) -> Step:
-        """A step in which parameters begin, with the belief about them in place of priors."""
+        """A step in which parameters begin, with the Gaussian prior of them in place of others."""
         earlier = [p for p in self._concerned if begun.exists(p.key)]
         new = self._begin(step, begun)
         initial = gtsam.Values(step.initial)
@@ -213,9 +213,9 @@ class _Told:
         return [Factor("prior", _rows_of(prior.factor, np.flatnonzero(kept), values))] if kept.any() else []
 
     def _move(self, parameter: Parameter, values: gtsam.Values) -> None:
-        """Take a first value that contradicts the belief to its mean."""
+        """Move a first value that contradicts the Gaussian prior to its mean."""
         rows, places = self._places(parameter)
-        mean, sigmas = self.belief.mean[places], self.belief.sigmas[places]
+        mean, sigmas = self.gaussian_prior.mean[places], self.gaussian_prior.sigmas[places]
         for _ in range(_MOVES):
             numbers, J = parameter.coordinates(values, parameter.key)
             if not (np.abs(mean - numbers[rows]) > _APART * sigmas).any():
@@ -227,24 +227,27 @@ class _Told:
             values.update(values.retract(move))
 
     def _places(self, parameter: Parameter) -> tuple[list[int], list[int]]:
-        """Which of a parameter's numbers are believed, and where in the belief they are."""
+        """Rows of a parameter's numbers that the Gaussian prior has, and their places in it."""
         names = [q.name for q in parameter.quantities]
-        rows = [i for i, name in enumerate(names) if name in self.belief.names]
-        return rows, [self.belief.names.index(names[i]) for i in rows]
+        rows = [i for i, name in enumerate(names) if name in self.gaussian_prior.names]
+        return rows, [self.gaussian_prior.names.index(names[i]) for i in rows]
 
     def _factor(self, earlier: Sequence[Parameter], new: Sequence[Parameter]) -> Factor:
-        """The belief about parameters that begin, given those that have begun; whitened."""
+        """The whitened factor of parameters that begin, given those that have begun."""
         concerned = [*earlier, *new]
         places = [self._places(p) for p in concerned]
         order = [place for _, own in places for place in own]
         quantities = {q.name: q for p in concerned for q in p.quantities}
-        names = [self.belief.names[i] for i in order]
+        names = [self.gaussian_prior.names[i] for i in order]
         sigmas = np.array(
-            [sigma or pinned(quantities[name]) for name, sigma in zip(names, self.belief.sigmas[order], strict=True)]
+            [
+                sigma or pinned(quantities[name])
+                for name, sigma in zip(names, self.gaussian_prior.sigmas[order], strict=True)
+            ]
         )
         count = sum(len(self._places(p)[1]) for p in new)
-        root = conditional_root(self.belief.covariance[np.ix_(order, order)], sigmas)[-count:]
-        mean = self.belief.mean[order]
+        root = conditional_root(self.gaussian_prior.covariance[np.ix_(order, order)], sigmas)[-count:]
+        mean = self.gaussian_prior.mean[order]
 
         def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
             numbers, start = [], 0
