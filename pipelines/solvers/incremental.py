@@ -92,8 +92,7 @@ class IncrementalConfig:
         learned: ratio of a reported number's variance to that of the last batch solution below which there is another.
         max_initialisation: time after which the initialisation phase ends in any case, s: the cost of a batch solution
             grows with it.
-        min_steps: number of steps before which the phase does not end: noise levels stay what they are then, and sigmas
-            go with them; of 400 measurements with two rows or three a level is known to 2 or 2.5 %.
+        min_steps: number of steps before which the phase does not end: few large steps cost little to solve again.
         max_curvature: largest share of a variance that is of second order with which the phase ends.
         max_change: largest change of a number, in its sigma, between smoother and batch solution that ends the phase.
         marginalize_every: time between marginalisations afterwards, s.
@@ -105,7 +104,7 @@ class IncrementalConfig:
     solve_growth: float = 1.25
     learned: float = 0.25
     max_initialisation: float = 600.0
-    min_steps: int = 400
+    min_steps: int = 100
     max_curvature: float = 0.15
     max_change: float = 0.1
     marginalize_every: float = 20.0

@@ -29,6 +29,7 @@ from alidade.pipelines.methods import Method, method
 from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.head.guidance import FAULTS
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
@@ -429,7 +430,7 @@ def test_without_residual_families_there_is_no_worst_segment_and_no_crash(head: 
     wrong = replace(data, head_gyro=data.head_gyro * [1.0, -1.0, 1.0])
     short = find.faults.segment(wrong, 0.0, 3.0)
     assert solve_trial(processes, short, config) is not None
-    find_hypotheses(processes, replace(find.faults, signs={}, faults=()), short, config, nothing)
+    find_hypotheses(processes, replace(FAULTS, signs={}, faults=()), short, config, nothing)
 
 
 @pytest.mark.slow
