@@ -1,11 +1,11 @@
-"""Triads turned every way in a constant field: lengths that stay, and the angle between two fields that stays.
+"""Factors of triads rotated in a constant field: its constant length, and the constant angle between two fields.
 
-Frames: b the body. A triad has nominal = K raw + b. Of a vector that is the same in level coordinates at all times a
-sensor in any attitude sees the length: raw lies on an ellipsoid. The attitude is eliminated: what is left of a noisy
-raw is its distance from there.
+Frames: b the body. A triad has nominal = K raw + b. The length of a vector that is constant in level coordinates does
+not depend on the attitude: raw lies on an ellipsoid. The attitude is eliminated; the residual of a noisy raw is its
+distance from the ellipsoid.
 
 Variables are (K by rows, b), 12 numbers, or of a K that is symmetric 9: k11 k12 k13 k22 k23 k33, b. To first order
-residuals are as white as the samples; of second order is that noise along a bent surface leads away from it, `excess`
+residuals are as white as the samples; the bias of second order, noise along a curved surface, is `excess`
 (of fitted curves: Kanatani, "Statistical optimization for geometric computation", 1996).
 """
 
@@ -25,23 +25,23 @@ _UPPER[[0, 1, 3, 2, 6, 4, 5, 7, 8], [0, 1, 1, 2, 2, 3, 4, 4, 5]] = 1.0
 _SYMMETRIC = np.block([[_UPPER, np.zeros((9, 3))], [np.zeros((3, 6)), np.eye(3)]])
 
 
-# No length or strength is less, so that logarithms have a value.
+# Lower limit of lengths and strengths, which keeps their logarithms finite.
 _LEAST = 1e-12
 
 
 def entries(symmetric: bool) -> Array:
-    """(12, 9) or (12, 12): rows of K and b, of the variable."""
+    """Matrix (12, 9) or (12, 12) from the variable's numbers to the rows of K and b."""
     return _SYMMETRIC if symmetric else np.eye(12)
 
 
 def nominal_of(raw: Array, numbers: Array) -> Array:
-    """K raw + b, (n, 3), of raw (n, 3) by rows of K and b (12,) or (n, 12)."""
+    """Calibrated vectors K raw + b, (n, 3), from raw (n, 3) and the rows of K and b (12,) or (n, 12)."""
     K, b = numbers[..., :9].reshape(*numbers.shape[:-1], 3, 3), numbers[..., 9:]
     return np.asarray(np.einsum("...ij,...j->...i", K, raw) + b)
 
 
 def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
-    """(n,) mean of the distances of raw (n, 3) from the ellipsoid of rows of K and b (12,) for noise of sigma (n,).
+    """Mean distance (n,) of raw (n, 3) from the ellipsoid of rows of K and b (12,), for noise of sigma (n,).
 
     With f = |K raw + b| of gradient g and second derivatives H it is sigma^2 (tr H / (2 |g|) - g'Hg / |g|^3).
     """
@@ -50,22 +50,22 @@ def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
     g = vectors / length[:, None] @ K
     slope = np.linalg.norm(g, axis=1)
     trace = ((K**2).sum() - slope**2) / length
-    bent = (((g @ K.T) ** 2).sum(axis=1) - slope**4) / length
-    return np.asarray(sigma**2 * (0.5 * trace / slope - bent / slope**3))
+    curvature = (((g @ K.T) ** 2).sum(axis=1) - slope**4) / length
+    return np.asarray(sigma**2 * (0.5 * trace / slope - curvature / slope**3))
 
 
 def sagitta(raw: Array, scatter: Array, numbers: Array) -> Array:
-    """(n,) how far the means raw (n, 3) of points of the ellipsoid with covariances (n, 3, 3) lie inside it.
+    """Depth (n,) inside the ellipsoid of the means raw (n, 3) of its points with covariances (n, 3, 3).
 
-    With what `excess` has for letters it is tr (H scatter) / (2 |g|).
+    In the symbols of `excess` it is tr (H scatter) / (2 |g|).
     """
     K, vectors = numbers[:9].reshape(3, 3), nominal_of(raw, numbers)
     length = np.linalg.norm(vectors, axis=1)
     direction = vectors / length[:, None]
     turned = K @ scatter @ K.T
     along = np.einsum("ni,nij,nj->n", direction, turned, direction)
-    bent = (np.trace(turned, axis1=1, axis2=2) - along) / length
-    return np.asarray(0.5 * bent / np.linalg.norm(direction @ K, axis=1))
+    curvature = (np.trace(turned, axis1=1, axis2=2) - along) / length
+    return np.asarray(0.5 * curvature / np.linalg.norm(direction @ K, axis=1))
 
 
 @dataclass(frozen=True)

@@ -316,11 +316,11 @@ def _distinct(rows: Array) -> Array:
 
 
 def needed(given: Array | None) -> Array:
-    """What variables were told to depend on. Raises ValueError when it was not given."""
+    """The optional input of a model, which its variables need. Raises ValueError where it is None."""
     if given is None:
         raise ValueError(
             "errors of a gyro need increments with scale=True and, for D, drivers; its slope over temperature needs "
-            "warmth; skew and scale of pictures need elapsed and first"
+            "temperature; skew and scale of pictures need elapsed and first"
         )
     return given
 

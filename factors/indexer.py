@@ -5,7 +5,7 @@ Frames: n local level (East-North-Up), base the indexer's fixed part, t its plat
     baseRt(alpha, beta) = Exp(alpha ex) Exp(epsilon ey) Exp(beta ez)
 
 alpha turns about the outer axis x, beta about the inner axis z; epsilon, the axes' deviation from a right angle, is the
-tilt of the inner axis about +y, zero when they are perpendicular. The mounting is told by the angles theta of
+tilt of the inner axis about +y, zero when they are perpendicular. The mounting angles theta are those of
 C_t^m = Rx(theta_x) Ry(theta_y) Rz(theta_z) with the passive matrices Rx(a) = Exp(a ex).T and so on, that is
 tRm = Exp(theta_z ez) Exp(theta_y ey) Exp(theta_x ex). Source: CN115265591B; methods page, section 2.
 
@@ -183,8 +183,7 @@ class AxisPath:
     def _interpolation(self, at: Array, i: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
         """Weights and indexes (n, 4) of the samples that make the angles at the times, in the intervals i.
 
-        The straight line between the two neighbours, bent by the curvature that the next two show: an axis that
-        gathers speed is followed to third order.
+        Cubic: the straight line between the two neighbours, corrected by the curvature that the next two show.
         """
         samples = np.clip(i[:, None] + np.array([-1, 0, 1, 2]), 0, len(self.t) - 1)
         share = (at - self.t[i]) / (self.t[i + 1] - self.t[i])
@@ -245,7 +244,7 @@ def gyro_means(edges: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
 class IndexerAverageFactor(Model):
     """Mean gyro rate over n adjoining windows against the mean that the encoders and the earth's rate say.
 
-        gyro = (I + S) mRt w + bias + c warmth,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
+        gyro = (I + S) mRt w + bias + c dT,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
 
     compared in frame t, where encoder noise has fixed directions. Blocks: theta (3), gyro bias (3, rad/s), then
     the options: "errors" (6), the numbers of S as alidade.factors.gyro has them; "temperature" (3, rad/s/K), which is
@@ -259,7 +258,7 @@ class IndexerAverageFactor(Model):
         sqrt_information: (3 n, 3 n) of the difference, in t: neighbours share the encoder noise at their common edge.
         options: those that are variables, in the order of their blocks; the others are zero.
         theta_unit: rad, what theta's block counts.
-        warmth: (n,) K, mean temperature over the windows above the one at which the bias is the bias; needed for c.
+        temperature: (n,) dT, K: mean over the windows, above the temperature that the bias refers to; needed for c.
     """
 
     gyro: Array
@@ -267,7 +266,7 @@ class IndexerAverageFactor(Model):
     sqrt_information: Array
     options: tuple[Option, ...] = ()
     theta_unit: float = 1.0
-    warmth: Array | None = None
+    temperature: Array | None = None
     shapes: ClassVar = {"gyro": (3,)}
     rows: int = 3
 
@@ -281,12 +280,12 @@ class IndexerAverageFactor(Model):
         options: tuple[Option, ...] = (),
         wander: float = 0.0,
         theta_unit: float = 1.0,
-        warmth: Array | None = None,
+        temperature: Array | None = None,
     ) -> IndexerAverageFactor:
         """From the noise of the sensors.
 
         Args:
-            gyro, rates, options, theta_unit, warmth: as the attributes.
+            gyro, rates, options, theta_unit, temperature: as the attributes.
             density: gyro noise, rad/s/sqrt(Hz): angle random walk in each window.
             encoder: white encoder noise at the edges, rad, one for both axes or (2,) for outer and inner.
             wander: error of the encoders' account of the platform's attitude, about any axis, rad, that changes from
@@ -301,7 +300,7 @@ class IndexerAverageFactor(Model):
         across = so3.hat(rates.fixed + rates.cosine)
         for i, block in enumerate(across @ np.swapaxes(across, 1, 2)):
             covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += wander**2 * block
-        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options, theta_unit, warmth)
+        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options, theta_unit, temperature)
 
     @property
     def time(self) -> Array:
@@ -314,14 +313,14 @@ class IndexerAverageFactor(Model):
         return (3, 3, *(_SIZES[option] for option in self.options))
 
     def __call__(self, theta: Array, bias: Array, *more: Array) -> Residuals:
-        """Residual sqrt_information * (tRm (I + S)^-1 (gyro - bias - c warmth) - Exp(tilt) w), (n, 3)."""
+        """Residual sqrt_information * (tRm (I + S)^-1 (gyro - bias - c dT) - Exp(tilt) w), (n, 3)."""
         given = dict(zip(self.options, more, strict=True))
         epsilon, tilt = given.get("epsilon", np.zeros(1)), given.get("tilt", np.zeros(3))
         theta = self.theta_unit * theta
         tRm = mounting(theta)
         corrected, N = self.gyro - bias, np.asarray(np.eye(3))
         if "temperature" in given:
-            corrected = corrected - needed(self.warmth)[:, None] * given["temperature"]
+            corrected = corrected - needed(self.temperature)[:, None] * given["temperature"]
         if "errors" in given:
             N = np.asarray(np.linalg.inv(np.eye(3) + symmetric(given["errors"])))
             corrected = np.einsum("nij,nj->ni", N, corrected)
@@ -337,7 +336,7 @@ class IndexerAverageFactor(Model):
             by_epsilon = -np.sin(epsilon) * parts[:, 1] + np.cos(epsilon) * parts[:, 2]
             blocks: dict[Option, Callable[[], Array]] = {
                 "errors": lambda: -by_symmetric(by_gyro[..., None] * corrected[:, None, None]),
-                "temperature": lambda: -by_gyro * needed(self.warmth)[:, None, None],
+                "temperature": lambda: -by_gyro * needed(self.temperature)[:, None, None],
                 "encoder": lambda: (
                     -so3.matrix(turn) @ (by_encoder[:, 0] + cosine * by_encoder[:, 1] + sine * by_encoder[:, 2])
                 ),

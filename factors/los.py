@@ -57,28 +57,28 @@ _PLACES = {
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """What n pictures need of their surroundings when errors of the sensors are variables.
+class LosContext:
+    """Motion, times and predicted LOS errors of n pictures, which the derivatives by sensor errors need.
 
     Attributes:
-        motion: of gyro and gimbal around the stamps.
+        motion: of gyro and gimbal near the stamps.
         elapsed: (n,) since the recording's first stamp, s.
-        watched: (n,) since their target was found, s.
-        foreseen: (n, 2) phx, phz as first guessed, rad, with none of the picture's own noise.
-        moved: (n,) s, by how much the stamps were moved already to where the pictures may have been taken.
+        tracked: (n,) time since the picture's target was found, s.
+        predicted: (n, 2) phx, phz at the initial values, rad, without the picture's own noise.
+        stamp_shift: (n,) correction that the stamps already contain, s.
     """
 
     motion: LocalMotion
     elapsed: Array
-    watched: Array
-    foreseen: Array
-    moved: Array
-    stacked: ClassVar = ("motion", "elapsed", "watched", "foreseen", "moved")
+    tracked: Array
+    predicted: Array
+    stamp_shift: Array
+    stacked: ClassVar = ("motion", "elapsed", "tracked", "predicted", "stamp_shift")
 
-    def __getitem__(self, rows: Any) -> Surroundings:
-        """Those of some of the pictures."""
-        return Surroundings(
-            self.motion[rows], self.elapsed[rows], self.watched[rows], self.foreseen[rows], self.moved[rows]
+    def __getitem__(self, rows: Any) -> LosContext:
+        """The context of the selected pictures."""
+        return LosContext(
+            self.motion[rows], self.elapsed[rows], self.tracked[rows], self.predicted[rows], self.stamp_shift[rows]
         )
 
 
@@ -89,24 +89,24 @@ class LosDirectionFactor(Model):
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
     picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with
-    `around` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 to 18), see
+    `context` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 to 18), see
     alidade.factors.gyro. With those errors
 
-    - a picture was taken at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay
-      later than it is stamped; gyro and gimbal carry attitude and angles there from where the stamp was moved to;
+    - a picture was exposed at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay
+      later than its stamp; gyro and gimbal propagate attitude and angles there from the shifted stamp;
     - an encoder reads angle + s sin(angle) + c cos(angle);
-    - phx and phz are measured larger by los_scale times what was foreseen. Scaling what the attitudes predict instead
+    - phx and phz are measured larger by los_scale times `context.predicted`. Scaling what the attitudes predict instead
       would reward small attitude changes, which cost the gyro less, with a large scale: the mode of all variables
       together lacks the determinant that pays for it;
     - the target's frame turns at (target_rate_x, 0, target_rate_z), about its own axes, from where it was found.
 
     Attributes:
-        time: (n,) stamps of the pictures, moved as `around` says, s.
+        time: (n,) stamps of the pictures, shifted by `context.stamp_shift`, s.
         measured: (n, 2) phx, phz, or (n, 3) with the roll, rad.
         sqrt_information: (n, 2, 2) or (n, 3, 3), 1/rad.
         gimbal: (n, 2) azimuth and elevation as read at the stamps, rad.
         names: the mounting angles that are variables; all others are zero.
-        around: the pictures' surroundings, when errors of the sensors are variables.
+        context: motion near the pictures; None: errors of the sensors are no variables.
         errors: numbers of the gyro's errors, 0 for a perfect gyro.
     """
 
@@ -115,10 +115,10 @@ class LosDirectionFactor(Model):
     sqrt_information: Array
     gimbal: Array
     names: tuple[str, ...] = ("delta_px", "delta_gx", "delta_gy", "delta_z")
-    around: Surroundings | None = None
+    context: LosContext | None = None
     errors: int = 0
     shapes: ClassVar = {"gimbal": (2,)}
-    stacked: ClassVar = ("time", "measured", "sqrt_information", "gimbal", "around")
+    stacked: ClassVar = ("time", "measured", "sqrt_information", "gimbal", "context")
 
     @property
     def rows(self) -> int:
@@ -127,8 +127,8 @@ class LosDirectionFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """tRm, the angles and, with surroundings, bias, SIGHT_ERRORS and the gyro's errors."""
-        if self.around is None:
+        """tRm, the angles and, with a context, bias, SIGHT_ERRORS and the gyro's errors."""
+        if self.context is None:
             return ROT3, len(self.names)
         return ROT3, len(self.names), 3, len(SIGHT_ERRORS), *([self.errors] if self.errors else [])
 
@@ -141,28 +141,28 @@ class LosDirectionFactor(Model):
         errors: Array | None = None,
     ) -> Residuals:
         """Residual sqrt_information * (measured - predicted), (n, 2) or (n, 3)."""
-        if self.around is None or bias is None or sight is None:
+        if self.context is None or bias is None or sight is None:
             residual, derivatives = self._residuals(tRm, angles, self.gimbal, 0.0)
             return residual, lambda: derivatives()[:2]
-        motion, elapsed, watched = self.around.motion, self.around.elapsed, self.around.watched
-        late = sight[:, 0] - sight[:, 1] * elapsed - self.around.moved
+        motion, elapsed, tracked = self.context.motion, self.context.elapsed, self.context.tracked
+        late = sight[:, 0] - sight[:, 1] * elapsed - self.context.stamp_shift
         turn, by_late, by_gyro = _carried(motion, late, bias, errors)
         gimbal, gimbal_rate, by_encoder = self._gimbal(motion, sight[:, 5:9], late - sight[:, 9])
-        moved = np.stack([sight[:, 3], np.zeros_like(late), sight[:, 4]], axis=1) * watched[:, None]
+        rotation = np.stack([sight[:, 3], np.zeros_like(late), sight[:, 4]], axis=1) * tracked[:, None]
         carried = so3.multiply(tRm, turn)
-        seen = so3.multiply(so3.exp(-moved), carried)
-        foreseen = self.around.foreseen
-        residual, derivatives = self._residuals(seen, angles, gimbal, sight[:, 2:3] * foreseen)
+        seen = so3.multiply(so3.exp(-rotation), carried)
+        predicted = self.context.predicted
+        residual, derivatives = self._residuals(seen, angles, gimbal, sight[:, 2:3] * predicted)
 
         def jacobians() -> tuple[Array, ...]:
             by_attitude, by_angles, by_gimbal = derivatives()
             by_delay = -by_gimbal @ gimbal_rate[..., None]
             by_time = by_attitude @ by_late - by_delay
-            moving = -so3.matrix(so3.inverse(carried)) @ so3.right_jacobian(-moved) * watched[:, None, None]
+            moving = -so3.matrix(so3.inverse(carried)) @ so3.right_jacobian(-rotation) * tracked[:, None, None]
             by_sight = [
                 by_time,
                 by_time * -elapsed[:, None, None],
-                -self.sqrt_information[:, :, :2] @ foreseen[..., None],
+                -self.sqrt_information[:, :, :2] @ predicted[..., None],
                 by_attitude @ moving[:, :, ::2],
                 (by_gimbal[..., None] * by_encoder[:, None]).reshape(*by_gimbal.shape[:2], 4),
                 by_delay,

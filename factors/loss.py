@@ -1,4 +1,4 @@
-"""How outlying measurements are weighed."""
+"""Robust loss of outlying measurements."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from alidade.factors.model import Array
 class TruncatedLoss:
     """Truncated least squares on each measurement's whitened norm, or a relaxation of it.
 
-    Beyond `gate` a measurement costs gate**2 / 2, whatever its size: it has no pull. `mu` = inf is that loss; a small
-    mu is a convex surrogate, mu = 0 its limit, plain least squares. Solving for one mu after the other leads from the
-    one to the other. Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust spatial perception",
-    RA-L 2020, eqs. 13 and 14.
+    Beyond `gate` a measurement costs gate**2 / 2, whatever its size, without influence. `mu` = inf is that loss; a
+    small mu is a convex surrogate, mu = 0 its limit, plain least squares. Graduated non-convexity goes from one to the
+    other. Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust spatial perception", RA-L 2020, eqs.
+    13 and 14.
     """
 
     gate: float
     mu: float = np.inf
 
     def __post_init__(self) -> None:
-        """Raises ValueError for a gate or a mu that is none."""
+        """Raises ValueError where gate <= 0 or mu < 0."""
         if not self.gate > 0.0 or not self.mu >= 0.0:
             raise ValueError(f"TruncatedLoss: gate {self.gate:g} must be above 0, mu {self.mu:g} not below")
 

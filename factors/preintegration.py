@@ -110,11 +110,11 @@ class GyroPath:
             self._starts.append(self._block(number).attitude[-1:].copy())
 
     def _block(self, number: int) -> _Block:
-        """A block of sample intervals."""
+        """The integrated block of sample intervals with this number."""
         if number not in self._kept:
             begin = number * _BLOCK
             end = min(begin + _BLOCK, len(self.t) - 1)
-            # One sample more on either side tells what trapezoids count too much.
+            # The trapezoids' excess needs one sample more on either side.
             some = slice(max(begin - 1, 0), end + 2)
             inner = slice(begin - some.start, end + 1 - some.start)
             t, mean = self.t[some], self.read[some]
@@ -122,8 +122,7 @@ class GyroPath:
             rate = (mean - self.bias_hat - trapezoid_excess(t, mean))[inner]
             drivers = (driving - trapezoid_excess(t, driving))[inner]
             if len(self._kept) == _KEPT:
-                # Streams are gone through from start to end again and again: what was kept longest comes next. The last
-                # third is what is looked at now.
+                # Streams are read from start to end repeatedly: the oldest block is needed next, the newest third now.
                 del self._kept[list(self._kept)[-max(_KEPT // 3, 2)]]
             self._kept[number] = _Block(t[inner], rate, drivers, self._starts[number])
         return self._kept[number]
@@ -325,10 +324,10 @@ def trapezoid_excess(t: Array, mean: Array) -> Array:
 
 
 def _gap_variance(t: Array, mean: Array) -> tuple[Array, Array]:
-    """Times (m,), s, and at them rad^2 per axis that straight lines across the gaps until then may be off, in all.
+    """Cumulative variance of straight lines across gaps, rad^2 per axis, (m,), at times (m,), s; returned times first.
 
     Between these times it grows in proportion to time; there are none but the ends of gaps. A line over T is off by
-    T^3 w'' / 12, w'' as bent as between samples; but never by more than T times the spread of the rates.
+    T^3 w'' / 12, w'' as large as between samples; but never by more than T times the spread of the rates.
     """
     step = np.diff(t)
     usual = float(np.median(step))
@@ -339,11 +338,11 @@ def _gap_variance(t: Array, mean: Array) -> tuple[Array, Array]:
     square, count = 0.0, 0
     for begin in range(0, len(t) - 2, _BLOCK):
         values, beside = mean[begin : begin + _BLOCK + 2], gap[begin : begin + _BLOCK + 1]
-        bends = (values[2:] - 2.0 * values[1:-1] + values[:-2])[~(beside[1:] | beside[:-1])] / usual**2
-        square, count = square + float((bends**2).sum()), count + bends.size
-    bent = float(np.sqrt(square / count)) if count else np.inf
+        curvature = (values[2:] - 2.0 * values[1:-1] + values[:-2])[~(beside[1:] | beside[:-1])] / usual**2
+        square, count = square + float((curvature**2).sum()), count + curvature.size
+    rms = float(np.sqrt(square / count)) if count else np.inf
     spread = float(np.sqrt(mean.var(axis=0).mean()))
-    sigma = np.minimum(step[found] * spread, step[found] ** 3 * bent / 12.0)
+    sigma = np.minimum(step[found] * spread, step[found] ** 3 * rms / 12.0)
     until = np.cumsum(sigma**2)
     ends = np.stack([t[found], t[found + 1]], axis=1).ravel()
     return ends, np.stack([until - sigma**2, until], axis=1).ravel()

@@ -1,9 +1,9 @@
-"""Triads of the cube method, and what an accelerometer, a gyro and a magnetometer at rest say.
+"""Triads of the cube method, and factors of accelerometer, gyro and magnetometer at rest.
 
 Frames: b body (the cube), n level East-North-Up.
 
 Each sensor is a *triad*, one vector of 12 numbers: the rows of A (3 x 3), then c (3), with raw = A nominal + c + noise,
-`nominal` being what an ideal sensor along the axes of b would say. Calibrations are told the other way round, nominal =
+`nominal` being what an ideal sensor along the axes of b would read. Calibrations state the inverse, nominal =
 K raw + b: K = A^-1, b = -A^-1 c (`calibration`). The graph predicts the noisy raw from the nominal, not the reverse.
 Source: methods page, section 4, after the patent on joint calibration of an inertial measurement unit and a geomagnetic
 sensor with an AprilTag hexahedron.
@@ -75,7 +75,7 @@ class TriadPriorFactor(Model):
 
 @dataclass(frozen=True)
 class AccelFactor(Model):
-    """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c + s warmth, raw = u + square u^2 + cube u^3, by axis.
+    """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c + s dT, raw = u + square u^2 + cube u^3, by axis.
 
     Blocks: nRb (rotations), triad (12); of one that is curved its terms (3 square, s^2/m, and 3 cube, (s^2/m)^2); of
     one whose temperature is known s (3, in the unit of raw per K).
@@ -86,7 +86,7 @@ class AccelFactor(Model):
         sigma: (n,) per axis, in the unit of raw.
         gravity: g, m/s^2.
         curved: whether it has square and cube terms.
-        warmth: (n,) K, its temperature above that at which c is the offset; None: not known.
+        temperature: (n,) dT, K above the temperature at which the offset is c; None: unknown.
     """
 
     time: Array
@@ -94,26 +94,26 @@ class AccelFactor(Model):
     sigma: Array
     gravity: float
     curved: bool = False
-    warmth: Array | None = None
-    shapes: ClassVar = {"raw": (3,), "sigma": (), "warmth": ()}
+    temperature: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": (), "temperature": ()}
     rows: int = 3
-    stacked: ClassVar = ("time", "raw", "sigma", "warmth")
+    stacked: ClassVar = ("time", "raw", "sigma", "temperature")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitude, triad and, where there are such, curvature and slope over temperature."""
-        return (ROT3, 12, *([6] if self.curved else []), *([] if self.warmth is None else [3]))
+        return (ROT3, 12, *([6] if self.curved else []), *([] if self.temperature is None else [3]))
 
     def __call__(self, nRb: Array, triads: Array, *terms: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
-        drift, by_slope = _drift(self.warmth, self.sigma, terms)
+        drift, by_slope = _drift(self.temperature, self.sigma, terms)
         error, jacobians = _at_rest(self.raw - drift, self.sigma, nRb, triads, self.gravity * _UP)
         if not self.curved:
             return error, lambda: (*jacobians()[:2], *by_slope)
         square, cube = terms[0][:, :3], terms[0][:, 3:]
         weight = 1.0 / self.sigma[:, None]
         u = error / weight + self.raw
-        bent = (square * u**2 + cube * u**3) * weight
+        nonlinear = (square * u**2 + cube * u**3) * weight
 
         def with_terms() -> tuple[Array, ...]:
             slope = (1.0 + 2.0 * square * u + 3.0 * cube * u**2)[..., None]
@@ -121,12 +121,12 @@ class AccelFactor(Model):
             by_attitude, by_triad, _ = jacobians()
             return slope * by_attitude, slope * by_triad, powers, *(slope * each for each in by_slope)
 
-        return error + bent, with_terms
+        return error + nonlinear, with_terms
 
 
 @dataclass(frozen=True)
 class GyroStaticFactor(Model):
-    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d + G bRn (0, 0, g) + s warmth.
+    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d + G bRn (0, 0, g) + s dT.
 
     Blocks: nRb (rotations), triad (12), d (3; how far the gyro's offset has wandered, in the unit of raw) and, of one
     that feels gravity, G by rows (9, rad/s per m/s^2), of one whose temperature is known s (3, in the unit of raw per
@@ -138,7 +138,7 @@ class GyroStaticFactor(Model):
         sigma: (n,) per axis, in the unit of raw.
         earth_rate: (3,) w_ie in n, rad/s.
         gravity: g, m/s^2, of a gyro that feels it; None: it does not.
-        warmth: (n,) K, its temperature above that at which c is the offset; None: not known.
+        temperature: (n,) dT, K above the temperature at which the offset is c; None: unknown.
     """
 
     time: Array
@@ -146,19 +146,19 @@ class GyroStaticFactor(Model):
     sigma: Array
     earth_rate: Array
     gravity: float | None = None
-    warmth: Array | None = None
-    shapes: ClassVar = {"raw": (3,), "sigma": (), "warmth": ()}
+    temperature: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": (), "temperature": ()}
     rows: int = 3
-    stacked: ClassVar = ("time", "raw", "sigma", "warmth")
+    stacked: ClassVar = ("time", "raw", "sigma", "temperature")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitude, triad, wandered offset and, where there are such, G and slope over temperature."""
-        return (ROT3, 12, 3, *([] if self.gravity is None else [9]), *([] if self.warmth is None else [3]))
+        return (ROT3, 12, 3, *([] if self.gravity is None else [9]), *([] if self.temperature is None else [3]))
 
     def __call__(self, nRb: Array, triads: Array, wandered: Array, *terms: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
-        drift, by_slope = _drift(self.warmth, self.sigma, terms)
+        drift, by_slope = _drift(self.temperature, self.sigma, terms)
         error, jacobians = _at_rest(self.raw - wandered - drift, self.sigma, nRb, triads, self.earth_rate)
         weight = 1.0 / self.sigma
         by_wandered = np.eye(3) * weight[:, None, None]
@@ -198,11 +198,11 @@ class MagFactor(Model):
         return _at_rest(self.raw, self.sigma, nRb, triads, field)
 
 
-def _drift(warmth: Array | None, sigma: Array, terms: Sequence[Array]) -> tuple[Array, tuple[Array, ...]]:
-    """What an offset has drifted by, (n or 1, 3), where its slope is the last of a model's terms, and its Jacobian."""
-    if warmth is None:
+def _drift(temperature: Array | None, sigma: Array, terms: Sequence[Array]) -> tuple[Array, tuple[Array, ...]]:
+    """Drift of the offset with temperature, (n or 1, 3), and its Jacobian by the slope, the model's last term."""
+    if temperature is None:
         return np.zeros((1, 3)), ()
-    return warmth[:, None] * terms[-1], ((warmth / sigma)[:, None, None] * np.eye(3),)
+    return temperature[:, None] * terms[-1], ((temperature / sigma)[:, None, None] * np.eye(3),)
 
 
 def _at_rest(raw: Array, sigma: Array, nRb: Array, triads: Array, vector: Array) -> Residuals:

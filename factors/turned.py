@@ -23,8 +23,8 @@ from alidade.factors.gyro import SCALE, Derivatives, carried, needed, rate_error
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 
-# s: cubics over so much before and after tell how the rate changes. Differences over 10 ms have noise at 400 Hz that
-# makes an arm 2 % too short, those over 30 ms an error that makes it .5 % too long.
+# Half width of the cubic fit for the angular acceleration, s. Differences over 10 ms have noise at 400 Hz that makes a
+# lever arm 2 % too short, those over 30 ms an error that makes it .5 % too long.
 _SPAN = 0.08
 _UP = np.array([0.0, 0.0, 1.0])
 

@@ -27,7 +27,7 @@ class GyroRotationFactor(Model):
     in the unit of raw: their mean adds to c). Of a gyro that feels specific force also G by rows (9, rad/s per m/s^2)
     and the accelerometer's triad (12): raw = A w + c + d + G f, with the f of that accelerometer, its curvature left
     out. Where the temperature is known also s (3, in the unit of raw per K), and that of an accelerometer that drifts
-    too (3): s warmth adds to c. Samples are mean rates centred on their stamps, integrated as
+    too (3): s dT adds to c. Samples are mean rates centred on their stamps, integrated as
     alidade.factors.preintegration does: the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
 
     Attributes:
@@ -36,8 +36,8 @@ class GyroRotationFactor(Model):
         raw: n times (N, 3), at the stamps.
         earth_rate: (3,) w_ie in n, rad/s.
         sigma: (n,) rad per axis.
-        accel: n times (N, 3), what the accelerometer says at the stamps; None: the gyro does not feel force.
-        warmth: n times (N,) K, temperature at the stamps above that at which c is the offset; None: not known.
+        accel: n times (N, 3), the accelerometer's readings at the stamps; None: the gyro does not feel force.
+        temperature: n times (N,) dT, K above the temperature at which the offset is c; None: unknown.
         drifts: whether the accelerometer has a slope over temperature too.
     """
 
@@ -47,17 +47,17 @@ class GyroRotationFactor(Model):
     earth_rate: Array
     sigma: Array
     accel: list[Array] | None = None
-    warmth: list[Array] | None = None
+    temperature: list[Array] | None = None
     drifts: bool = False
     shapes: ClassVar = {"sigma": ()}
     rows: int = 3
-    stacked: ClassVar = ("time", "stamps", "raw", "sigma", "accel", "warmth")
+    stacked: ClassVar = ("time", "stamps", "raw", "sigma", "accel", "temperature")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitudes, triad, wandered offsets and, where there are such, G with the accelerometer's triad and slope."""
         of_force = [] if self.accel is None else [9, 12]
-        slopes = [] if self.warmth is None else [3, 3] if self.drifts else [3]
+        slopes = [] if self.temperature is None else [3, 3] if self.drifts else [3]
         return (ROT3, ROT3, 12, 3, 3, *of_force, *slopes)
 
     def __call__(
@@ -66,12 +66,12 @@ class GyroRotationFactor(Model):
         """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
         offsets = np.concatenate([triads[:, :9], triads[:, 9:] + 0.5 * (wandered_i + wandered_j)], axis=1)
         felt, slopes = ((), terms) if self.accel is None else (terms[:2], terms[2:])
-        raw, accel, warmth = self._joined
+        raw, accel, temperature = self._joined
         samples = self._samples
-        if warmth is not None:
-            raw = raw - warmth[:, None] * slopes[0][samples.turn]
-        if warmth is not None and accel is not None and self.drifts:
-            accel = accel - warmth[:, None] * slopes[1][samples.turn]
+        if temperature is not None:
+            raw = raw - temperature[:, None] * slopes[0][samples.turn]
+        if temperature is not None and accel is not None and self.drifts:
+            accel = accel - temperature[:, None] * slopes[1][samples.turn]
         turns = Turns.of(samples, raw, offsets, *felt, *(() if accel is None else (accel,)))
         dR = turns.rotation
         earth = (samples.t[samples.last] - samples.t[samples.first])[:, None] * self.earth_rate
@@ -82,7 +82,7 @@ class GyroRotationFactor(Model):
         def jacobians() -> tuple[Array, ...]:
             left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
             right = so3.right_jacobian_inverse(error) * weight[:, None, None]
-            by = [*turns.derivatives(), *(() if warmth is None else turns.by_slopes(warmth)[: len(slopes)])]
+            by = [*turns.derivatives(), *(() if temperature is None else turns.by_slopes(temperature)[: len(slopes)])]
             by = [left @ each for each in by]
             by_offset = by[0][..., 9:]
             ends = left @ so3.matrix(so3.inverse(dR)), right
@@ -96,19 +96,19 @@ class GyroRotationFactor(Model):
 
     @cached_property
     def _joined(self) -> tuple[Array, Array | None, Array | None]:
-        """Readings of gyro and accelerometer and the warmth, all turns' one after the other."""
-        accel, warmth = (None if each is None else np.concatenate(each) for each in (self.accel, self.warmth))
-        return np.concatenate(self.raw), accel, warmth
+        """Readings of gyro and accelerometer and the temperature, concatenated over all turns."""
+        accel, temperature = (None if each is None else np.concatenate(each) for each in (self.accel, self.temperature))
+        return np.concatenate(self.raw), accel, temperature
 
 
 @dataclass(frozen=True)
 class Samples:
-    """When the N samples of n turns were taken, one turn after the other.
+    """Times of the N samples of n turns, one turn after the other.
 
     Attributes:
-        t: (N,) s.
-        first, last: (n,) of each turn.
-        turn: (N,) of each sample.
+        t: (N,) stamps, s.
+        first, last: (n,) indexes of each turn's samples.
+        turn: (N,) index of each sample's turn.
         step: (N - 1, 1) s to the next sample; none from one turn to another.
     """
 
@@ -120,7 +120,7 @@ class Samples:
 
     @classmethod
     def of(cls, stamps: Sequence[Array]) -> Samples:
-        """From the stamps of each turn, two at least."""
+        """Samples of turns from the stamps of each, two at least."""
         counts = np.array([len(each) for each in stamps])
         t, ends = np.concatenate(stamps), np.cumsum(counts)
         step = np.diff(t)[:, None]
@@ -128,7 +128,7 @@ class Samples:
         return cls(t, ends - counts, ends - 1, np.repeat(np.arange(len(counts)), counts), step)
 
     def points(self, means: Array) -> Array:
-        """Vectors (N, d) between which lines integrate to the means (N, d) that were read."""
+        """Point values (N, d) whose linear interpolation integrates to the measured means (N, d)."""
         excess = trapezoid_excess(self.t, means)
         excess[self.first] = excess[self.last] = 0.0
         return np.asarray(means - excess)
@@ -146,11 +146,11 @@ class Samples:
 
 @dataclass(frozen=True)
 class Turns:
-    """Turns as a gyro with its triad sees them.
+    """Turns as a gyro with a given triad measures them.
 
     Attributes:
-        samples: of all turns.
-        rate: (N, 3) calibrated, between which rates are linear, rad/s.
+        samples: the samples of all turns.
+        rate: (N, 3) calibrated point rates, linear in between, rad/s.
         K: (n, 3, 3), the inverse of the gyro's A.
         force: (N, 3) likewise, m/s^2; None where the gyro does not feel it.
         G: (n, 3, 3), likewise.
@@ -187,13 +187,14 @@ class Turns:
 
     @property
     def rotation(self) -> Array:
-        """From the first stamp of each to its last, (n, 4)."""
+        """Rotation of each turn from its first stamp to its last, (n, 4)."""
         first, last = self._attitude[self.samples.first], self._attitude[self.samples.last]
         return so3.multiply(so3.inverse(first), last)
 
     def derivatives(self) -> tuple[Array, ...]:
-        """Of the rotations, perturbed on the right, by the gyro's triad (n, 3, 12) and, where there is force, by G
-        (n, 3, 9) and the accelerometer's triad (n, 3, 12).
+        """Derivatives of the rotations, perturbed on the right, by the gyro's triad and the terms of specific force.
+
+        Shapes: triad (n, 3, 12); with specific force also G (n, 3, 9) and the accelerometer's triad (n, 3, 12).
 
         dw = -K (dA w + dc + dG f + G df), df = -K_a (dA_a f + dc_a).
         """
@@ -204,10 +205,12 @@ class Turns:
         by_accel = _by_numbers(by_force, self.K @ self.G @ self.accel_K)
         return by_triad, _by_numbers(by_force, -self.K)[..., :9], by_accel
 
-    def by_slopes(self, warmth: Array) -> tuple[Array, ...]:
-        """Likewise by the slopes over temperature of the gyro and, where there is force, of the accelerometer,
-        (n, 3, 3) each, for a temperature (N,), K, above that at which the offsets are what they are."""
-        by_rate = self.samples.products(self._by_rate, self.samples.points(warmth[:, None]))[..., 0]
+    def by_slopes(self, temperature: Array) -> tuple[Array, ...]:
+        """Derivatives of the rotations by the slopes over temperature of gyro and accelerometer, (n, 3, 3) each.
+
+        Without specific force only the gyro's. The temperature (N,) counts from that of the offsets, K.
+        """
+        by_rate = self.samples.products(self._by_rate, self.samples.points(temperature[:, None]))[..., 0]
         if self.G is None or self.accel_K is None:
             return (-by_rate @ self.K,)
         return -by_rate @ self.K, by_rate @ self.K @ self.G @ self.accel_K
@@ -220,7 +223,7 @@ class Turns:
 
     @cached_property
     def _attitude(self) -> Array:
-        """At each sample (N, 4), one turn carried on from the other."""
+        """Attitude at each sample (N, 4), continued from one turn to the next."""
         return np.concatenate([so3.identity(1), running_product(so3.exp(self._arcs))])
 
     @cached_property
@@ -236,7 +239,7 @@ class Turns:
         return by_rate
 
     def _sums(self, vectors: Array) -> Array:
-        """Sums (n, 3, 3, 4) over each turn of its derivatives by the rates times vectors (N, 3), and of these alone."""
+        """Sums (n, 3, 3, 4) over each turn: derivatives by rate times vectors (N, 3), then derivatives alone."""
         return self.samples.products(self._by_rate, np.concatenate([vectors, np.ones((len(vectors), 1))], axis=1))
 
 
@@ -244,7 +247,7 @@ def _by_numbers(sums: Array, matrices: Array) -> Array:
     """Derivative (n, 3, 12) by a matrix D (rows) and an offset d, where dw = M (D v + d).
 
     Args:
-        sums: (n, 3, 3, 4) of the derivatives by w times v, and of these alone.
+        sums: (n, 3, 3, 4), derivatives by w times v, then the derivatives alone.
         matrices: (n, 3, 3) M.
     """
     by_numbers = np.einsum("niab,nac->nicb", sums, matrices)

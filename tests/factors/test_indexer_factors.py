@@ -29,7 +29,7 @@ RNG = np.random.default_rng(3)
 N = 9
 BASE_RATE = so3.rotate(so3.exp([0.3, -0.2, 0.9]), earth_rate(0.7))
 OPTIONS: tuple[Option, ...] = ("errors", "temperature", "encoder", "epsilon", "tilt")
-WARMTH = np.linspace(0.0, 8.0, N)
+TEMPERATURE = np.linspace(0.0, 8.0, N)
 
 
 def _angles(t: Array) -> tuple[Array, Array]:
@@ -53,7 +53,7 @@ def _rates(n: int = N, spread: float = 0.3) -> PlatformRates:
 
 
 def _model(gyro: Array, rates: PlatformRates) -> IndexerAverageFactor:
-    return IndexerAverageFactor(gyro, rates, RNG.normal(size=(3 * N, 3 * N)), OPTIONS, warmth=WARMTH)
+    return IndexerAverageFactor(gyro, rates, RNG.normal(size=(3 * N, 3 * N)), OPTIONS, temperature=TEMPERATURE)
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 2e-3, -0.4])
@@ -163,7 +163,7 @@ def test_windows_without_encoder_noise_are_independent() -> None:
             rates.by_encoder[rows],
             np.zeros((3 * len(rows), 3 * len(rows) + 2)),
         )
-        return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0, OPTIONS, warmth=WARMTH[rows])
+        return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0, OPTIONS, temperature=TEMPERATURE[rows])
 
     assert_rows_are_independent(model, blocks)
 
@@ -189,8 +189,8 @@ def test_residual_vanishes_at_the_truth() -> None:
     w = so3.rotate(so3.exp(tilt), fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
     xx, yy, zz, xy, xz, yz = errors[0]
     gain = np.eye(3) + np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    gyro = so3.rotate(so3.inverse(mounting(theta)), w) @ gain + bias + WARMTH[:, None] * slope
-    model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0, OPTIONS, warmth=WARMTH)
+    gyro = so3.rotate(so3.inverse(mounting(theta)), w) @ gain + bias + TEMPERATURE[:, None] * slope
+    model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0, OPTIONS, temperature=TEMPERATURE)
     np.testing.assert_allclose(model(theta, bias, errors, slope, encoder, epsilon, tilt)[0], 0.0, atol=1e-13)
     assert np.abs(model(theta + 1e-3, bias, errors, slope, encoder, epsilon, tilt)[0]).max() > 1e-5
 

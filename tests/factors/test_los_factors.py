@@ -7,7 +7,7 @@ import pytest
 
 from alidade.factors import so3
 from alidade.factors.gimbal import GimbalPath, LocalMotion, command
-from alidade.factors.los import SIGHT_ERRORS, LosDirectionFactor, LosRateFactor, Surroundings, rate_matrix, roll_rate
+from alidade.factors.los import SIGHT_ERRORS, LosContext, LosDirectionFactor, LosRateFactor, rate_matrix, roll_rate
 from alidade.factors.model import Array
 from alidade.factors.testing import assert_jacobians
 from tests.support.numerics import assert_rows_are_independent
@@ -31,8 +31,8 @@ def _gimbal(t: Array) -> Array:
 
 STAMPS = np.arange(0.0, 6.0, 0.005)
 FORCE = np.array([0.5, -1.0, 9.7])
-FORESEEN = 0.02 * np.random.default_rng(4).normal(size=(N, 2))
-MOVED = 0.003 * np.random.default_rng(5).normal(size=N)
+PREDICTED = 0.02 * np.random.default_rng(4).normal(size=(N, 2))
+STAMP_SHIFT = 0.003 * np.random.default_rng(5).normal(size=N)
 GIMBAL = GimbalPath(STAMPS, _gimbal(STAMPS))
 WARMTH = (2.0 * STAMPS)[:, None]
 # What moves the gyro's readings, by how many numbers its errors are.
@@ -67,9 +67,9 @@ def _factor(
     rng = np.random.default_rng(3)
     root = rng.normal(size=(N, width, width)) + 3 * np.eye(width)
     measured = 0.05 * rng.normal(size=(N, width))
-    around = Surroundings(MOTIONS[gyro_errors], TIMES, TIMES - 0.2, FORESEEN, MOVED)[rows] if sight else None
+    context = LosContext(MOTIONS[gyro_errors], TIMES, TIMES - 0.2, PREDICTED, STAMP_SHIFT)[rows] if sight else None
     return LosDirectionFactor(
-        TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[rows], names, around, gyro_errors
+        TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[rows], names, context, gyro_errors
     )
 
 
@@ -105,7 +105,7 @@ def test_an_error_does_what_its_definition_says(name: str) -> None:
     root_inverse = np.linalg.inv(model.sqrt_information)
     picture = model.measured - np.einsum("nij,nj->ni", root_inverse, model(tRm, angles, bias, sight, errors)[0])
 
-    late = {"time_offset": size + 0.0 * TIMES, "clock_skew": -size * TIMES}.get(name, 0.0 * TIMES) - MOVED
+    late = {"time_offset": size + 0.0 * TIMES, "clock_skew": -size * TIMES}.get(name, 0.0 * TIMES) - STAMP_SHIFT
     gimbal = _gimbal(TIMES + late - (size if name == "encoder_delay" else 0.0))
     read = _gimbal(TIMES + late)
     for i, joint in enumerate(("azimuth", "elevation")):
@@ -127,7 +127,7 @@ def test_an_error_does_what_its_definition_says(name: str) -> None:
     level = LosDirectionFactor(TIMES, model.measured, model.sqrt_information, gimbal, CORE)
     expected = level.predict(seen, angles)
     if name == "los_scale":
-        expected[:, :2] += size * FORESEEN
+        expected[:, :2] += size * PREDICTED
     np.testing.assert_allclose(picture, expected, atol=3e-6)
 
 

@@ -47,17 +47,17 @@ def _sigma(rows: np.ndarray) -> Array:
 
 
 # K above that at which offsets are what they are.
-WARMTH = np.linspace(-2.0, 6.0, N)
+TEMPERATURE = np.linspace(-2.0, 6.0, N)
 
 
 def _static(kind: str, rows: np.ndarray) -> Model:
     raw = _rng(5).normal(size=(N, 3))[rows]
-    warmth = WARMTH[rows] if kind.startswith("warm") else None
+    temperature = TEMPERATURE[rows] if kind.startswith("warm") else None
     if "accel" in kind:
-        return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8, "curved" in kind, warmth)
+        return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8, "curved" in kind, temperature)
     if "gyro" in kind:
         gravity = 9.8 if kind.endswith("gyro that feels gravity") else None
-        return GyroStaticFactor(TIMES[rows], raw, _sigma(rows), EARTH * 1e4, gravity, warmth)
+        return GyroStaticFactor(TIMES[rows], raw, _sigma(rows), EARTH * 1e4, gravity, temperature)
     return MagFactor(TIMES[rows], raw, _sigma(rows))
 
 
@@ -91,7 +91,7 @@ def test_static_models_are_what_they_say() -> None:
     """Axis by axis, from the attitude's matrix; at another temperature the readings are off by the slope times that."""
     rng = _rng(13)
     slope = 0.1 * rng.normal(size=(N, 3))
-    drift = WARMTH[:, None] * slope
+    drift = TEMPERATURE[:, None] * slope
     (nRb, triads, wandered, G), terms = _static_blocks("gyro that feels gravity"), 1e-3 * rng.normal(size=(N, 6))
     A, c = parts(triads)
     up = so3.matrix(nRb)[:, 2]
@@ -101,14 +101,14 @@ def test_static_models_are_what_they_say() -> None:
     np.testing.assert_allclose(
         GyroStaticFactor(TIMES, raw, sigma, EARTH, 9.8)(nRb, triads, wandered, G)[0], 0, atol=1e-13
     )
-    warm = GyroStaticFactor(TIMES, raw + drift, sigma, EARTH, 9.8, WARMTH)
+    warm = GyroStaticFactor(TIMES, raw + drift, sigma, EARTH, 9.8, TEMPERATURE)
     np.testing.assert_allclose(warm(nRb, triads, wandered, G, slope)[0], 0, atol=1e-13)
     u = 9.8 * np.einsum("nij,nj->ni", A, up) + c
     raw = u + terms[:, :3] * u**2 + terms[:, 3:] * u**3
     np.testing.assert_allclose(AccelFactor(TIMES, raw, sigma, 9.8, curved=True)(nRb, triads, terms)[0], 0, atol=1e-12)
     u += drift
     raw = u + terms[:, :3] * u**2 + terms[:, 3:] * u**3
-    bent = AccelFactor(TIMES, raw, sigma, 9.8, curved=True, warmth=WARMTH)
+    bent = AccelFactor(TIMES, raw, sigma, 9.8, curved=True, temperature=TEMPERATURE)
     np.testing.assert_allclose(bent(nRb, triads, terms, slope)[0], 0, atol=1e-12)
 
 
@@ -121,9 +121,9 @@ def _turns(rows: np.ndarray, angle: float, feels: bool = False, warm: bool = Fal
         stamps.append(t)
         raw.append(angle * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
         accel.append(9.8 * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
-    felt, warmth = accel if feels else None, [WARMTH[i] + t**2 for i, t in zip(rows, stamps, strict=True)]
+    felt, temperature = accel if feels else None, [TEMPERATURE[i] + t**2 for i, t in zip(rows, stamps, strict=True)]
     return GyroRotationFactor(
-        TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), felt, warmth if warm else None, warm and feels
+        TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), felt, temperature if warm else None, warm and feels
     )
 
 
@@ -168,9 +168,9 @@ def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
     feels = GyroRotationFactor(t[-1:], [t], [raw + force @ G.T], EARTH, np.ones(1), [accel])
     of_force = G.reshape(1, 9), triad(accel_K, accel_b)[None]
     np.testing.assert_allclose(feels(iRb0, nRb1, triad(K, b)[None], *wandered, *of_force)[0], 0.0, atol=1e-12)
-    slopes, warmth = 1e-3 * rng.normal(size=(2, 1, 3)), 8.0 + 3.0 * t**2
-    drifted = [raw + force @ G.T + np.outer(warmth, slopes[0])], [accel + np.outer(warmth, slopes[1])]
-    warm = GyroRotationFactor(t[-1:], [t], drifted[0], EARTH, np.ones(1), drifted[1], [warmth], drifts=True)
+    slopes, temperature = 1e-3 * rng.normal(size=(2, 1, 3)), 8.0 + 3.0 * t**2
+    drifted = [raw + force @ G.T + np.outer(temperature, slopes[0])], [accel + np.outer(temperature, slopes[1])]
+    warm = GyroRotationFactor(t[-1:], [t], drifted[0], EARTH, np.ones(1), drifted[1], [temperature], drifts=True)
     np.testing.assert_allclose(warm(iRb0, nRb1, triad(K, b)[None], *wandered, *of_force, *slopes)[0], 0.0, atol=1e-12)
 
 

@@ -46,7 +46,10 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "sigma one number": ({"sigma": 1e-3}, "sigma of 20 measurements has shape (), not (20,)"),
     "text": ({"raw": [["a"] * 3] * N}, "raw is no array of numbers"),
     "ragged lists": ({"raw": [[1.0, 2.0, 3.0]] * (N - 1) + [[1.0]]}, "raw is no array of numbers"),
-    "warmth too long": ({"warmth": np.zeros(N + 1)}, "warmth of 20 measurements has shape (21,), not (20,)"),
+    "temperature too long": (
+        {"temperature": np.zeros(N + 1)},
+        "temperature of 20 measurements has shape (21,), not (20,)",
+    ),
 }
 
 

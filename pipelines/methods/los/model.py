@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.chi_square import gate
 from alidade.factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
-from alidade.factors.los import LosDirectionFactor, Surroundings
+from alidade.factors.los import LosContext, LosDirectionFactor
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.display.drawing import swaying
@@ -70,7 +70,7 @@ class _Model:
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
-    around: Surroundings | None  # of the keyframes, when errors of the sensors are variables
+    around: LosContext | None  # of the keyframes, when errors of the sensors are variables
     loss: TruncatedLoss
     parameters: LosParameters
     reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
@@ -181,7 +181,7 @@ def _prepare(
         errors = foreseen(chains, time, camera(motion.gimbal, mount, parameters.names), measured, chain.gyro)
         clock, watched = _watched(used, clock, before, start)
         elapsed = clock.elapsed(time)
-        around = Surroundings(motion, elapsed, watched, errors, clock.late(elapsed))
+        around = LosContext(motion, elapsed, watched, errors, clock.late(elapsed))
     model = _Model(
         chain=chain,
         mount=mount,
