@@ -1,8 +1,8 @@
-"""When a calibration is to be done: what works long asks, and stops with what it has.
+"""Deadline of a calibration: long computations ask for it and stop with their result so far.
 
     with deadline.within(60.0):                     # the command, or a session where no command has
         ...
-        if deadline.passed("the search for causes"):    # what works long; told in `stopped()`
+        if deadline.passed("the search for causes"):    # a long computation; `stopped()` names it
             return ()
 
 Minimisations end after their iteration, runs after their step, trials before they begin: the solution first, trials

@@ -1,10 +1,10 @@
-"""Several processes for long work: how many there may be, work divided among them, and things that they keep.
+"""Pool of processes for long computations: their number, tasks divided among them, and objects that they keep.
 
 with parallel.processes(jobs):                             # the command
     ...
-    scores = parallel.done([partial(score, each) for each in trials], "trials", 4)     # whoever works long
-    crew = Crew(stretches, most=4)
-    errors = crew.ask(StretchAt.error, [()] * len(stretches), "stretch by stretch")
+    scores = parallel.done([partial(score, each) for each in trials], "trials", 4)     # a long computation
+    pool = WorkerPool(segments, most=4)
+    errors = pool.ask(SegmentAt.error, [()] * len(segments), "segment by segment")
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from alidade.pipelines.errors import InputError
 Thing = TypeVar("Thing")
 Answer = TypeVar("Answer")
 
-# What Linux says of the memory of the machine, and of a container (man 5 proc, cgroup-v2).
+# Memory of the machine, and of a container, on Linux (man 5 proc, cgroup-v2).
 _MEMORY, _CONTAINER = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 # One process, unless a command says that there may be more.
 _jobs = 1
-# This process's ends of the connections to others, which a fork closes: a connection ends with the last that is open.
+# This process's ends of the connections to workers. A fork closes them: a connection ends with its last open end.
 _open: weakref.WeakSet[Connection] = weakref.WeakSet()
 
 
 @contextmanager
 def processes(jobs: int | None) -> Iterator[None]:
-    """Within the block so many processes may be used; None: one a core."""
+    """Allow `jobs` processes within the block; None: one per core."""
     global _jobs
     before, _jobs = _jobs, jobs or _cores()
     try:
@@ -52,17 +52,17 @@ def processes(jobs: int | None) -> Iterator[None]:
 
 
 def _cores() -> int:
-    """Those that this process may run on, where the system says which."""
+    """Number of cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def allowed() -> int:
-    """How many processes may be used."""
+    """Number of processes that may be used."""
     return _jobs
 
 
 def room() -> float:
-    """Bytes of memory that are free for processes: of the machine, and of a container with a limit.
+    """Free memory for processes, bytes: the machine's, or the container's where that is less.
 
     Infinite where there is one process alone, which is everywhere but on Linux.
     """
@@ -78,8 +78,8 @@ def room() -> float:
 
 
 def done(works: Sequence[Callable[[], Answer]], what: str, most: int) -> list[Answer]:
-    """What pieces of work give, shown as it comes in, at `most` so many done at a time; see `Crew` and its `ask`."""
-    return Crew(works, min(most, len(works))).ask(_done, [()] * len(works), what)
+    """Results of independent tasks, at most `most` at a time, with progress; see `WorkerPool.ask`."""
+    return WorkerPool(works, min(most, len(works))).ask(_done, [()] * len(works), what)
 
 
 def _done(work: Callable[[], Answer]) -> Answer:
@@ -87,7 +87,7 @@ def _done(work: Callable[[], Answer]) -> Answer:
 
 
 class LostError(InputError):
-    """A process was ended from outside."""
+    """Raised where a worker process was ended from outside."""
 
     def __init__(self) -> None:
         super().__init__(
@@ -96,53 +96,54 @@ class LostError(InputError):
         )
 
     def __reduce__(self) -> tuple[type[LostError], tuple[()]]:
-        """It takes no message."""
+        """Pickle without a message, which the constructor does not take."""
         return LostError, ()
 
 
-class Crew(Generic[Thing]):
-    """Things divided among processes that keep them, or all kept by this one.
+class WorkerPool(Generic[Thing]):
+    """Objects divided among processes that keep them, or all kept by this one.
 
-    Processes are forked, so that each begins with all that there is, and nothing is sent to it but questions. They end
-    with the crew, and may each use their share of the processes that there may be. Where the system cannot fork safely,
-    which is everywhere but on Linux, there is one process.
+    Processes are forked: each begins with the state of this one and receives questions only. They end with the pool;
+        each
+    may use its share of the allowed processes. Where the system cannot fork safely (all but Linux), there is one
+    process.
 
     Args:
-        things: each is asked in the process that keeps it, and may keep there what it finds.
-        most: processes that are worth while.
+        things: objects, each asked in the process that keeps it; it may keep state there.
+        most: largest useful number of processes.
     """
 
     def __init__(self, things: Sequence[Thing], most: int) -> None:
         self._things = things
         count = min(allowed(), most) if sys.platform == "linux" else 1
         share = max(allowed() // max(count, 1), 1)
-        self._hands = [_Hand(things[i::count], share) for i in range(count)] if count > 1 else []
+        self._workers = [_Worker(things[i::count], share) for i in range(count)] if count > 1 else []
 
     def ask(self, question: Callable[..., Answer], given: Sequence[tuple[Any, ...]], what: str) -> list[Answer]:
-        """What a question gives of each thing, shown as it comes in.
+        """Answers of all things to a question, in order, with progress.
 
         Args:
-            question: a function at the top of a module, since it may go to another process.
-            given: for each thing what the question takes besides.
-            what: is done, for who watches.
+            question: a function at the top of a module, which can be pickled.
+            given: further arguments of the question for each thing.
+            what: name of the work in the progress display.
 
         Raises:
-            LostError: a process was ended from outside; nothing can be asked any more.
-            Exception: the first that the question raised, as it is.
+            LostError: a process was ended from outside; the pool is unusable.
+            Exception: the first that a question raised, unchanged.
         """
-        if not self._hands:
-            together = zip(self._things, given, strict=True)
-            return [question(thing, *args) for thing, args in progress.track(together, what, len(given))]
-        count = len(self._hands)
+        if not self._workers:
+            pairs = zip(self._things, given, strict=True)
+            return [question(thing, *args) for thing, args in progress.track(pairs, what, len(given))]
+        count = len(self._workers)
         try:
-            for i, hand in enumerate(self._hands):
-                hand.send((question, given[i::count]))
+            for i, worker in enumerate(self._workers):
+                worker.send((question, given[i::count]))
             turns = progress.track(range(len(given)), what, len(given))
-            answers = [self._hands[i % count].receive() for i in turns]
+            answers = [self._workers[i % count].receive() for i in turns]
         except BaseException:
-            # Answers that are still on their way are none to the next question.
-            for hand in self._hands:
-                hand.close()
+            # Answers still in the pipes belong to no later question.
+            for worker in self._workers:
+                worker.close()
             raise
         for _, error in answers:
             if error is not None:
@@ -150,8 +151,8 @@ class Crew(Generic[Thing]):
         return [answer for answer, _ in answers]
 
 
-class _Hand:
-    """One process of a crew."""
+class _Worker:
+    """One process of a WorkerPool, seen from its parent."""
 
     def __init__(self, things: Sequence[Any], share: int) -> None:
         context = multiprocessing.get_context("fork")
@@ -159,11 +160,11 @@ class _Hand:
         _open.add(self._connection)
         process = context.Process(target=_work, args=(theirs, things, share, os.getpid()))
         with warnings.catch_warnings():
-            # Threads that draw progress are not needed in a fork, which leaves them and what they may hold alone.
+            # A fork needs no threads that draw progress, and does not touch their locks.
             warnings.simplefilter("ignore", DeprecationWarning)
             process.start()
         theirs.close()
-        # At the end of this process before others are waited for.
+        # At the end of this process, before it waits for others.
         Finalize(self, process.kill, exitpriority=10)
 
     def send(self, message: tuple[Callable[..., Any], Sequence[tuple[Any, ...]]]) -> None:
@@ -180,22 +181,22 @@ class _Hand:
         return answer
 
     def close(self) -> None:
-        """Ask nothing any more."""
+        """Close the connection, which ends the process."""
         self._connection.close()
 
 
 def _work(connection: Connection, things: Sequence[Any], share: int, parent: int) -> None:
-    """Answer as long as somebody asks. An interruption is for the main process to handle."""
+    """Main loop of a worker: answer questions until the connection closes. Interrupts are left to the parent."""
     global _jobs
     _jobs = share
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with(parent)
     for end in list(_open):
         end.close()
-    # Whoever draws progress may hold these at the moment of the fork, and is not here to let go of them.
+    # The threads that draw progress may have locked these streams at the moment of the fork, and do not exist here.
     progress.hide()
     sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
-    # To look for garbage in what was there before would have all of it copied.
+    # A garbage collection over the parent's objects would copy all of their pages.
     gc.freeze()
     try:
         while True:
@@ -203,7 +204,7 @@ def _work(connection: Connection, things: Sequence[Any], share: int, parent: int
             for thing, args in zip(things, given, strict=True):
                 connection.send_bytes(_answer(question, thing, args))
     except (EOFError, OSError):
-        return  # whoever asked is gone
+        return  # the parent closed the connection
 
 
 def _end_with(parent: int) -> None:
@@ -214,7 +215,7 @@ def _end_with(parent: int) -> None:
 
 
 def _answer(question: Callable[..., Any], thing: Any, args: tuple[Any, ...]) -> bytes:
-    """What a question gives or raises, ready to be sent."""
+    """The answer to a question, or the exception that it raised, pickled."""
     answer: tuple[Any, Exception | None]
     try:
         answer = question(thing, *args), None

@@ -70,7 +70,7 @@ def doing(what: str, total: float | None = None) -> Iterator[Callable[[float], N
 def track(
     items: Iterable[Item], what: str, total: float | None = None, done: Callable[[Item], float] | None = None
 ) -> Iterator[Item]:
-    """The items, shown as they are taken; `done` tells from one how much of the total is behind, else they count."""
+    """Yield the items and show progress; `done` maps an item to the finished part of the total, else items count."""
     with doing(what, total) as update:
         for i, item in enumerate(items):
             yield item

@@ -319,11 +319,11 @@ class Config(Section):
 
     @property
     def origin(self) -> str:
-        """The file that the keys are from, or what stands in for one; empty where nobody says."""
+        """The file that the keys are from, or its substitute; empty where unknown."""
         return self._origin
 
     def of(self, origin: str) -> Config:
-        """The same config, of a file."""
+        """The same config with the file that it is from."""
         out = self.model_copy()
         out._origin = origin
         return out

@@ -225,7 +225,7 @@ class Session:
             if said.startswith("topic "):  # a fault of a topic matters less than others that are not there
                 said = f"{recording.path}: method {chosen.name} lacks {'; '.join(missing)}"
             raise InputError(f"{said}{f'; nearest is {nearest}' if nearest else ''}") from error
-        noted = (COPIED, OVERTAKEN, HELD, "not believed (kept)")
+        noted = (COPIED, OVERTAKEN, HELD, "not used (reading kept)")
         many = [f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted)]
         for sentence in (*many, *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
             recording.remark(sentence)

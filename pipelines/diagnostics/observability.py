@@ -147,7 +147,7 @@ class TimeToAccuracy:
 
     Attributes:
         met_s: time from which on its sigma was as required, s; None: never.
-        stretch: (start, end), s, of the tenth of the recording that brought most information.
+        stretch: (start, end) of the tenth of the recording that brought most information.
         share: that tenth's part of all information.
     """
 

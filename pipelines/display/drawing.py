@@ -198,9 +198,9 @@ def covered(directions: Array, what: str) -> str:
                 continue
             reach, turn = radius * np.sqrt(2.0) * np.sin(0.5 * colatitude), float(np.arctan2(y, x))
             at = f"{middle + reach * np.cos(turn):.1f} {-reach * np.sin(turn):.1f}"
-            size, stretch = radius * np.sqrt(2.0) * np.sin(0.5 * _NEAR), float(np.cos(0.5 * colatitude))
+            size, ratio = radius * np.sqrt(2.0) * np.sin(0.5 * _NEAR), float(np.cos(0.5 * colatitude))
             paint += (
-                f'<ellipse rx="{size * stretch:.1f}" ry="{size / stretch:.1f}" '
+                f'<ellipse rx="{size * ratio:.1f}" ry="{size / ratio:.1f}" '
                 f'transform="translate({at}) rotate({-np.rad2deg(turn):.0f})"/>'
             )
             dots += f'<circle r="3" transform="translate({at})"/>' if colatitude <= 0.5 * np.pi else ""

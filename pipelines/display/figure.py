@@ -37,7 +37,7 @@ PALETTE = {
     "rejected": ("#cc3311", "#ff7755"),
     "pale": ("#9ab6cc", "#58738a"),
     "before": ("#8a949e", "#7c8792"),
-    "faint": ("#c9d1d9", "#3a4551"),
+    "grid": ("#c9d1d9", "#3a4551"),
     "gap": ("#f6dfae", "#5c4a1c"),
     "ink": ("#1b2530", "#e4e9ee"),
     "soft": ("#5b6875", "#a3afbb"),
@@ -45,7 +45,7 @@ PALETTE = {
 }
 COLORS = tuple(name for name in PALETTE if name.startswith("series"))
 AXES = ("x", "y", "z")
-REJECTED, PALE, BEFORE, FAINT = "rejected", "pale", "before", "faint"
+REJECTED, PALE, BEFORE, GRID = "rejected", "pale", "before", "grid"
 
 Dash = Literal["solid", "dotted", "dashed", "dotdash"]
 Shape = Literal["circle", "ring", "x"]

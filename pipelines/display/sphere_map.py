@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.pipelines.display.figure import COLORS, FAINT, Figure
+from alidade.pipelines.display.figure import COLORS, GRID, Figure
 from alidade.pipelines.estimation.problem import Array
 
 # Directions farther than this from all there are, rad, are gaps; the second ones wide.
@@ -49,7 +49,7 @@ def sphere_map(directions: Array, names: list[str], what: str) -> Figure:
         at_edge = 0.999999 * longitude
         across = np.cos(latitude)
         edge = _map(np.stack([across * np.cos(at_edge), across * np.sin(at_edge), np.sin(latitude)], axis=1))
-        out.line(edge[:, 0], edge[:, 1], color=FAINT)
+        out.line(edge[:, 0], edge[:, 1], color=GRID)
     for low, high, color in zip(_GAPS, (*_GAPS[1:], np.inf), _GAP_COLORS, strict=True):
         some = _map(_SPHERE[(away > low) & (away <= high)])
         out.points(some[:, 0], some[:, 1], f"no {what} within {np.rad2deg(low):.0f} deg", color, 6)

@@ -235,9 +235,9 @@ def acting(errors: Parameter | None, drivers: Mapping[ParameterSpec, Array | Non
 
 
 def stamped(parameter: Parameter | None, name: str, sigma: float) -> Parameter | None:
-    """The variable with the sigma of stamps, s, where log times stand in for them, in one of its numbers: a delay.
+    """The variable with the sigma of replaced stamps, s, added to one of its numbers, a delay.
 
-    How late log times are nobody knows: that is part of what the delay may be, and of what it may be off.
+    The lateness of log times is unknown: it widens the prior of the delay and its final sigma.
     """
 
     def known(q: Quantity) -> Quantity:

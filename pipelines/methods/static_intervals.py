@@ -70,7 +70,7 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
     still = _turns_not(means, forces, runs[:, 1] - runs[:, 0] + 1, floor[0])
     if len(runs) and not still.any():
         raise InputError(
-            f"no static pose: the device is quiet in {len(runs)} stretches, but the gyro's mean rates in them lie up "
+            f"no static pose: the device is quiet in {len(runs)} intervals, but the gyro's mean rates in them lie up "
             f"to {np.ptp(means, axis=0).max():.2g} rad/s apart: either it turns steadily in them, or gravity shifts "
             "its gyro by far more than a usual one's (g-sensitivity)"
         )

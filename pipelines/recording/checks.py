@@ -1,4 +1,4 @@
-"""Checks of measured series that every method's reader needs. What is wrong and can be told is an InputError."""
+"""Checks of measured series, used by every method's reader; they raise InputError."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ MAX_NORM_ERROR = 1e-3
 # The best sensors there are have more noise, rad/s/sqrt(Hz), m/s^2/sqrt(Hz) and T/sqrt(Hz). Drivers that know nothing
 # write a variance of 1e-12, say.
 LEAST_GYRO, LEAST_ACCEL, LEAST_MAG = 2e-7, 1e-6, 1e-12
-# Steps that tell in which unit of time stamps are, and the shortest of a sensor: of 40 kHz, s.
+# Least number of steps from which the unit of stamps is recognised, and the shortest of a sensor: of 40 kHz, s.
 _FEWEST_STEPS, _SHORTEST_STEP_S = 10, 2.5e-5
-# A gyro is read more often than once in so many s; another sensor than once in so many.
+# Longest usual step of a gyro, and of another sensor, s.
 SLOWEST_GYRO_S, SLOWEST_S = 0.5, 5.0
 # The unit that stamps are in whose step has to be multiplied so.
 _MEANT = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "s or ms", 1e6: "s", 1e9: "s"}
@@ -188,12 +188,12 @@ def unit_quaternions(topic: str, t: Array, wxyz: Array) -> Array:
 
 
 def check_overlap(spans: Mapping[str, Array]) -> None:
-    """Raise InputError if the times of the topics, name -> t, have no stretch in common."""
+    """Raise InputError where the times of the topics, name -> t, do not overlap."""
     latest = max(spans, key=lambda name: spans[name][0])
     earliest = min(spans, key=lambda name: spans[name][-1])
     if spans[latest][0] >= spans[earliest][-1]:
         described = ", ".join(f"{name} {t[0]:.3f} to {t[-1]:.3f} s" for name, t in spans.items())
-        raise InputError(f"no stretch of time is covered by all of: {described}; are the clocks the same?")
+        raise InputError(f"no time is covered by all of: {described}; are the clocks the same?")
 
 
 def count(dropped: dict[str, int], reason: str, number: int) -> None:

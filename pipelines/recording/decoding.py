@@ -41,7 +41,7 @@ _CONVERSIONS = {
     "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
     "the messages as JSON, which `flatc --json --raw-binary` makes of each with its .fbs, into another MCAP file",
 }
-# Largest share of messages without a stamp that are left out; where there are more, log times stand in for all of them.
+# Largest share of messages without a stamp that are left out; where there are more, log times replace all stamps.
 MAX_UNSTAMPED_SHARE = 0.1
 # Layouts of a topic's messages (they differ in frame names, say) that are decoded at once; others one by one.
 _MAX_LAYOUTS = 8
@@ -353,7 +353,7 @@ def few_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
-    """Stamps and log times: these stand in for missing stamps; where those are few, the messages are left out."""
+    """Stamps and log times. Messages without a stamp are left out where they are few; else log times replace stamps."""
     kept: Any = ~few if (few := few_unstamped(stamps, log_ns)).any() else slice(None)
     stamps, log_ns = stamps[kept], log_ns[kept]
     return (stamps if stamps.all() else np.where(stamps == 0, log_ns, stamps)), log_ns

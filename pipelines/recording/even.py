@@ -14,10 +14,10 @@ _HOLE, _MOST_FILLED = 5, 0.02
 
 
 def even_pieces(t: Array, values: Array) -> tuple[list[Array], float, int]:
-    """The samples in pieces that are evenly spaced, their interval, s, and how many of them were filled in.
+    """Pieces of evenly spaced samples, their interval, s, and the number of samples filled in.
 
-    Stamps that jitter are taken as those of evenly spaced samples, lost samples told from late stamps by the stamps
-    around them. Short holes are filled by straight lines, long ones part the record.
+    Jittering stamps count as evenly spaced; the stamps beside a hole distinguish lost samples from late stamps. Short
+    holes are filled by straight lines, long ones split the record.
 
     Args:
         t: (N,) s, increasing.

@@ -1,8 +1,8 @@
-"""Samples of a noisy sensor that cannot be what it measured: frozen, at the end of its range, or torn out by a spike.
+"""Faulty samples of a noisy sensor: frozen, saturated, or a spike.
 
-A sensor is told from its own noise: a reading that repeats exactly while it should move, or that lies far from both
-its neighbours while these agree, is none. Streams that repeat most of the time (simulated without noise, coarsely
-quantised at rest) say nothing of the kind and are left alone.
+The sensor's own noise identifies them: a valid reading neither repeats exactly while the sensor moves nor lies far from
+both its neighbours while these agree. Streams that repeat most of the time (simulated without noise, coarsely quantised
+at rest) are not tested.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def _spikes(x: Array) -> Mask:
 
 
 def _runs(x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """First and last index of every stretch of equal readings; NaN equals nothing."""
+    """First and last index of every run of equal readings; NaN equals nothing."""
     change = np.flatnonzero(np.diff(x) != 0.0)
     return np.concatenate([[0], change + 1]), np.concatenate([change, [len(x) - 1]])
 

@@ -15,7 +15,7 @@ from alidade.pipelines.settings import Config
 
 @dataclass(frozen=True)
 class TopicFacts:
-    """One topic. Times are s from the session's start; None where there are too few messages to tell.
+    """Rates and gaps of one topic. Times are s from the session's start; None where there are too few messages.
 
     rate_hz is one over the median interval between stamps; the largest gap is the longest interval and where it begins.
     """

@@ -120,7 +120,7 @@ class McapFile(Container):
             self._read_index(stream)
 
     def _read_index(self, stream: BinaryIO) -> None:
-        """Walk the file; read chunks whose content the walk does not tell."""
+        """Index the file's records; read the chunks whose content no index lists."""
         self.size = stream.seek(0, 2)
         end = self._read_summary(stream)
         self._walk(stream, self.size if end is None else end)

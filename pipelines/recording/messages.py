@@ -151,9 +151,9 @@ class MessageError(Exception):
 
 
 class Definition:
-    """A message type as its definition text tells it, not as we would expect it.
+    """A message type by the definition text in the recording, which may differ from the standard one.
 
-    The text is another's, and rosbags makes code of it, so that its size is looked at before.
+    The text is foreign input, and rosbags generates code from it: its size is checked first.
     """
 
     def __init__(self, name: str, text: str, wire: Wire = "cdr", language: Language = "msg") -> None:

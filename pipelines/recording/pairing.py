@@ -21,11 +21,11 @@ Stamps = NDArray[np.int64]
 
 # Delays looked for, s; steps and length of the grid they are looked for on.
 _LARGEST_DELAY, _FINEST, _MOST = 2.0, 0.002, 1 << 17
-# Attitudes are differenced over this long, s.
+# Interval over which attitudes are differenced, s.
 _INTERVAL = 0.1
-# A delay is refined within so much, s, in smaller and smaller reach, from so many rates at least.
+# Search of a delay: half range, s; half ranges of the successive refinements, s; least number of rates.
 _WITHIN, _REACHES, _FEWEST = 0.1, (0.05, 0.02, 0.02), 30
-# Rates that vary less, rad/s, or are known for less time, s, tell nothing.
+# Least variation of rates, rad/s, and shortest duration, s, from which a pairing is estimated.
 _LEAST_MOTION, _SHORTEST = 0.02, 3.0
 # A mount beyond three sigmas of its default prior, 0.35 rad, is not what makes an inverse likely.
 MAX_MOUNT = 3.0 * 0.35
@@ -133,7 +133,7 @@ def pair(
 
 
 class _Seen(NamedTuple):
-    """What an attitude tells: rates (n, 3) from a to b (n,), and what turns vectors from its frame into the body."""
+    """Mean rates (n, 3) of an attitude from a to b (n,), and the rotations from its frame into the body."""
 
     a: Array
     b: Array
@@ -142,10 +142,10 @@ class _Seen(NamedTuple):
 
 
 def _refined(offset: float, seen: _Seen, gyro: _Gyro, others: Sequence[_Gyro]) -> float:
-    """The delay at which the gyro's rates explain the attitude's best, besides those of what carries both, if any.
+    """The delay at which the gyro's rates, less those of a carrier if any, fit the attitude's rates best.
 
-    An attitude on a carrier that turns as well is against the carrier: its rate is that of the gyro less the carrier's,
-    in the body. All is linear in how the sensors are turned against each other and in their biases.
+    An attitude relative to a moving carrier has the rate of the gyro less the carrier's, in the body. The fit is linear
+    in the relative rotations of the sensors and in their biases.
     """
 
     def inside(one: _Gyro) -> NDArray[np.bool_]:

@@ -33,17 +33,17 @@ GRAVITY_REMOVED = (
 _FEWEST = 50
 # Unsigned counts that are signed ones: taken as such they vary by less than so much of what they do as they are.
 _LESS = 0.5
-# Sigmas of a sample, in SI, beyond which a reading says nothing at all: of a gyro, of an accelerometer (gravity), of a
+# Largest plausible sigmas of a sample, SI: of a gyro, of an accelerometer (gravity), of a
 # magnetometer (twice the earth's field) and of an attitude (a radian).
 MOST_SIGMA = {"gyro": 0.5, "accel": 9.8, "mag": 1e-4, "attitude": 1.0}
 HELD = ": repeats the reading before, used once"
 _MAX_NUMBER = 1e100
-# Readings that repeat the one before in more than so much of the rows were held; so many have to tell.
+# A topic holds readings where more than this share of the rows repeats the row before; least number of rows tested.
 _HELD, _MIN_HELD = 0.4, 100
 
 
 def implausible(kind: str, values: Array) -> str:
-    """What is wrong with the unit of readings (N, 3), as a phrase; empty if nothing is, and of a gyro.
+    """Fault in the unit of readings (N, 3), as a phrase; empty without fault, and for a gyro.
 
     Args:
         kind: accel, gyro or mag.
@@ -112,7 +112,7 @@ def is_there(kind: str, values: Array, covariance: Array) -> bool:
 
 
 def plausible_covariance(topic: str, kind: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
-    """Covariances (N, 3, 3), zero in place of those that say nothing, which are counted in `dropped`.
+    """Covariances (N, 3, 3), zero in place of implausible ones, which are counted in `dropped`.
 
     Args:
         topic: for what is counted.
@@ -131,7 +131,7 @@ def plausible_covariance(topic: str, kind: str, covariance: Array, least: float,
     tiny = ~absent & (variance > 0.0) & (variance < least)
     huge = ~absent & ~(np.abs(diagonal) < MOST_SIGMA[kind] ** 2).all(axis=1)
     for mask, what in ((absent, "of -1"), (tiny, "too small for any sensor"), (huge, "too large for any sensor")):
-        count(dropped, f"{topic}: covariance {what}, not believed (kept)", alike * int(np.count_nonzero(mask)))
+        count(dropped, f"{topic}: covariance {what}, not used (reading kept)", alike * int(np.count_nonzero(mask)))
     unknown = absent | tiny | huge
     if not unknown.any():
         return covariance

@@ -59,7 +59,7 @@ SENSOR_STAMPED_TYPES = {
 }
 # Topics, and pairs of frames, that an error message names.
 MAX_NAMED = 30
-# Sigma of the delay with which messages are logged, s: assumed where log times stand in for stamps.
+# Sigma of the delay with which messages are logged, s: assumed where log times replace stamps.
 UNKNOWN_LOG_DELAY_S = 0.01
 # Quantities that may be counts of a sensor.
 _COUNTED: Mapping[type, tuple[str, ...]] = {
@@ -114,7 +114,7 @@ class Recording:
         path: of the file or folder, as it was named.
         container: the raw messages, and what of them is lost.
         recorded: topics in the file, by name, sorted.
-        stamp_sigma_s: sigma of the stamps read by now, s: 0, but where log times stand in for them.
+        stamp_sigma_s: sigma of the stamps read by now, s: 0 except where log times replace them.
     """
 
     def __init__(self, container: Container, epoch_ns: int | None = None) -> None:
@@ -561,14 +561,14 @@ class Recording:
         return self._stamp_facts
 
     def _note_unstamped(self, topic: str, t_ns: NDArray[np.int64], from_log: int) -> None:
-        """Note that log times stand in for stamps, and by how much they jitter."""
+        """Note that log times replace stamps, and by how much they jitter."""
         if not from_log:
             return
         jitter = jitter_ns(np.diff(t_ns))
         self.stamp_sigma_s = max(self.stamp_sigma_s, float(np.hypot(UNKNOWN_LOG_DELAY_S, jitter * 1e-9)))
         self.remark(
-            f"topic {topic}: {from_log} of {len(t_ns)} messages have no stamp; the log times stand in, which are "
-            f"late by a delay that nobody knows (taken for {1e3 * UNKNOWN_LOG_DELAY_S:.0f} ms, one sigma) and jitter "
+            f"topic {topic}: {from_log} of {len(t_ns)} messages have no stamp; the log times replace them, which are "
+            f"late by an unknown delay (assumed {1e3 * UNKNOWN_LOG_DELAY_S:.0f} ms, one sigma) and jitter "
             f"by {jitter * 1e-6:.2g} ms (sigma)"
         )
 

@@ -1,4 +1,4 @@
-"""What the arrays of a method's data hold in a row, told by the annotations of their class.
+"""Shapes of the arrays of a method's data, from the annotations of their class.
 
     gyro_t: Numbers
     gyro: Vectors

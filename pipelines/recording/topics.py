@@ -24,7 +24,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Setting:
-    """A key of the config that stands in for a topic: how to ask for it, and whether a config has it."""
+    """A key of the config that replaces a topic: how to ask for it, and whether a config has it."""
 
     phrase: str
     given: Callable[[Config], bool]

@@ -11,7 +11,7 @@ directions turn while the weak ones move by as much as their priors allow. A pri
 covariance C, E[NEES] = tr(P^-1 C) is the number of directions for every P made of diagonal blocks of C. It is the
 truncated solution of the self-calibration literature (Maye, Furgale, Siegwart, "Self-supervised calibration for robotic
 systems", IEEE Intelligent Vehicles Symposium 2013), with priors as the yardstick. Two things the rule needs beside it,
-by `python -m benchmarks.young` (mean NEES against its two-sided 99.9 % interval, 8 recordings):
+by `python -m benchmarks.initialisation` (mean NEES against its two-sided 99.9 % interval, 8 recordings):
 
 - Second order. A tumbled magnetometer at rest knows some directions a million times better than others, and these bend:
   without `curvature` the NEES of 10 numbers was 53,000, 990, 94 at the first three moments, that of the indexer's 17 at

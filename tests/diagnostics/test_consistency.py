@@ -213,7 +213,7 @@ def test_swapped_topics(head: Case) -> None:
 def test_a_platform_that_moves_without_a_topic(head: Case) -> None:
     find, data, config = head
     wrong = replace(data, platform_t=None, platform_gyro=None, platform_gyro_density=None)
-    assert first_of_calibration((find, wrong, config)).startswith("the platform moves, and no topic tells how")
+    assert first_of_calibration((find, wrong, config)).startswith("the platform moves, and no topic measures it")
 
 
 @pytest.mark.slow

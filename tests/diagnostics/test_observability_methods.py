@@ -56,7 +56,7 @@ def predicted(scenario: _Scenario) -> Prediction:
             LosScenario(**_LOS, priors={"delta_pz": 0.1, "delta_gz": 0.1}),
             "unobservable",
             {"delta_pz", "delta_gz"},
-            "can never be told apart",
+            "cannot be separated",
         ),
         (IndexerScenario(**_INDEXER, positions=_OUTER), "weak", {"theta_x"}, "turns about the inner axis"),
         (

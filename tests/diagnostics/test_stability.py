@@ -227,7 +227,7 @@ def test_a_mount_that_stays_is_calibrated() -> None:
 
 
 def test_a_slip_is_seen_while_it_is_recorded() -> None:
-    """With the estimate still young, and the same when the run has gone on from a Gaussian."""
+    """In the initialisation phase, and the same after the run has continued from a Gaussian."""
     run, alarms = watched(session(0, 0.8, IDEAL, vision_rate_hz=4.0))
     assert run.recorder.rows.array[-1, 0] > 55.0
     assert alarms

@@ -12,7 +12,7 @@ from alidade.pipelines.solvers import weak_directions
 from alidade.pipelines.solvers.batch import solve, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.posterior import Reported
-from benchmarks.young import CASES, LOS, beginning, drawn_los, followed, made, nees
+from benchmarks.initialisation import CASES, LOS, beginning, drawn_los, followed, made, nees
 from tests.support.builders import IDEAL
 
 

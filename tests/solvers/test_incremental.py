@@ -25,7 +25,7 @@ from alidade.pipelines.solvers.incremental import (
     solve_incremental,
 )
 from benchmarks.batch import IDEAL
-from benchmarks.young import CASES, LOS, beginning, drawn_los, followed, made, nees, report, run
+from benchmarks.initialisation import CASES, LOS, beginning, drawn_los, followed, made, nees, report, run
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35

@@ -103,7 +103,7 @@ def test_hours_of_indexing_cost_the_same_per_turn() -> None:
 
     def clocked(chunk: int) -> object:
         for step in graph.steps(chunk):
-            if chunk == 1:  # others are read when a young run is solved again
+            if chunk == 1:  # others are read when the initialisation phase is solved again
                 moments.append(time.process_time())
             yield step
 

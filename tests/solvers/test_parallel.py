@@ -16,7 +16,7 @@ from rich.console import Console
 
 from alidade.pipelines import parallel, progress
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.parallel import Crew, LostError
+from alidade.pipelines.parallel import LostError, WorkerPool
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere there is one process, as here without --jobs"
@@ -68,22 +68,22 @@ def three() -> Iterator[None]:
         yield
 
 
-def crew(count: int = 7) -> Crew[Counter]:
-    return Crew([Counter(i) for i in range(count)], most=10)
+def pool(count: int = 7) -> WorkerPool[Counter]:
+    return WorkerPool([Counter(i) for i in range(count)], most=10)
 
 
-def ask(of: Crew[Counter], *numbers: int) -> list[int]:
+def ask(of: WorkerPool[Counter], *numbers: int) -> list[int]:
     return of.ask(Counter.add, [(number,) for number in numbers], "adding")
 
 
-def processes(of: Crew[Counter]) -> list[int]:
+def processes(of: WorkerPool[Counter]) -> list[int]:
     return of.ask(Counter.process, [()] * 7, "asking")
 
 
 @pytest.mark.usefixtures("three")
 def test_things_are_kept_where_they_are() -> None:
     """In turns, by three processes that are not this one, and asked again they know what they were given."""
-    of = crew()
+    of = pool()
     assert ask(of, *range(7)) == [0, 2, 4, 6, 8, 10, 12]
     assert ask(of, *[1] * 7) == [1, 3, 5, 7, 9, 11, 13]
     where = processes(of)
@@ -94,13 +94,13 @@ def test_things_are_kept_where_they_are() -> None:
 @pytest.mark.parametrize(("jobs", "most"), [(1, 10), (5, 1), (5, 0)])
 def test_one_process_does_it_itself(jobs: int, most: int) -> None:
     with parallel.processes(jobs):
-        of = Crew([Counter(1), Counter(2)], most)
+        of = WorkerPool([Counter(1), Counter(2)], most)
     assert of.ask(Counter.process, [()] * 2, "asking") == [os.getpid()] * 2
 
 
 @pytest.mark.usefixtures("three")
 def test_what_one_raises_is_raised_and_the_others_go_on() -> None:
-    of = crew()
+    of = pool()
     with pytest.raises(ValueError, match="-1 of 3"):
         ask(of, 0, 0, 0, -1, 0, -2, 0)
     assert ask(of, *[0] * 7) == list(range(7))
@@ -108,7 +108,7 @@ def test_what_one_raises_is_raised_and_the_others_go_on() -> None:
 
 @pytest.mark.usefixtures("three")
 def test_processes_end_with_their_crew() -> None:
-    of, other = crew(), crew()
+    of, other = pool(), pool()
     here, there = set(processes(of)), set(processes(other))
     assert not here & there
     del of
@@ -119,7 +119,7 @@ def test_processes_end_with_their_crew() -> None:
 @pytest.mark.usefixtures("three")
 def test_a_process_that_is_ended_is_told() -> None:
     """And what others had answered by then is no answer to the next question."""
-    of = crew()
+    of = pool()
     with pytest.raises(InputError, match=r"ended from outside.*--jobs 1"):
         of.ask(Counter.end, [()] * 7, "ending")
     with pytest.raises(LostError):
@@ -129,7 +129,7 @@ def test_a_process_that_is_ended_is_told() -> None:
 @pytest.mark.usefixtures("three")
 @pytest.mark.parametrize(("question", "told"), [(Counter.fail, "two words"), (Counter.local, "pickle")])
 def test_what_cannot_be_sent_is_told(question: Callable[[Counter], object], told: str) -> None:
-    of = crew()
+    of = pool()
     with pytest.raises(RuntimeError, match=told):
         of.ask(question, [()] * 7, "asking")
     assert ask(of, *[0] * 7) == list(range(7))
@@ -141,7 +141,7 @@ def test_processes_have_streams_of_their_own(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(Console, "is_terminal", True)
     with progress.shown():
         assert type(sys.stderr).__name__ == "FileProxy"
-        assert set(crew().ask(Counter.speak, [()] * 7, "asking")) == {"TextIOWrapper"}
+        assert set(pool().ask(Counter.speak, [()] * 7, "asking")) == {"TextIOWrapper"}
 
 
 def test_a_process_lost_below_another_is_no_answer() -> None:
@@ -150,7 +150,7 @@ def test_a_process_lost_below_another_is_no_answer() -> None:
 
 
 def _lost() -> list[None]:
-    return Crew([Counter(0)] * 2, 2).ask(Counter.end, [()] * 2, "ending")
+    return WorkerPool([Counter(0)] * 2, 2).ask(Counter.end, [()] * 2, "ending")
 
 
 @pytest.mark.parametrize(("jobs", "share"), [(3, 1), (4, 2), (1, 1)])
@@ -189,12 +189,12 @@ def test_room_is_what_machine_and_container_leave(
 KILLED = """
 import os, signal
 from alidade.pipelines import parallel
-from tests.solvers.test_parallel import Counter, crew, processes
+from tests.solvers.test_parallel import Counter, pool, processes
 with parallel.processes(3):
-    first, second = crew(), crew()
+    first, second = pool(), pool()
     print(*processes(first), *processes(second), flush=True)
-    for hand in second._hands:
-        hand.send((Counter.sleep, [()] * 3))
+    for worker in second._workers:
+        worker.send((Counter.sleep, [()] * 3))
     os.kill(os.getpid(), signal.SIGKILL)
 """
 

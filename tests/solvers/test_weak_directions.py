@@ -28,7 +28,7 @@ from alidade.pipelines.solvers.weak_directions import (
     constrained_step,
     curvature,
 )
-from benchmarks.young import CASES, DRAWN, interval, made, nees
+from benchmarks.initialisation import CASES, DRAWN, interval, made, nees
 from tests.support.problems import problem
 
 

@@ -239,7 +239,7 @@ def _consistency(study: Study, solvers: Sequence[str]) -> Summary:
     needed = max(nees.needed for nees in judged.values())
     fewest = min(nees.runs for nees in judged.values())
     if not wrong and fewest < needed:
-        text = f"Too few runs to tell: {fewest}, {needed} are needed to see sigmas that are a fifth too small. {said}."
+        text = f"Too few runs for a test: {fewest}; sigmas a fifth too small show in {needed}. {said}."
         return Summary(question, "cannot say", "fixed", text, (), (f"Give `--runs {needed}` or more.",))
     if not wrong:
         steps = ("Rely on the sigmas of recordings like this one; another motion or sensor is another study.",)

@@ -126,7 +126,7 @@ def _tag_table(layout: Layout) -> Table:
         "are those of the worst axis. False: pictures in which the tag does not fit the others of the same picture by "
         "far, left out. Correlation: by how much the sigmas exceed those of corners that err independently and of tags "
         f"that are flat squares: in all pictures alike corners are off by {layout.bend:.2%} of the tag's size, one "
-        "sigma each way, whether the paper is bent or the print is askew."
+        "sigma each way, whether the paper is curved or the print is askew."
     )
     return Table("", caption, COLUMNS, rows, "tags", most_rows=None)
 

@@ -65,7 +65,7 @@ def regression(raw: Array, nominal: Array) -> TriadRegression:
     centre, spread = raw.mean(axis=0), raw.std(axis=0)
     design = np.hstack([(raw - centre) / spread, np.ones((len(raw), 1))])
     if np.linalg.cond(design) > 1e8:
-        raise InputError("the published regression cannot tell the axes apart: all static poses are alike")
+        raise InputError("the published regression cannot separate the axes: all static poses are alike")
     solution = np.linalg.lstsq(design, nominal, rcond=None)[0]
     residuals = nominal - design @ solution
     freedom = max(len(raw) - 4, 1)

@@ -14,7 +14,7 @@ from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
-from alidade.pipelines.display.figure import BEFORE, COLORS, FAINT, Figure, Plot, thin
+from alidade.pipelines.display.figure import BEFORE, COLORS, GRID, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, sphere_map, widest_gap
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.display.units import rounded
@@ -393,7 +393,7 @@ def _sphere(
     views = []
     for i, j in ((0, 1), (0, 2)):
         view = Figure("xyz"[j], "xyz"[i], 400, 0.5, square=True)
-        view.line(np.cos(angle), np.sin(angle), color=FAINT)
+        view.line(np.cos(angle), np.sin(angle), color=GRID)
         if name == "mag" and data.mag is not None:
             moving = calibrated(name, nominal(data.mag, config.section(CubeConfig).raw.mag), config, values) / strength
             some = moving[thin(3 * len(moving))]
@@ -404,7 +404,7 @@ def _sphere(
     misses = [100.0 * (np.linalg.norm(v, axis=1) - 1.0) for v in vectors]
     lengths = Figure("length, % off", height=240)
     _add_both(lengths, [time, time], misses)
-    lengths.levels(0.0, FAINT, "solid")
+    lengths.levels(0.0, GRID, "solid")
     rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
     return Plot(
         f"Sphere of the {NAMES[name]}",

@@ -189,7 +189,7 @@ def _seen_in(
         return None
     pose = estimate_pose(data.camera, body, tags, None, expected)
     if pose is None or pose.ambiguous:
-        count(dropped, "static pose with its tags' planar flip not told" if pose else "static pose not solved", 1)
+        count(dropped, "static pose with its tags' planar flip unresolved" if pose else "static pose not solved", 1)
         return None
     side = np.linalg.norm(tags.corners - np.roll(tags.corners, 1, axis=1), axis=2).mean()
     misfit = bool((pose.tag_rms_px > _MISFIT_SHARE * side).any())

@@ -106,7 +106,7 @@ FAULTS = FaultModel(
             partial(_reordered, order=(1, 2, 3, 0)),
         ),
         DataFault("the topics of helmet and platform IMU are swapped", _swapped),
-        DataFault("the platform moves, and no topic tells how: record /platform/imu", _moving, fallback=True),
+        DataFault("the platform moves, and no topic measures it: record /platform/imu", _moving, fallback=True),
     ),
 )
 

@@ -142,7 +142,7 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
 
 
 def _continuation(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
-    """The graph of the end of a growing recording; see Problem.onward."""
+    """The graph of the end of a growing recording; see Problem.continuation."""
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time < data.vision_t[0]):
         return None

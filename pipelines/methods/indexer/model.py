@@ -346,7 +346,7 @@ def agreeing(
         if abs(gain - 1.0) > allowed:
             raise InputError(
                 f"indexer: about the axis {name} the gyro turns at {100.0 * gain:.4g} % of the encoder's rate, more "
-                "than 1 % off; check units and gear, or say so of the gyro (sensors: {gyro: {scale: 0.05}})"
+                "than 1 % off; check units and gear, or state the gyro's scale error (sensors: {gyro: {scale: 0.05}})"
             )
     duration = np.array([g.duration for g in groups])
     noise = np.sqrt(density**2 / duration + 2.0 * (encoder / duration) ** 2)

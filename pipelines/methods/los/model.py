@@ -119,7 +119,7 @@ def _noises(data: LosData, config: Config) -> dict[str, Level]:
 
 
 def _continuation(config: Config, model: _Model, data: LosData, time: float) -> Problem | None:
-    """The graph of the end of a growing recording; see Problem.onward."""
+    """The graph of the end of a growing recording; see Problem.continuation."""
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time not in data.image_t):
         return None
@@ -362,7 +362,7 @@ def _advice(weights: Mapping[str, float]) -> Motion:
     if {each.name for each in AZIMUTH_ZEROS} <= strong:
         return Motion(
             "ask for delta_z = delta_pz - delta_gz instead",
-            why="delta_pz and delta_gz can never be told apart, turning the carrier's frame about the azimuth axis "
+            why="delta_pz and delta_gz cannot be separated, turning the carrier's frame about the azimuth axis "
             "changes both alike",
         )
     if TIME_OFFSET.name in strong:

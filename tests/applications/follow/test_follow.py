@@ -31,7 +31,7 @@ from alidade.pipelines.methods.los.simulation import LosScenario, los_config, si
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import ClockSheet
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
-from benchmarks.young import nees
+from benchmarks.initialisation import nees
 from tests.support.builders import IDEAL
 from tests.support.command import Command
 

@@ -1,4 +1,6 @@
-"""Consistency while little is known: python -m benchmarks.young METHOD [--only CASE ...] [--solver SOLVER] [--seeds N]
+"""Consistency in the initialisation phase: NEES of recordings that begin badly.
+
+    python -m benchmarks.initialisation METHOD [--only CASE ...] [--solver SOLVER] [--seeds N]
 
 Recordings that begin badly, with mounts and sensor errors drawn from their priors: at rest, about one axis, slowly,
 with mounts without a prior, without pictures, among outliers. At ten moments of each recording the joint error is
@@ -380,7 +382,7 @@ def interval(bounded: int, numbers: int, recordings: int) -> tuple[float, float]
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study of one method; what FILE already has is not run again."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.young", description=__doc__.split("\n\n")[1])
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.initialisation", description=__doc__.split("\n\n")[2])
     parser.add_argument("method", choices=CASES)
     parser.add_argument("--only", nargs="+", metavar="CASE", help="default: all")
     parser.add_argument("--solver", nargs="+", choices=SOLVERS, default=SOLVERS, help="default: both")
