@@ -86,7 +86,7 @@ def notebook_html(calibration: Calibration) -> str:
 
 
 def calibration_report(calibration: Calibration) -> Report:
-    """The report of a calibration: verdict, results, use; how to apply it; diagnostics; details folded."""
+    """The report of a calibration: verdict, results, use; how to apply it; diagnostics; collapsed details."""
     c, file = calibration, saved(calibration)
     start = datetime.datetime.fromtimestamp(c.facts.epoch_ns // 1_000_000_000, datetime.UTC)
     about = [
@@ -107,8 +107,8 @@ def calibration_report(calibration: Calibration) -> Report:
             Section("Results", _results(c, cards)),
             Section("Uncertainty in use", tuple(_use_card(found) for found in c.uses)),
             Section("Frames", _frames(c, file)),
-            Section("Apply", _application(c, file), narrow_folded=True),
-            Section("Diagnostics", _diagnostics(c), narrow_folded=True),
+            Section("Apply", _application(c, file), narrow_collapsed=True),
+            Section("Diagnostics", _diagnostics(c), narrow_collapsed=True),
             Section("Details", _details(c)),
         ),
     )
@@ -170,9 +170,7 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
     alone = [name for name, each in c.verdicts.items() if each == "prior"]
     if alone:
         more = f" + {len(alone) - 1}" if len(alone) > 1 else ""
-        found.append(
-            Badge(f"prior alone: {alone[0]}{more}", "warn", "within the requirement because the prior says so")
-        )
+        found.append(Badge(f"prior alone: {alone[0]}{more}", "warn", "within the requirement by the prior alone"))
     if c.fit is not None:
         fits = c.fit.low <= c.fit.value <= c.fit.high
         found.append(
@@ -197,7 +195,7 @@ def _tile(found: UseBands) -> Tile:
 
 
 def _results(c: Calibration, cards: Sequence[ResultCard]) -> tuple[Block, ...]:
-    """The cards; those of surroundings alone are folded unless something in them is not determined."""
+    """The result cards; cards of nuisance parameters alone are collapsed where all of them are determined."""
     known = "; ▾ simulated truth" if truth_errors(c) else ""
     beside = [card for card in cards if card is not cards[0] and _is_beside(c, card)]
     shown = tuple(result_table(card) for card in cards if card not in beside)
@@ -209,7 +207,7 @@ def _results(c: Calibration, cards: Sequence[ResultCard]) -> tuple[Block, ...]:
 
 
 def _is_beside(c: Calibration, card: ResultCard) -> bool:
-    """Whether a card has nuisance parameters of the surroundings only, all of them determined."""
+    """Whether a card has nuisance parameters only, all of them determined."""
     names = [name for _, row in card.rows for name in row.names]
     return all(c.quantities[name].assumed for name in names) and not any(
         row.verdict in ("weak", "unobservable") for _, row in card.rows
@@ -281,7 +279,7 @@ def _titled(title: str, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
 
 
 def _details(c: Calibration) -> tuple[Block, ...]:
-    """Everything else, folded."""
+    """Further details, collapsed."""
     said = Bullets(
         tuple(dict.fromkeys((c.headline, *(f"{note}." for note in c.notes), *sentences.next_steps(c.findings))))
     )
@@ -438,8 +436,8 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
         "SI units. calibration.yaml has the numbers, and rotations as quaternions; the same with these numbers in it:"
     )
     snippets = (Details(language, (Code(text, copied=True),), "screen") for language, text in code)
-    folded = Details("Formulas", (Bullets(formulas),))
-    return (Card((Code("\n".join(session), copied=True), folded, said, *snippets), id="application"),)
+    formulas_block = Details("Formulas", (Bullets(formulas),))
+    return (Card((Code("\n".join(session), copied=True), formulas_block, said, *snippets), id="application"),)
 
 
 def _call(c: Calibration) -> str:

@@ -86,7 +86,7 @@ class Svg:
 
 @dataclass(frozen=True)
 class Details:
-    """Blocks that a page folds under a line; `style` and `id` are those of style.css."""
+    """Blocks that a page collapses under a summary line; `style` and `id` are those of style.css."""
 
     summary: str
     blocks: tuple[Block, ...]
@@ -166,12 +166,12 @@ Block = (
 
 @dataclass(frozen=True)
 class Section:
-    """Blocks under a heading; `page_only`: not in a terminal; `narrow_folded`: folded on a phone."""
+    """Blocks under a heading; `page_only`: not in a terminal; `narrow_collapsed`: collapsed on a phone."""
 
     title: str
     blocks: tuple[Block, ...]
     page_only: bool = False
-    narrow_folded: bool = False
+    narrow_collapsed: bool = False
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ class ParameterResult(_Record):
 
     @model_serializer(mode="wrap")
     def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
-        """What is calibrated belongs to no group and has no pull; a prior about 0 has no mean."""
+        """Content without empty keys: without a group there is no z-score; a prior about 0 has no mean."""
         content: dict[str, object] = handler(self)
         left_out = {*(() if self.group else ("group", "pull")), *(() if self.prior_mean else ("prior_mean",))}
         return {k: v for k, v in content.items() if k not in left_out}
@@ -182,7 +182,7 @@ class SensitivityResult(_Record):
 
 
 class MeasurementResult(_Record):
-    """A measurement and the parameter that it shifts most, by `pull` sigmas."""
+    """An influential measurement and the parameter that it shifts most, in sigmas."""
 
     family: str  # of measurements
     time_s: float  # s from the start

@@ -30,9 +30,9 @@ def _triads(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
 
 
 def _in_si(saved: SavedCalibration) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
-    """K and b of sensors that are recorded in SI, and what has to be said of them.
+    """K and b of sensors that are recorded in SI, and notes about them.
 
-    A magnetometer in T that was held against a field of unknown strength keeps its scale on average: its K has the
+    A magnetometer in T, calibrated in a field of unknown strength, keeps its scale on average: its K has the
     determinant 1. Raises InputError when a sensor is recorded in counts.
     """
     triads, notes = _triads(saved), []
@@ -166,7 +166,7 @@ def _noise_lines(saved: SavedCalibration) -> list[str]:
     lines = [
         "# Noise with K and b applied. Densities are measured at rest, root mean squares of the axes. Walks are not",
         "# measured: stated is what the calibration took; an upper bound adds up over the recording to the error of",
-        "# the mean of one rest, and a larger one would have shown. Allan deviations over hours tell better.",
+        "# the mean of one rest, and a larger one would have shown. Allan deviations over hours are more accurate.",
     ]
     for name, word, unit in (("accel", "accelerometer", "m/s^2"), ("gyro", "gyroscope", "rad/s")):
         row = noise[name]

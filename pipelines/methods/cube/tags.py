@@ -184,7 +184,7 @@ def tag_places(config: Config) -> tuple[Parameter, ...]:
 
     def quantity(tag: int, axis: str) -> Quantity:
         name = f"tag_{tag}_p{axis}"
-        sigma = config.prior(name, _PRIOR if tag in _told(cube) else 0.0)
+        sigma = config.prior(name, _PRIOR if tag in _known_tags(cube) else 0.0)
         return Quantity(name, "m", sigma, _PRIOR, np.inf, nuisance=True)
 
     return tuple(Parameter(tag_place_key(tag), tuple(quantity(tag, a) for a in "xyz")) for tag in sorted(cube.tags))
@@ -198,12 +198,12 @@ def layout_prior(config: Config) -> GaussianPrior | None:
     elsewhere = {*config.priors, *(name for gaussian_prior in config.gaussian_priors for name in gaussian_prior.names)}
     of_camera = CAMERA_NUMBERS if cube.covariance.camera else ()
     names = (*(f"tag_{tag}_{number}" for tag in cube.covariance.tags for number in _NUMBERS), *of_camera)
-    told = {*(f"tag_{tag}_{number}" for tag in _told(cube) for number in _NUMBERS), *of_camera}
+    known = {*(f"tag_{tag}_{number}" for tag in _known_tags(cube) for number in _NUMBERS), *of_camera}
     whole = GaussianPrior(names, np.zeros(len(names)), cube.covariance.matrix, "the covariance of the tags' layout")
-    return whole.of(told - elsewhere)
+    return whole.of(known - elsewhere)
 
 
-def _told(cube: CubeConfig) -> list[int]:
+def _known_tags(cube: CubeConfig) -> list[int]:
     """Tags on the cube that the layout's covariance is of; the lowest id is exact."""
     tags = () if cube.covariance is None else cube.covariance.tags
     return [tag for tag in tags if tag in cube.tags and tag != min(cube.tags)]

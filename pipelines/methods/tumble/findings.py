@@ -24,9 +24,10 @@ def findings(data: TumbleData, config: Config, estimate: Estimate) -> Findings:
     """Rows of `triads`, `offsets`, `stretches` and `coverage` for the sensors that the estimate knows.
 
     triads: as of the cube, where K has no unit. offsets: b with its sigma, its length, what that is of the strength.
-    stretches: by how much a field along one direction of the body reads too strong against the mean, for the directions
-    that read most and least. coverage: part of all directions of the body that the vector came within 30 deg of, the
-    widest gap, rad, and where it is. Each with a sentence.
+    stretches: relative error of a field's length along one direction of the body against the mean, for the directions
+        of
+    the largest and the least reading. coverage: part of all directions of the body that the vector came within 30 deg
+    of, the widest gap, rad, and where it is. Each with a sentence.
     """
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
     sensors = [each for each in prepare(data, config).sensors if f"{each.name}_k11" in values]

@@ -1,10 +1,10 @@
 """The tumble method: a magnetometer, an accelerometer, or both, turned by hand through all attitudes, and nothing else.
 
 There is no camera and no reference. Without a gyro attitudes are unknown: what is known is that the field has one
-strength, the specific force at rest another, and that the angle between them stays. That tells of each sensor scale,
-non-orthogonality and offset, and of two how they are turned against each other. The body's axes are those in which the
+strength, the specific force at rest another, and that the angle between them is constant. That determines each sensor's
+scale, non-orthogonality and offset, and the relative rotation of two. The body's axes are those in which the
 K of the accelerometer, or of a magnetometer alone, is symmetric: as near to the sensor's own as any can be. A gyro
-chains the attitudes (`chained`): each sample of the field then tells three numbers instead of one.
+chains the attitudes (`chained`): each sample of the field then gives three residuals instead of one.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
 
 
 def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[Step]:
-    """A step for each stretch of time; the first brings the variables and their priors too."""
+    """A step for each interval of time; the first contains the variables and their priors too."""
     loss = TruncatedLoss(gate(1))
     times = [each.time for each in (*model.sensors, model.moments) if each is not None]
     start, stop = min(t[0] for t in times), max(t[-1] for t in times)
@@ -126,7 +126,7 @@ def _rows(time: Array, low: float, high: float) -> slice:
 
 
 def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]:
-    """What a sensor says in a stretch of time."""
+    """Strength factors of a sensor's readings in a slice of rows."""
     if rows.start == rows.stop:
         return []
     drivers = None if sensor.drivers is None else sensor.drivers[rows]
@@ -138,7 +138,7 @@ def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]
 
 
 def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: TruncatedLoss) -> list[Factor]:
-    """The angles between field and gravity in a stretch of time."""
+    """Factors of the angles between field and gravity in a slice of rows."""
     if rows.start == rows.stop:
         return []
     drivers = None if moments.drivers is None else moments.drivers[rows]

@@ -1,4 +1,4 @@
-"""What the person who turns a device is told of what has been collected."""
+"""Guidance for the person who rotates the device: coverage so far."""
 
 from __future__ import annotations
 

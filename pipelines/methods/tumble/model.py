@@ -29,7 +29,7 @@ from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
 from alidade.pipelines.settings import Config
 
-# Typical norms, SI, by which counts are told; of a sensor with its offset.
+# Plausible norms of readings with their offset, SI; others are counts.
 _PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
 # Standard gravity, and what it is off by where the latitude is unknown, m/s^2.
 _GRAVITY, _GRAVITY_SIGMA = 9.80665, 0.02
@@ -39,11 +39,11 @@ _FEWEST_RESTS = 9
 _RESOLUTION = 1e-9
 # Samples this many sigmas from the ellipsoid are left out of the first guess.
 _FAR, _ROUNDS = 5.0, 5
-# A rotation is told by pairs of vectors if the second-best answer fits this many times worse.
+# A rotation from pairs of vectors is unique where the second-best solution fits this many times worse.
 _CLEAR = 2.0
-# How well what the hand adds is known beforehand, in the logarithm.
+# Prior sigma of the noise by the hand's motion, in the logarithm.
 _HARDLY = 2.0
-# What the sine of the dip may be off before a sign is called wrong, and the least sine that tells.
+# Largest error of the sine of the dip before a sign counts as wrong, and the least sine for that test.
 _SINE = 0.35
 _AT_REST = "every sample counts as one at rest, and its motion as noise"
 _SWUNG = "all its samples are used, swung about a point (accel_arm); what the hand adds counts as noise"
@@ -61,7 +61,7 @@ _GRAVITY_DOWN = (
 )
 _NEGATIVE_DIP = (
     "The field rises: right south of the magnetic equator; north of it the accelerometer shows gravity down, and all "
-    "signs of K of the magnetometer rest on that. State latitude_deg and longitude_deg in the config to tell."
+    "signs of K of the magnetometer rest on that. State latitude_deg and longitude_deg in the config to decide."
 )
 
 
@@ -73,7 +73,7 @@ class Sensor:
         name: accel or mag.
         time, raw: (n,) s and (n, 3), as recorded, of the samples or means that are used.
         sigma, excess: (n,) of these over the radius; see StrengthFactor.
-        believed: what a sample scatters by over the radius, as stated or else as the first guess has it.
+        sample_scatter: sigma of a sample over the radius, as stated or else from the residuals of the first guess.
         symmetric: whether K is so by definition: the sensor defines the body's axes.
         is_si: whether it is recorded in SI; else in counts.
         radius: of the ellipsoid, in the unit recorded.
@@ -91,7 +91,7 @@ class Sensor:
     raw: Array
     sigma: Array
     excess: Array
-    believed: float
+    sample_scatter: float
     symmetric: bool
     is_si: bool
     radius: float
@@ -172,7 +172,7 @@ class Model:
         moments: what the sensors measured together, where no gyro ties them.
         guess: of the magnetometer in the axes of the gyro that chains the attitudes; None: these are eliminated.
         declination: of the field, rad east, where the place is known.
-        premises: what has to be told.
+        premises: sentences about assumptions that a user should know.
         dropped: what was left out.
     """
 
@@ -279,7 +279,7 @@ def _of_guess(mag: Sensor, guess: FieldGuess) -> Sensor:
         mag,
         radius=radius,
         sigma=scale * mag.sigma,
-        believed=scale * mag.believed,
+        sample_scatter=scale * mag.sample_scatter,
         symmetric=False,
         start=start,
         turned=guess.mount,
@@ -287,7 +287,7 @@ def _of_guess(mag: Sensor, guess: FieldGuess) -> Sensor:
 
 
 def _of_hand(accel: Sensor) -> Sensor:
-    """An accelerometer that is used while it moves: what the hand adds nobody states, and the residuals tell."""
+    """An accelerometer used in motion: the noise of the hand's motion is estimated from the residuals."""
     if accel.rested or accel.noise.known == 0.0:
         return accel
     return replace(accel, noise=replace(accel.noise, name="accel_motion", source="default", known=_HARDLY))
@@ -361,8 +361,8 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sen
     )
     causes = {ACCEL_SQUARE: found.nominal(raw) ** 2}
     if data.temperature is not None:
-        warmth = data.temperature.above(data.temperature.first, data.accel_t)
-        causes[ACCEL_SLOPE] = np.repeat(_means(data.accel_t, warmth[:, None], rests)[1], 3, axis=1)
+        temperature = data.temperature.above(data.temperature.first, data.accel_t)
+        causes[ACCEL_SLOPE] = np.repeat(_means(data.accel_t, temperature[:, None], rests)[1], 3, axis=1)
     driven = tuple(each for each in causes if parameter(0, (each,), config) is not None)
     if not driven:
         return found
@@ -414,14 +414,14 @@ def _sensor(
     if noise.stated > 0.0:
         noise = replace(noise, least=_RESOLUTION * radius * interval**0.5 / noise.stated)
     stated_sigma = noise.stated * interval**-0.5
-    believed = (stated_sigma if noise.source != "default" or noise.known == 0.0 else seen) / radius
+    sample_scatter = (stated_sigma if noise.source != "default" or noise.known == 0.0 else seen) / radius
     return Sensor(
         name=name,
         time=time,
         raw=raw,
         sigma=stated_sigma / radius / root_number,
-        excess=excess(raw / radius, believed / root_number, numbers),
-        believed=believed,
+        excess=excess(raw / radius, sample_scatter / root_number, numbers),
+        sample_scatter=sample_scatter,
         symmetric=True,
         is_si=is_si,
         radius=radius,
@@ -538,7 +538,8 @@ def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[ND
 
 
 def _mounting(up: Array, field: Array) -> tuple[Array, float, bool]:
-    """R (3, 3), proper, and s with up . R field = -s for unit vectors (n, 3), and whether they tell; else no rotation.
+    """R (3, 3), proper, and s with up . R field = -s for unit vectors (n, 3), and whether R is unique; else no
+    rotation.
 
     Linear in the nine entries of R and in s, with one solution up to a factor, whose sign is R's determinant.
     """

@@ -27,7 +27,7 @@ STRENGTHS = {"accel": "gravity", "mag": "field_strength"}
 _DIP = "field_dip"
 
 # Priors: of entries of K against a sensor on the body's axes; of b over the strength: an accelerometer in SI is near
-# zero, hard iron and offsets of counts are as large as they like. Of a dip that no model tells, rad.
+# zero, hard iron and offsets of counts have no limit. Of a dip without a model, rad.
 _GAIN, _BIAS, _OFFSET, _ANY_DIP = 0.5, 0.2, 10.0, 1.0
 # A strength that is known, over itself, where it is set free.
 _ANY_STRENGTH = 1e-2
@@ -102,7 +102,7 @@ def _gain_unit(sensor: Sensor) -> str:
 
 
 def _strength(sensor: Sensor, config: Config) -> Variable:
-    """What the sensor is held against: no motion tells it from the scale, whose sigma has it."""
+    """Strength of the measured vector: no motion separates it from the scale, whose sigma contains it."""
     name, usual = STRENGTHS[sensor.name], sensor.spread or _ANY_STRENGTH * sensor.strength
     quantity = Quantity(
         name,

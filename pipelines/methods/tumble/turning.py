@@ -182,7 +182,7 @@ def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
     homogeneous in K and b. b is eliminated; K is the smallest right singular vector of the rest, which is total least
     squares for white noise of the readings (integrated form of m' = -w x m: Rodriguez-Martinez and Troni, "Full
     magnetometer and gyroscope bias estimation using angular rates", IEEE J. Oceanic Eng. 2024). Motion about one axis
-    leaves K undetermined along it; there K is taken for a rotation of readings on the sphere nearest to them.
+    leaves K undetermined along it; there K is assumed a rotation of readings on the sphere nearest to them.
 
     Args:
         data: with a gyro.

@@ -1,7 +1,7 @@
-"""Means over readings between which the device hardly turned: one attitude each, and not as many as samples.
+"""Means over readings between which the device hardly rotated, one attitude each.
 
-Taken one by one, samples of a rest scatter about it as those of a device do that turns a little, and the ellipsoid's
-normal there follows the direction in which they happen to scatter least. What many samples tell so is their noise.
+Single samples of a rest scatter like those of a slightly rotating device, and the ellipsoid's normal there follows the
+direction of least scatter: an estimate from single samples fits their noise.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _TOPICS = {"accel": IMU, "mag": MAG}
 
 
 def unturned(sensor: Sensor) -> Sensor:
-    """The sensor with means for readings, how far these lie inside the ellipsoid in their excess.
+    """The sensor with means in place of readings, its `excess` corrected for their depth inside the ellipsoid.
 
-    Rests are means already; and where nobody states the noise, what samples scatter by may be motion.
+    Rests are means already. Without a stated noise the sensor stays as it is: the scatter may be motion.
     """
     if sensor.rested or sensor.noise.source == "default":
         return sensor
-    raw, believed = sensor.scaled, sensor.believed
-    first = _beginnings(raw, believed)
+    raw, sample_scatter = sensor.scaled, sensor.sample_scatter
+    first = _beginnings(raw, sample_scatter)
     number = np.diff(np.append(first, len(raw)))
 
     def mean(values: Array) -> Array:
@@ -46,14 +46,14 @@ def unturned(sensor: Sensor) -> Sensor:
     means = mean(raw)
     apart = raw - np.repeat(means, number, axis=0)
     scatter = mean(apart[:, :, None] * apart[:, None, :])
-    scatter -= (believed**2 * (1.0 - 1.0 / number))[:, None, None] * np.eye(3)
+    scatter -= (sample_scatter**2 * (1.0 - 1.0 / number))[:, None, None] * np.eye(3)
     numbers = sensor.start @ entries(sensor.symmetric).T
     return replace(
         sensor,
         time=mean(sensor.time),
         raw=sensor.radius * means,
         sigma=sensor.sigma[first] / np.sqrt(number),
-        excess=excess(means, believed / np.sqrt(number), numbers) - sagitta(means, scatter, numbers),
+        excess=excess(means, sample_scatter / np.sqrt(number), numbers) - sagitta(means, scatter, numbers),
         drivers=None if sensor.drivers is None else mean(sensor.drivers),
     )
 
