@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Motion:
-    """What to do with a device while it is being recorded.
+    """A motion of the device that would improve the recording.
 
     Attributes:
         words: a sentence, without its capital and its full stop.
@@ -21,5 +21,5 @@ class Motion:
 
     @property
     def advice(self) -> str:
-        """What to do, and what for."""
+        """Sentence: the motion, and what it improves."""
         return f"{self.why}: {self.words}" if self.why else self.words

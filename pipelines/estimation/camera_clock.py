@@ -41,7 +41,7 @@ class Clock:
     skew: float = 0.0
 
     def late(self, elapsed: Array) -> Array:
-        """How much later (n,), s, than their stamps pictures were taken, so long after the first, s."""
+        """Delay (n,) of exposures after their stamps, s, at times (n,) since the first, s."""
         return np.asarray(self.offset - self.skew * elapsed)
 
     def taken(self, elapsed: Array) -> Array:
@@ -55,7 +55,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Where a graph's keyframes stand: where pictures were taken by some clock, the first guess of theirs.
+    """Times of a graph's keyframes: exposures by the camera's clock, at its initial guess.
 
     Attributes:
         clock: that clock.
@@ -81,7 +81,7 @@ def first_span(skew_sigma: float) -> float:
 
 
 def turns_near(gyro: GyroPath, start: Array, stop: Array) -> Callable[[Array, Array], Increments]:
-    """What a gyro turned over windows whose ends (n,), s, are near these: looked up once, then carried on by its rates.
+    """Function that gives a gyro's rotations over windows whose ends (n,), s, are near the given ones.
 
     A stream longer than what is kept of it is integrated anew for every look.
     """

@@ -47,7 +47,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
 
 
 class Severity(IntEnum):
-    """In the contract's order of statuses; a NOTE leaves the status as it is."""
+    """Severity of a finding, in the contract's order of statuses; a NOTE leaves the status unchanged."""
 
     NOTE, WEAK, INCONSISTENT, UNOBSERVABLE = range(4)
 
@@ -75,6 +75,6 @@ def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def status(findings: Iterable[Finding]) -> Status:
-    """Of a result with these findings: that of the most severe one."""
+    """Status of a result: that of its most severe finding."""
     statuses: tuple[Status, ...] = ("calibrated", "weak", "inconsistent", "unobservable")
     return statuses[max((finding.severity for finding in findings), default=Severity.NOTE)]

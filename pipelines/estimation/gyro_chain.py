@@ -53,7 +53,7 @@ def as_slice(of: NDArray[np.intp]) -> NDArray[np.intp] | slice:
 
 @dataclass(frozen=True)
 class Trunk:
-    """What a chain over the end of a recording that grows goes on from.
+    """State of a chain at a keyframe, from which a chain over the end of a growing recording continues.
 
     Attributes:
         keyframe: number of its first keyframe in the recording.
@@ -159,7 +159,7 @@ class GyroChain:
         )
 
     def trunk(self, time: float) -> Trunk | None:
-        """What a chain over the end of the same recording goes on from at a keyframe; None if none is at the time."""
+        """State at a keyframe for a chain over the end of the recording; None where no keyframe has this time."""
         k = int(np.searchsorted(self.time, time))
         if k == len(self.time) or self.time[k] != time:
             return None
@@ -216,7 +216,7 @@ class GyroChain:
         return range(first, now + 1), range(max(first - 1, 1), now + 1 if last else now)
 
     def _increments(self, after: NDArray[np.intp]) -> list[Factor]:
-        """Those that lead to keyframes."""
+        """Factors that lead to keyframes."""
         states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
         bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
         carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
@@ -230,7 +230,7 @@ class GyroChain:
     def predict(
         self, keyframes: range, seen: Callable[[int, gtsam.Values], Array], current: gtsam.Values
     ) -> gtsam.Values:
-        """What `add` adds, from the current estimate: attitudes carried by the gyro, biases carried over.
+        """Initial values of the variables of `add`: attitudes propagated by the gyro, biases unchanged.
 
         Args:
             keyframes: the step's, not the first one.
@@ -262,7 +262,7 @@ class GyroChain:
         return corrected(self.platform_turns[rows], platform_bias - self.platform.bias_hat, scale)[0], turned
 
     def _errors(self, values: gtsam.Values, n: int) -> tuple[Array | None, Array | None]:
-        """Of the gyro and of the platform's, n equal rows; None for perfect ones."""
+        """Errors of the gyro and of the platform's, n equal rows; None for perfect ones."""
         own, platform = (
             None if p is None else np.broadcast_to(values.atVector(p.key), (n, len(p.quantities)))
             for p in (self.errors, self.platform_errors)

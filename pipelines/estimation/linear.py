@@ -32,7 +32,7 @@ class LinearModel(Model):
 
     @property
     def coefficients(self) -> tuple[Array, ...]:
-        """(n, m, d) of each vector."""
+        """Coefficients (n, m, d) of each vector."""
         return tuple(each for each in (self.first, self.second, self.third) if each is not None)
 
     @property

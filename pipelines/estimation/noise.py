@@ -63,7 +63,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Level:
-    """How large a noise is, over what was stated.
+    """Estimated size of a noise, relative to the stated one.
 
     Attributes:
         noise: as it was stated.
@@ -95,5 +95,5 @@ class Level:
 
     @property
     def used(self) -> float:
-        """In the noise's unit."""
+        """The noise as used, in its unit."""
         return self.scale * self.noise.stated

@@ -184,7 +184,7 @@ def encoder_errors(joints: Sequence[str], once_per_turn: float, delay: float) ->
 
 
 def kind(name: str) -> str:
-    """What a parameter is about: its name without axes, and without sine and cosine."""
+    """Kind of a parameter: its name without axes, sine and cosine."""
     return _NUMBERS.sub("", name)
 
 
@@ -227,7 +227,7 @@ def gyro_errors(
 
 
 def acting(errors: Parameter | None, drivers: Mapping[ParameterSpec, Array | None]) -> Array | None:
-    """Those of a gyro's drivers that its errors act on, side by side, (N, d): of (N, 3) and (N,); None: none."""
+    """Drivers (N, d) of a gyro that its errors depend on, as columns; None without any."""
     names = {q.name for q in errors.quantities} if errors else set()
     found = [driver for each, driver in drivers.items() if driver is not None and each.names[0] in names]
     alone = len(found) == 1 and found[0].ndim == 2

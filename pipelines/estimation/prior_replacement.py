@@ -47,7 +47,7 @@ def with_priors(problem: Problem, gaussian_priors: Sequence[GaussianPrior]) -> P
 
 
 def about(factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values) -> NDArray[np.bool_]:
-    """(m, n) which rows of a linearised prior are about which of the parameters' reported numbers."""
+    """Mask (m, n): row of a linearised prior is about a reported number of the parameters."""
     A, _ = factor.jacobian()
     inverses = {p.key: np.linalg.pinv(p.coordinates(values, p.key)[1]) for p in parameters if p.key in factor.keys()}
     columns, start = {}, 0
@@ -67,7 +67,7 @@ def about(factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values:
 def about_alone(
     factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values, names: Collection[str]
 ) -> NDArray[np.bool_]:
-    """(m,) which rows of a linearised prior are about some of these numbers and no others, but for fixed ones."""
+    """Mask (m,) of rows of a linearised prior about the named numbers and no others, except fixed ones."""
     quantities = [q for p in parameters for q in p.quantities]
     among = np.array([q.name in names for q in quantities])
     others = np.array([q.name not in names and q.prior_sigma != 0.0 for q in quantities])
@@ -206,7 +206,7 @@ class _PriorFactors:
         return replace(step, factors=factors, initial=initial)
 
     def _rest(self, prior: Factor, values: gtsam.Values) -> list[Factor]:
-        """What of a prior is not replaced."""
+        """Factors of the part of a prior that is not replaced."""
         kept = ~about_alone(prior.factor.linearize(values), self.parameters, values, self.replaced)
         if kept.all():
             return [prior]
@@ -273,7 +273,7 @@ def _value(values: gtsam.Values, key: int) -> gtsam.Rot3 | Array:
 
 
 def conditional_root(covariance: Array, sigmas: Array) -> Array:
-    """(n, n) lower triangular R, R'R the information of numbers: row i is number i given those before it.
+    """Lower triangular R (n, n) with R'R the information: row i is number i given those before it.
 
     Args:
         covariance: (n, n) of the numbers; fixed ones have rows of zeros.
@@ -289,7 +289,7 @@ def conditional_root(covariance: Array, sigmas: Array) -> Array:
 
 
 def _rows_of(factor: gtsam.NonlinearFactor, rows: NDArray[np.intp], at: gtsam.Values) -> gtsam.CustomFactor:
-    """Some rows of a factor; its variables are among the values."""
+    """A factor with selected rows of another; its variables are among the values."""
     keys, dims = factor.keys(), at.dims()
     ends = np.cumsum([dims[key] for key in keys])[:-1]
 

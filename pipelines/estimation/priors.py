@@ -21,7 +21,7 @@ _FREE = 10.0
 
 @dataclass(frozen=True)
 class RotationPrior(Model):
-    """What is known of rotations beforehand: R Log(mean^-1 x) is white noise. Block: a rotation.
+    """Prior of rotations: R Log(mean^-1 x) is white noise. Block: a rotation.
 
     Attributes:
         time: (n,) s.
@@ -46,7 +46,7 @@ class RotationPrior(Model):
 
 
 def prior_sigmas(parameter: Parameter) -> Array:
-    """(n,) sigmas of the prior factor."""
+    """Sigmas (n,) of the prior factor."""
     return np.array(
         [_FREE * q.prior_scale if q.prior_sigma is None else q.prior_sigma or pinned(q) for q in parameter.quantities]
     )

@@ -1,4 +1,4 @@
-"""What a method hands to a solver, and what a solver hands back.
+"""Interface between a method and a solver: problem, steps, estimate.
 
 A method writes its graph once, as a `Problem` that yields `Step`s in time order. The batch solver collects all steps
 and solves once; the incremental solver feeds them one by one to a smoother. Both, and the published solver of the
@@ -150,7 +150,7 @@ class Parameter:
         return self.coordinates is rotation_vector_coordinates or isinstance(self.coordinates, NearRotationVector)
 
     def near(self, numbers: Mapping[str, float]) -> Parameter:
-        """The same; a rotation all of whose numbers are given is reported by the vector nearest to these."""
+        """The parameter with complete rotations reported by the rotation vector nearest to these numbers."""
         names = [q.name for q in self.quantities]
         if not self.is_rotation or any(name not in numbers for name in names):
             return self
@@ -184,12 +184,12 @@ class Factor:
 
     @classmethod
     def process_of(cls, family: str, process: BoundModel, beside: Array | None = None) -> Factor:
-        """What joins variables and is no outlier."""
+        """A factor that joins variables and is never an outlier."""
         return cls(family, process=process, beside=beside)
 
     @property
     def factor(self) -> gtsam.NonlinearFactor:
-        """For a gtsam graph; of a vectorised factor a new one at every call."""
+        """The gtsam factor; of a vectorised factor a new one at every call."""
         if self.native is not None:
             return self.native
         bound = self.bound
@@ -219,7 +219,7 @@ def _no_values() -> gtsam.Values:
 
 @dataclass(frozen=True)
 class Step:
-    """What one moment adds to the graph. A method builds it by adding to its collections, and then leaves it alone.
+    """Addition to the graph at one moment. A method builds it by adding to its collections, then leaves it alone.
 
     Attributes:
         time: s from the session's start.
@@ -244,7 +244,7 @@ class Step:
 
 @dataclass(frozen=True)
 class ChainLayout:
-    """Which variables of a problem are a chain, by the letters of their symbols; all others are shared by all rows.
+    """Variables of a problem that form a chain, by the letters of their symbols; all others are shared.
 
     Every measurement depends on the states of one keyframe or of two successive ones, on the bias node in force there
     and on shared variables. A factor of few rows may join the states of many keyframes.
@@ -325,7 +325,7 @@ class Problem:
     gaussian_priors: tuple[GaussianPrior, ...] = ()
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
-        """The same problem; rotations are reported by the rotation vectors nearest to these numbers (rad, by name)."""
+        """The problem with rotations reported by the rotation vectors nearest to these numbers (rad, by name)."""
         continuation, finer = self.continuation, self.finer
 
         def grown(data: Any, time: float) -> Problem | None:
@@ -345,7 +345,7 @@ class Problem:
         )
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
-        """What formulas need, by name: an estimate's values and the constants."""
+        """Inputs of formulas by name: an estimate's values and the constants."""
         return {**self.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
 
     def graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -365,7 +365,7 @@ class Problem:
         return tuple(q for p in self.parameters for q in p.quantities)
 
     def prior_covariance(self, names: Sequence[str], sigmas: Array) -> Array:
-        """(m, m) prior covariance of some numbers: their sigmas (m,) with the correlations of `gaussian_priors`."""
+        """Prior covariance (m, m) of some numbers: their sigmas (m,) with the correlations of `gaussian_priors`."""
         covariance = np.diag(np.square(sigmas))
         for gaussian_prior in self.gaussian_priors:
             known = gaussian_prior.of(names)
@@ -413,13 +413,13 @@ class History:
     sigmas: Array
 
     def inflated(self, by: Array) -> History:
-        """With sigmas larger by factors (n,)."""
+        """The history with sigmas multiplied by factors (n,)."""
         return replace(self, sigmas=self.sigmas * by)
 
 
 @dataclass(frozen=True)
 class Course:
-    """What was known jointly at some moments, each of them with all that came before, weighed alike at all moments.
+    """Joint posterior at moments, given all before each, with the same noise levels at all.
 
     Attributes:
         time: (k,), s.
@@ -435,13 +435,13 @@ class Course:
 
     @property
     def history(self) -> History:
-        """With sigmas alone."""
+        """The history with sigmas in place of covariances."""
         return History(self.time, self.values, np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
 
 
 @dataclass(frozen=True)
 class InfluentialMeasurement:
-    """What a measurement does to the parameter that it moves most.
+    """Influence of a measurement on the parameter that it shifts most.
 
     Attributes:
         family: of the measurement.
@@ -482,7 +482,7 @@ class SqrtInformation:
     scales: Array
 
     def with_priors_of(self, other: SqrtInformation) -> SqrtInformation:
-        """This information with the device's priors as another linearisation of the same graph has them."""
+        """This information with the device's priors linearised as in another one of the same graph."""
         return replace(self, prior_R=other.prior_R, prior_d=other.prior_d + other.prior_R @ (other.at - self.at))
 
 
@@ -605,7 +605,7 @@ class Estimate:
 
     @property
     def sigmas(self) -> Array:
-        """(n,) standard deviations."""
+        """Standard deviations (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -615,5 +615,5 @@ class Estimate:
 
     @property
     def inflations(self) -> Array:
-        """(n,) `inflation`, ones where it is None."""
+        """Inflation (n,), ones where `inflation` is None."""
         return np.ones(len(self.values)) if self.inflation is None else self.inflation

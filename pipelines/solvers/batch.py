@@ -101,12 +101,12 @@ class Solved:
 
     @property
     def engine(self) -> Engine:
-        """With the loss and the weights in force."""
+        """The engine of the graph, with the loss and the weights of the solution."""
         return self.solution.engine
 
     @property
     def values(self) -> Values:
-        """Of all variables, weak directions at their priors."""
+        """Values of all variables, weak directions at their priors."""
         return self.posterior.values
 
 
@@ -209,7 +209,7 @@ def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[
 
 
 def _numbers(compiled: Compiled, values: Values) -> Array:
-    """(n,) reported numbers at some values."""
+    """Reported numbers (n,) at given values."""
     return Reported.of(compiled.problem, compiled.layout, values, compiled.current_keys).numbers
 
 
@@ -323,7 +323,7 @@ def _node_key(layout: Layout, first: int, node: int) -> int:
 
 
 def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, float]:
-    """By how much the numbers are elsewhere in a graph that is a little different, empty where its variables differ.
+    """Changes of the reported numbers in a slightly changed graph; empty where its variables differ.
 
     Noise levels, and which measurements are rejected, are those of the solution.
     """
@@ -344,7 +344,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
 def _told(
     solved: Solved, device: Collection[str], elsewhere: Callable[[SqrtInformation], Mapping[str, float]] | None
 ) -> SqrtInformation:
-    """What a graph says, linear about its solution or where the reported numbers are to be."""
+    """Square-root information of a graph about its numbers, linearised at its solution or at `elsewhere`."""
     compiled, engine, values = solved.compiled, solved.engine, solved.values
     own = sqrt_information(compiled.problem, engine, values, compiled.current_keys, device)
     wanted = {} if elsewhere is None else elsewhere(own)

@@ -113,7 +113,7 @@ class ChainSystem:
         return replace(self, measured=measured, shared=prior, walk=walk)
 
     def segments(self) -> Index:
-        """(B,) last states of segments, none of which spans two pieces."""
+        """Last states of the segments, (B,); no segment spans two pieces."""
         n = len(self.measured)
         index, length = np.arange(n), max(2, int(n / max((2.0 * n) ** 0.5, SEQUENTIAL_STATES / 2.0)))
         if self.piece is None:
@@ -122,7 +122,7 @@ class ChainSystem:
         return np.flatnonzero((last[np.searchsorted(last, index)] - index) % length == 0)
 
     def with_nodes_as_states(self) -> ChainSystem:
-        """The same where every piece is one state: states (x_j, z_j) and no nodes."""
+        """The system with every piece as one state: states (x_j, z_j) and no nodes."""
         assert self.walk is not None
         d, c, (n, b, _), beside = self.d, self.c, self.between.shape, _triangle(self.beside)
         x, z, rest = np.arange(d), np.arange(d, d + c), np.arange(2 * (d + c), 2 * (d + c) + self.border - c)
@@ -186,7 +186,7 @@ class _Level:
         return x[:-1]
 
     def covariances(self, ends: Array) -> Array:
-        """Those (N, 2 d + c, .) of (state, state before, node), from those (B, 2 d + c, .) of the segments' last."""
+        """Covariances (N, 2 d + c, .) of (state, state before, node), from those (B, 2 d + c, .) of segment ends."""
         d, c = self.rows.shape[1], ends.shape[1] - 2 * self.rows.shape[1]
         swap, out = np.r_[d : 2 * d, :d, 2 * d : 2 * d + c], np.zeros((len(self.rows), *ends.shape[1:]))
         before, node = slice(d), slice(2 * d, None)
@@ -285,7 +285,7 @@ class ChainFactorization:
         return np.asarray(np.linalg.inv(self.root[:-1, :-1])[:, self.c :])
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
-        """(M,) keyframes, and R of (their node, shared, right side) by all until then; few rows at first."""
+        """Keyframes (M,), and R of (node, shared, right side) given all until each; few rows at first."""
         ends, roots, known = self._ends, list[Array](), np.zeros((0, 1))
         for k, (head, pile) in enumerate(zip(ends.heads, ends.piles, strict=True)):
             known = _root([known, pile] if k and ends.piece[k] == ends.piece[k - 1] else [pile], pile.shape[1])
@@ -372,7 +372,7 @@ class _TimeOrder:
         return x, nodes
 
     def covariances(self, last: Array, tail: int) -> tuple[Array, Array]:
-        """Those (M, 2 d + c, .) of (state, state before, node), (J, 2 c, .) of (node, node before).
+        """Covariances (M, 2 d + c, .) of (state, state before, node) and (J, 2 c, .) of (node, node before).
 
         `last` (tail, tail) is the last node's, all where the shared unknowns are known.
         """
@@ -405,13 +405,13 @@ def _before(R: Array, following: Array, same: Array) -> tuple[Array, Array]:
 
 
 def _inverse_gram(R: Array) -> Array:
-    """(R'R)^-1 of triangles (..., d, d)."""
+    """Inverse Gram matrices (R'R)^-1 of triangles (..., d, d)."""
     inverse = np.linalg.inv(R)
     return np.asarray(inverse @ np.swapaxes(inverse, -1, -2))
 
 
 def _block(matrices: Array, some: Index) -> Array:
-    """Some rows, and the same columns, of matrices (..., n, n)."""
+    """Principal submatrices of matrices (..., n, n): selected rows and the same columns."""
     return matrices[..., some[:, None], some]
 
 

@@ -1,4 +1,4 @@
-"""What an incremental run continues from: a marginal Gaussian, in memory and in a file.
+"""Checkpoint of an incremental run: the marginal Gaussian that it continues from, in memory and in a file.
 
 A run is saved where everything but the active variables was just marginalised out of its smoother: the Gaussian, in
 gtsam's own text, which keeps every digit, with the rows and noise levels that the run has gathered. Later steps come

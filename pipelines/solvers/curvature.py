@@ -1,4 +1,4 @@
-"""How far the posterior of a batch solution goes beyond its linear system, for a smoother that continues from that.
+"""Second-order correction of a batch posterior, for a smoother that continues from it.
 
 The smoother knows the linear system alone. What `weak_directions` adds to it, the covariance of second order and the
 directions that are weak because of it, is added to the smoother's covariance until the next batch solution.
@@ -33,7 +33,7 @@ APART = 0.5
 
 @dataclass(frozen=True, eq=False)
 class SecondOrder:
-    """What a posterior has beside that of its linear system.
+    """Second-order terms of a posterior beside its linear system.
 
     Attributes:
         covariance: (m, m) of the free reported numbers, in units of their usual priors' sigmas; no larger.
@@ -63,13 +63,13 @@ class SecondOrder:
 
 
 def _covariance(directions: WeakDirections) -> Array:
-    """(m, m) of the strong directions."""
+    """Covariance (m, m) of the strong directions."""
     root = directions.strong * directions.sigmas
     return np.asarray(root @ root.T)
 
 
 def beyond_second_order(solved: Solved) -> NDArray[np.bool_]:
-    """(n,) which reported numbers have a part in what is of higher order than the second; see the module.
+    """Which reported numbers (n,) are part of terms of higher than second order; see the module.
 
     Those of one variable go together, and all where slopes at half the way cannot be found.
     """
@@ -88,7 +88,7 @@ def beyond_second_order(solved: Solved) -> NDArray[np.bool_]:
 
 
 def _third(known: Array, missed: Array) -> float:
-    """What slopes at half the way miss, in sigmas of the combination of numbers that misses most.
+    """Third-order error of the slopes half the way, in sigmas of the worst combination of numbers.
 
     Args:
         known, missed: (k, .) square roots of covariances of some numbers.

@@ -58,7 +58,7 @@ class Compiled:
 
     @property
     def layout(self) -> Layout:
-        """Of the variables."""
+        """Layout of the variables."""
         return self.engine.layout
 
 

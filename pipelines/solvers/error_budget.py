@@ -95,7 +95,7 @@ class Influence:
         return self.engine.products(group, self.values, self.step)
 
     def moves(self, changed: Engine) -> Array:
-        """(m,) how far the numbers move, to first order, where other factors of the same layout are in force."""
+        """Changes (m,) of the numbers, to first order, under other factors of the same layout."""
         moved = np.zeros(len(self.names))
         for sign, engine in ((1.0, changed), (-1.0, self.engine)):
             for group in engine.groups:
@@ -250,7 +250,7 @@ def _lagged(L: Array, lags: int) -> Array:
 
 
 def inflation(names: Sequence[str], covariance: Array, free: Sequence[str], added: Mapping[str, Array]) -> Array:
-    """(n,) ratio of inflated to nominal sigma; 1 for fixed numbers.
+    """Ratio of inflated to nominal sigma, (n,); 1 for fixed numbers.
 
     Args:
         names: (n,) of all reported numbers.
@@ -265,5 +265,5 @@ def inflation(names: Sequence[str], covariance: Array, free: Sequence[str], adde
 
 
 def sigma_ratio(variance: Array, grown: Array) -> Array:
-    """(n,) ratio of the sigmas of grown variances to those of variances; 1 for fixed numbers."""
+    """Ratio of the sigmas of grown variances to those of variances, (n,); 1 for fixed numbers."""
     return np.sqrt(np.divide(grown, variance, out=np.ones_like(variance), where=variance > 0.0))

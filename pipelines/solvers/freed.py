@@ -1,4 +1,4 @@
-"""What a graph says of numbers that were fixed when a recording was solved: nothing is solved again but the states."""
+"""Information about numbers that were fixed in the solution: only the states are solved again."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | N
 
 
 def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]]:
-    """(n,) of each group which of its measurements the solution uses; all where it has others of the family."""
+    """Inlier mask (n,) of each group in the solution; all where it has other measurements of the family."""
     used = [np.ones(len(group.model.time), dtype=bool) for group in groups]
     for family, known in estimate.residuals.items():
         own = [i for i, group in enumerate(groups) if group.family == family and group.is_measurement]

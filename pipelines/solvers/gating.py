@@ -51,7 +51,7 @@ class RowBuffer:
 
     @property
     def array(self) -> Array:
-        """(n, width), a view that the next row may make stale."""
+        """The rows (n, width), a view that the next row may make stale."""
         return self._array[: self._count]
 
     def add(self, rows: Array) -> None:
@@ -209,7 +209,7 @@ class InnovationGate:
         return Factor.of(factor.family, measurement.only(used))
 
     def _within_gate(self, error: Array, S: Array, gated: bool) -> NDArray[np.bool_]:
-        """(p,) which innovations (p, m) of covariances (p, m, m) are used."""
+        """Inlier mask (p,) of innovations (p, m) with covariances (p, m, m)."""
         squares = (error * np.linalg.solve(S, error[:, :, None])[:, :, 0]).sum(axis=1)
         used = squares < gate(error.shape[1]) ** 2 if gated else np.ones(len(error), dtype=bool)
         self.rejected_in_a_row = 0 if used.any() else self.rejected_in_a_row + 1

@@ -1,4 +1,4 @@
-"""The same problem eliminated by gtsam: for graphs that are no chain, and as the reference of the chain.
+"""Elimination by gtsam: for graphs that are no chain, and as the reference of the chain solver.
 
 Models are evaluated as for the chain; every measurement becomes a gtsam.JacobianFactor about its own variables. All but
 the last bias node and the shared unknowns are eliminated by QR in an order of gtsam's choice (COLAMD), and what is left
@@ -38,12 +38,12 @@ class GtsamEngine:
 
     @classmethod
     def of(cls, factors: Sequence[Factor], layout: Layout) -> GtsamEngine:
-        """Of the factors of a graph."""
+        """Engine of a graph's factors."""
         return cls(Linearization.of(factors, layout, chain=False))
 
     @property
     def layout(self) -> Layout:
-        """Of the variables."""
+        """Layout of the variables."""
         return self.linearization.layout
 
     @property
@@ -58,7 +58,7 @@ class GtsamEngine:
 
     @property
     def time(self) -> Array:
-        """(N,) s of the keyframes."""
+        """Times of the keyframes (N,), s."""
         return self.linearization.time
 
     def at(self, values: Values) -> tuple[GtsamSystem, float]:
@@ -182,7 +182,7 @@ class GtsamSystem:
 
 
 def undetermined(error: RuntimeError) -> IndeterminateStateError:
-    """What gtsam's text about an indeterminate system says, with the name of the state that it was working near."""
+    """Error for gtsam's text about an indeterminate system, with the name of the state nearby."""
     found = re.search(r"Symbol: (\w+)", str(error))
     return IndeterminateStateError(UNDETERMINED.replace("a state", f"state {found[1]}") if found else UNDETERMINED)
 
@@ -260,7 +260,7 @@ class GtsamFactorization:
         return *self._back(last, 0.0, generator.standard_normal), last[self.c :]
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
-        """None: the elimination is not in time order."""
+        """Always None: the elimination is not in time order."""
         return np.zeros(0, dtype=np.intp), []
 
     @property

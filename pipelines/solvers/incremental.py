@@ -190,7 +190,7 @@ class _Posterior:
     covariance: Array
 
     def weak(self, unknown: NDArray[np.bool_] | bool = False) -> Array:
-        """(m, w) orthonormal weak directions: of calibrated numbers but some unknown, with sigmas above MAX_SIGMA.
+        """Orthonormal weak directions (m, w): of calibrated numbers but some unknown, with sigmas above MAX_SIGMA.
 
         Nuisance parameters are small whatever they are: nothing is nonlinear across their priors.
         """
@@ -667,7 +667,7 @@ def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[
 
 
 def _course_of(solved: Solved) -> Course | None:
-    """What was known at moments before a batch solution."""
+    """Posterior at moments before a batch solution."""
     compiled, posterior = solved.compiled, solved.posterior
     engine, system, found = solved.engine, posterior.system, posterior.factorization
     if not (isinstance(engine, Linearization) and isinstance(system, ChainSystem)):

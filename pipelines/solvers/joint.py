@@ -104,7 +104,7 @@ class Joined:
         return self._gaussian_prior(recording, self.values, self.covariance)
 
     def others(self, recording: int) -> GaussianPrior:
-        """The same without that recording: what all others and the priors say."""
+        """Prior of one recording: information of all other recordings and the device's priors."""
         rows = [each for i, each in enumerate(self.rows) if i != recording]
         return self._gaussian_prior(recording, *_solved(rows, self.scales))
 
@@ -159,7 +159,7 @@ class Joined:
         return (*part.names, *missing, *part.own), gain, np.asarray(inverse)
 
     def _priors(self, A: Array) -> list[str]:
-        """What each of some priors' rows is about."""
+        """Names of the numbers that each row of the priors is about."""
         size = np.abs(A * self.scales)
         about = [np.flatnonzero(row > _ROUNDING * row.max(initial=0.0)) for row in size]
         return [f"prior of {self.unknowns[k[0]][0]}" if len(k) == 1 else "prior" for k in about]
@@ -195,14 +195,14 @@ class Joined:
         )
 
     def _places(self, recording: int) -> list[int]:
-        """Where the numbers of the device are, as they are in a recording."""
+        """Positions of the device's numbers among a recording's."""
         places = {unknown: i for i, unknown in enumerate(self.unknowns)}
         names = self.parts[recording].names
         return [places[name, None] if (name, None) in places else places[name, recording] for name in names]
 
 
 def grown(sigmas: Sequence[float], inflations: Sequence[float]) -> float:
-    """By what a number's sigma grows: the recordings' own factors, each weighed by what it says of the number."""
+    """Inflation of a joint sigma: the recordings' own factors, weighted by their information about the number."""
     found = [(sigma, inflation) for sigma, inflation in zip(sigmas, inflations, strict=True) if sigma > 0.0]
     if not found:
         return 1.0
@@ -211,7 +211,7 @@ def grown(sigmas: Sequence[float], inflations: Sequence[float]) -> float:
 
 
 def information_at_levels(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> SqrtInformation:
-    """What a problem says of its numbers, linear about its solution with noise levels that are known.
+    """Square-root information of a problem about its numbers, linear about its solution, at given noise levels.
 
     Raises:
         IndeterminateError: a state is not determined.

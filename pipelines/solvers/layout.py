@@ -1,4 +1,4 @@
-"""Where the variables of a problem stand: in arrays of values, and among the unknowns of a chain.
+"""Positions of a problem's variables: in arrays of values, and among the unknowns of a chain.
 
     layout, values = Layout.of(problem.layout, initial)      # from a problem's ChainLayout and gtsam values
     moved = layout.retract(values, Tangent(*factorization.solve()))
@@ -50,13 +50,13 @@ class Tangent:
     shared: Array
 
     def times(self, length: float) -> Tangent:
-        """The same, so many times as long."""
+        """The tangent repeated `length` times."""
         return Tangent(length * self.states, length * self.nodes, length * self.shared)
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where the variables of a problem stand.
+    """Positions of a problem's variables in arrays of values and among the unknowns of a chain.
 
     Attributes:
         key: (V,) the variables, increasing.
@@ -196,7 +196,7 @@ class Layout:
         return Values(arrays)
 
     def root_columns(self, key: int) -> Array:
-        """(d, c + s) by which a variable's tangent follows from the last node and the shared unknowns.
+        """Columns (d, c + s) by which a variable's tangent follows from the last node and the shared unknowns.
 
         Raises NotAChainError for a state, or a node that is not the last.
         """
@@ -224,7 +224,7 @@ def _alike(values: gtsam.Values, key: Index, letter: Index) -> list[Index]:
 
 
 def _read(values: gtsam.Values, keys: Index) -> tuple[Block, Array]:
-    """What variables of one kind are, and their values (n, width). Raises NotAChainError for other kinds."""
+    """Block and values (n, width) of variables of one kind. Raises NotAChainError for other kinds."""
     first = int(keys[0])
     for block, read in ((None, values.atVector), (ROT3, values.atRot3), (POSE3, values.atPose3)):
         try:
@@ -293,7 +293,7 @@ def _nodes(
 
 
 def _kept(shape: tuple[int, int], place: Index, offset: Index, size: Index) -> NDArray[np.bool_]:
-    """Which numbers of states, or nodes, variables have."""
+    """Mask of the numbers of states, or nodes, that variables have."""
     out = np.zeros(shape, dtype=bool)
     if out.size:
         for begin, width in {*zip(offset[place >= 0].tolist(), size[place >= 0].tolist(), strict=True)}:

@@ -77,7 +77,7 @@ class Engine(Protocol):
 
     @property
     def layout(self) -> Layout:
-        """Of the variables."""
+        """Layout of the variables."""
 
     @property
     def groups(self) -> Sequence[Group]:
@@ -97,11 +97,11 @@ class Engine(Protocol):
 
     @property
     def piece(self) -> Index:
-        """(N,) node in force at each keyframe."""
+        """Node in force at each keyframe, (N,)."""
 
     @property
     def time(self) -> Array:
-        """(N,) s of the keyframes."""
+        """Times of the keyframes (N,), s."""
 
     def under(self, loss: TruncatedLoss | None) -> Self:
         """The engine with another loss for the measurements that have one."""
@@ -241,7 +241,7 @@ def _is_minimum(config: LevenbergConfig, enough: float, damping: float, predicte
 def _reached(
     engine: Engine, here: _Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
 ) -> tuple[_Point, int]:
-    """Where a step leads, its length or its end corrected, and the number of corrections."""
+    """Point after a step whose length or end is corrected, and the number of corrections."""
     there = _Point.of(engine, engine.layout.retract(here.values, step))
     if here.cost - there.cost > _DOUBLE * predicted:
         return _lengthened(engine, here.values, step, there.cost), 0
@@ -269,7 +269,7 @@ def without_rejected(engine: Engine, values: Values) -> Engine:
 
 
 def _lengthened(engine: Engine, values: Values, step: Tangent, cost: float) -> _Point:
-    """Where a step leads that is doubled as long as the cost, `cost` after it as it is, falls."""
+    """Point after a step that is doubled as long as the cost falls; `cost` is that after the single step."""
     length = 1.0
 
     def ahead(length: float) -> Values:

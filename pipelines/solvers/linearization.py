@@ -126,7 +126,7 @@ class Group:
 
     @property
     def all_weights(self) -> Array:
-        """(n, m) weights of the rows beside the loss, a copy."""
+        """Weights (n, m) of the rows beside the loss, a copy."""
         shape = len(self.model.time), self.model.rows
         return np.ones(shape) if self.weights is None else self.weights.copy()
 
@@ -144,7 +144,7 @@ class Group:
         return float((squares if self.loss is None else self.loss.cost(squares)).sum())
 
     def used(self, residuals: Array) -> Array:
-        """(n,) the loss's weights of measurements with these whitened residuals, unweighted."""
+        """Weights (n,) by the loss of measurements with these unweighted whitened residuals."""
         if self.loss is None:
             return np.ones(len(residuals))
         return self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)])))
@@ -160,7 +160,7 @@ class Group:
         return -factor * residuals, jacobians, self.cost(residuals)
 
     def rows(self, values: Values, width: int) -> tuple[Array, float]:
-        """(n, m, width) rows on the columns of their target, right side last, and the cost."""
+        """Rows (n, m, width) on the columns of their target, right side last, and the cost."""
         right, jacobians, cost = self.whitened(values)
         out = np.zeros((*right.shape, width))
         out[..., -1] = right
@@ -242,7 +242,7 @@ class Linearization:
         return sum(group.cost(group.evaluate(values)[0]) for group in self.groups)
 
     def residuals(self, values: Values) -> list[Array]:
-        """(n, m) weighted whitened residuals of each group, outliers included."""
+        """Weighted whitened residuals (n, m) of each group, outliers included."""
         return [group.weighted(group.evaluate(values)[0]) for group in self.groups]
 
     def with_groups(self, groups: Sequence[Group]) -> Linearization:
@@ -261,7 +261,7 @@ class Linearization:
 
     @property
     def time(self) -> Array:
-        """(N,) s of the keyframes: of what joins each to the one before, else of the last measurement there."""
+        """Times of the keyframes (N,), s: of what joins each to the one before, else of the last measurement there."""
         out = np.full(self.layout.sizes[0], -np.inf)
         for target in ("state", "pair", ""):
             known = np.full(len(out), -np.inf)
@@ -273,7 +273,7 @@ class Linearization:
         return np.maximum.accumulate(np.where(out > -np.inf, out, known[0] if len(known) else 0.0))
 
     def under(self, loss: TruncatedLoss | None) -> Linearization:
-        """The same with another loss for measurements that have one."""
+        """The linearization with another loss for measurements that have one."""
         return replace(self, groups=[g if g.loss is None else replace(g, loss=loss) for g in self.groups])
 
     def _complete(self, measured: Array) -> None:
@@ -284,7 +284,7 @@ class Linearization:
             measured[keyframe, -1 - (np.cumsum(absent, axis=1) - 1)[keyframe, number], number] = 1.0
 
     def _walk(self, rows: list[list[Array]]) -> Array:
-        """(J, w, 2 c + 1) rows about nodes; unit rows for what no variable has, as the first node's deviation."""
+        """Rows (J, w, 2 c + 1) about nodes; unit rows for numbers of no variable."""
         c, absent = self.layout.sizes[3], ~self.layout.kept[1]
         units = [np.eye(2 * c + 1)[np.flatnonzero(each)] for each in absent]
         whole = [np.concatenate([unit, *each]) for unit, each in zip(units, rows, strict=True)]
@@ -436,7 +436,7 @@ class _Draft:
         return self.pair and all((layout.node[each] >= 0).all() for each in self.at)
 
     def _columns(self, i: int, layout: Layout, target: str, piece: Index) -> list[Index]:
-        """Those of a block, on its target; see Group."""
+        """Columns of a block on its target; see Group."""
         d, c = layout.sizes[1], layout.sizes[3]
         at = self.at[i]
         span = np.arange(dimension(layout.blocks[layout.block[at[0]]]))
@@ -457,12 +457,12 @@ class _Draft:
 
 
 def _single(columns: Index) -> Index:
-    """(1,) if all are one."""
+    """Columns (1,) where all rows are equal, else unchanged."""
     return columns[:1] if (columns == columns[:1]).all() else columns
 
 
 def _positions(columns: Sequence[int | list[int]], lengths: Sequence[int], layout: Layout) -> Index:
-    """(n or 1,) positions of a block's variables."""
+    """Positions (n or 1,) of a block's variables."""
     if isinstance(columns[0], int):
         at = layout.at([int(column) for column in columns if isinstance(column, int)])
         return at[:1] if (at == at[0]).all() else np.repeat(at, lengths)
@@ -470,7 +470,7 @@ def _positions(columns: Sequence[int | list[int]], lengths: Sequence[int], layou
 
 
 def _below(place: Index, rows: int, used: Index) -> Index:
-    """(n,) first row of each measurement among those of its place; `used` (N,) rows there grow."""
+    """First row (n,) of each measurement among those at its place; `used` (N,), rows there, grows."""
     order = np.argsort(place, kind="stable")
     begins = np.flatnonzero(np.diff(place[order], prepend=-1))
     counts = np.diff(begins, append=len(order))
@@ -482,7 +482,7 @@ def _below(place: Index, rows: int, used: Index) -> Index:
 
 
 def _pieces(drafts: Sequence[_Draft], layout: Layout) -> Index:
-    """(N,) node in force at each keyframe, such that every node is in force at one."""
+    """Node in force at each keyframe, (N,), such that every node is in force at one."""
     N, d, J, c, _ = layout.sizes
     if not c:
         return np.zeros(N, dtype=np.intp)

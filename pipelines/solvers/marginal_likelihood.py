@@ -88,7 +88,7 @@ class Rows:
     is_measurement: bool
 
     def of(self, kept: NDArray[np.bool_], renumbered: Index) -> Rows:
-        """Some of them, with other numbers of states."""
+        """Selected rows, their states renumbered."""
         states = tuple((renumbered[i[kept]], J[kept]) for i, J in self.states)
         beside = None if self.beside is None else self.beside[kept]
         parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside)
@@ -125,7 +125,7 @@ class LinearChain:
 
     @classmethod
     def of(cls, linearization: Linearization, values: Values) -> LinearChain:
-        """From a problem's factors, weighed as stated, about some values."""
+        """Chain of a problem's factors at their stated noise, linearised at given values."""
         (n, d, _, c, p), drafts = linearization.layout.sizes, list[Rows]()
         prior = [np.zeros((0, p + 1))]
         for number, group in enumerate(linearization.under(None).groups):
@@ -157,7 +157,7 @@ class LinearChain:
         return cls((n, d), tuple(drafts), np.concatenate(prior))
 
     def liveliest(self, factors: list[Array], most: int = ENOUGH_KEYFRAMES) -> tuple[LinearChain, list[Array]]:
-        """That over some pieces, half of them those with most motion, and what else is about its rows.
+        """Chain over some pieces, half of them those with most motion, and further data about its rows.
 
         What grows with motion shows there; what is white everywhere.
         """
@@ -188,7 +188,7 @@ class LinearChain:
         return replace(self, rows=rows)
 
     def variances(self, levels: Sequence[Level]) -> list[Array]:
-        """(n,) of each kind of rows, over what was stated."""
+        """Variances (n,) of each kind of rows, over the stated ones."""
         return [_variance(rows, levels) for rows in self.rows]
 
     def solved(self, variances: Sequence[Array]) -> _Solution | None:
@@ -233,7 +233,7 @@ class LinearChain:
 
     @cached_property
     def _products(self) -> list[tuple[Array, list[Array], Array | None, list[Array], list[Array]]]:
-        """Of each kind what does not change with the levels: squares, J'J, J_i'J_j, J'r and J'J_shared."""
+        """Products of each kind of rows independent of the levels: squares, J'J, J_i'J_j, J'r and J'J_shared."""
         return [_products(rows) for rows in self.rows]
 
     def moves(self, states: Array, shared: Array) -> list[Array]:
@@ -353,7 +353,7 @@ class _Solution:
         return cho_solve_banded((self.root, False), states, check_finite=False) - self.border @ x, x
 
     def covariance(self, by_shared: Array) -> Array:
-        """(r, r) of numbers that go with the shared parameters by derivatives (r, p)."""
+        """Covariance (r, r) of numbers with derivatives (r, p) by the shared parameters."""
         half = np.linalg.solve(self.small, by_shared.T)
         return np.asarray(half.T @ half)
 
@@ -498,7 +498,7 @@ def _maximum(
 def widened(
     chain: LinearChain, levels: Sequence[Level], rejected: Mapping[int, NDArray[np.bool_]]
 ) -> tuple[dict[int, Array], dict[int, NDArray[np.bool_]]]:
-    """By group, by how much its measurements are widened at some levels (n,), and which are outliers (n,).
+    """By group, the factor (n,) of its measurements' sigmas at given levels, and the outlier mask (n,).
 
     An outlier is what was rejected and, without any say of its own, lies beyond `OUTLIER_GATES` gates of the solution:
     the innovation of the first measurements has no prediction.
@@ -599,7 +599,7 @@ def _square(S: Array, y: Array) -> Array:
 
 
 def _by_row(chain: LinearChain, of: Mapping[int, NDArray[Any]] | None, otherwise: float) -> list[Array]:
-    """(n,) of each kind of rows, from what groups have."""
+    """Values (n,) of each kind of rows, from those of groups."""
     known = of or {}
     return [np.asarray(known.get(r.group, np.full(len(r.time), otherwise)), dtype=float) for r in chain.rows]
 
@@ -613,7 +613,7 @@ def _present(chain: LinearChain, level: Level) -> bool:
 
 
 def _variance(rows: Rows, levels: Sequence[Level]) -> Array:
-    """(n,) over what was stated."""
+    """Variance (n,) of rows over the stated one."""
     out = np.ones(len(rows.time))
     for level in levels:
         if rows.family in level.noise.families and not level.noise.beside:
@@ -633,7 +633,7 @@ def _at(levels: Sequence[Level], free: Sequence[int], u: Array) -> tuple[Level, 
 
 
 def _parts(chain: LinearChain, levels: Sequence[Level], which: int) -> list[Array]:
-    """(n,) of each kind of rows, the part of their variance that is one of the levels'."""
+    """Part (n,) of the variance of each kind of rows that one of the levels causes."""
     level, out = levels[which], []
     for rows in chain.rows:
         if rows.family not in level.noise.families or (level.noise.beside and rows.beside is None):
@@ -827,7 +827,7 @@ def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Val
 
 
 def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> Array:
-    """(n,) ratio of sandwich to nominal sigma of the reported numbers, at least 1."""
+    """Ratio of sandwich to nominal sigma of the reported numbers, (n,), at least 1."""
     engine, layout = compiled.engine, compiled.layout
     assert isinstance(engine, Linearization)
     assert isinstance(solution.engine, Linearization)

@@ -138,7 +138,7 @@ def level_weights(weights: Array, levels: Iterable[Level], beside: Array | None)
 
 
 def _additional(beside: Array | None, level: float) -> Array:
-    """(n, 1) variance of a noise beside others, in units of what its measurements are whitened by."""
+    """Variance (n, 1) of a noise beside others, in units of the whitening variance."""
     assert beside is not None
     return ((level * beside) ** 2)[:, None]
 
@@ -198,7 +198,7 @@ def _redundancy(noise: Noise, expected: ExpectedSquares) -> float:
 def _refined(
     level: Level, groups: Sequence[Group], values: Values, redundancy: float, first: bool, config: NoiseConfig
 ) -> Level:
-    """What the level should be."""
+    """Improved estimate of a noise level."""
     square, typical = _size(level.noise, groups, values, config)
     if first and typical > 0.0 and not config.misplaced**-2 < square / typical < config.misplaced**2:
         square = typical
@@ -273,7 +273,7 @@ def _rows(noise: Noise, rows: int) -> list[int]:
 
 
 def _used_square(group: Group, values: Values) -> Array:
-    """(n, m) squares of weighted residuals, zero of rejected measurements."""
+    """Squares (n, m) of weighted residuals, zero of rejected measurements."""
     residuals = group.evaluate(values)[0]
     return np.where((group.used(residuals) > 0.5)[:, None], group.weighted(residuals) ** 2, 0.0)
 

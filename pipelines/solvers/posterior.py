@@ -1,4 +1,4 @@
-"""What the factor R of a chain says of the reported numbers: covariance, chi-square, square-root information.
+"""Posterior of the reported numbers from the factor R of a chain: covariance, chi-square, square-root information.
 
 The reported numbers q are functions of the last bias node and the shared unknowns x, with Jacobian J; `root` is R of x
 with its right side. With T = [N U], N the directions of x that no number sees and U the moves of x that change one free
@@ -118,12 +118,12 @@ class Reported:
 
     @property
     def u(self) -> Array:
-        """(m,) the free numbers in prior units, from their prior means."""
+        """The free numbers (m,) in prior units, relative to their prior means."""
         return np.asarray((self.numbers[self.free] - self.mean) / self.scale)
 
     @cached_property
     def basis(self) -> Array:
-        """(c + s, p + m) moves of the last node and the shared unknowns: p that no number sees, then those of u."""
+        """Directions (c + s, p + m) of last node and shared unknowns: p that move no number, then those of u."""
         inverse = np.linalg.pinv(self.jacobian)
         _, sizes, axes = np.linalg.svd(self.jacobian, full_matrices=True)
         seen = int(np.count_nonzero(sizes > UNSEEN * sizes.max(initial=0.0)))
@@ -136,7 +136,7 @@ class Reported:
         return ReportedRoot(basis, R, basis.shape[1] - len(self.free))
 
     def covariance(self, of_u: Array) -> Array:
-        """(n, n) of all numbers, from that of u (m, m); rows of fixed numbers are zero."""
+        """Covariance (n, n) of all numbers from that of u (m, m); rows of fixed numbers are zero."""
         out = np.diag(self.extra**2)
         out[np.ix_(self.free, self.free)] += of_u * np.outer(self.scale, self.scale)
         return out
@@ -158,14 +158,14 @@ class ReportedRoot:
 
     @property
     def R(self) -> Array:
-        """(m, m) of u, everything else marginalised out."""
+        """Square-root information (m, m) of u, everything else marginalised out."""
         rows = self.triangle[self.unseen : -1, self.unseen : -1]
         m = rows.shape[1]
         return np.vstack([rows[:m], np.zeros((max(0, m - len(rows)), m))])
 
     @property
     def d(self) -> Array:
-        """(m,) right side: |R du - d| is minimal at the solution."""
+        """Right side (m,): |R du - d| is minimal at the solution."""
         return np.asarray(self.triangle[self.unseen : self.triangle.shape[1] - 1, -1])
 
     def last(self, du: Array, right: float = 1.0) -> Array:
@@ -178,7 +178,7 @@ class ReportedRoot:
         return np.asarray(self.basis @ np.vstack([y, du]))
 
     def covariance(self) -> Array:
-        """(m, m) of u as the linear system has it; works where R is singular."""
+        """Covariance (m, m) of u by the linear system; works where R is singular."""
         _, sizes, axes = np.linalg.svd(self.R)
         root = axes.T / np.maximum(sizes, 1.0 / WIDEST)
         return np.asarray(root @ root.T)
@@ -226,7 +226,7 @@ class Leverage:
 
 
 def counted(group: Group, values: Values) -> NDArray[np.bool_]:
-    """(n,) measurements that the loss does not reject."""
+    """Mask (n,) of measurements that the loss does not reject."""
     if group.loss is None:
         return np.ones(len(group.model.time), dtype=bool)
     return np.asarray(group.used(group.evaluate(values)[0]) > 0.0)
@@ -329,19 +329,19 @@ class _Variances:
         return cls(measured, between, shared, nodes, np.concatenate(moved, axis=2))
 
     def of_walk(self, rows: Array, node: NDArray[np.intp]) -> Array:
-        """(n, m) of rows (n, m, 2 c) about nodes and those before."""
+        """Variances (n, m) of rows (n, m, 2 c) about nodes and those before."""
         return _quadratic(rows, self.nodes[node]) + np.square(rows @ self.moves[node]).sum(axis=2)
 
 
 def _squares(rows: Array, following: Array, shared: Array) -> Array:
-    """(n, m) squares of what rows (n, m, k + s + 1) make of moves (n, k, q) and (s, q), summed over the q."""
+    """Squares (n, m) of rows (n, m, k + s + 1) times moves (n, k, q) and (s, q), summed over the q."""
     n, k, q = following.shape
     about = rows.reshape(-1, rows.shape[2])[:, k:-1] @ shared
     return np.asarray(np.square(rows[..., :k] @ following + about.reshape(n, rows.shape[1], q)).sum(axis=2))
 
 
 def _quadratic(rows: Array, covariances: Array) -> Array:
-    """(n, m) variances of rows (n, m, k), from covariances (n, k, k)."""
+    """Variances (n, m) of rows (n, m, k), from covariances (n, k, k)."""
     return np.einsum("nmk,nmk->nm", rows @ covariances, rows)
 
 
@@ -366,7 +366,7 @@ def chi_square(found: Sequence[Leverage]) -> ChiSquare:
 def expected_squares(
     engine: Engine, system: System, factorization: Factorization, values: Values
 ) -> dict[tuple[str, int], float]:
-    """(family, row of its measurements) -> expected sum of squares under noise of unit variance.
+    """Expected sums of squares under noise of unit variance, by (family, row of its measurements).
 
     Rows of a process or a prior count as one. Arguments and errors are those of `leverages`.
     """
@@ -459,7 +459,7 @@ def followed(factorization: Factorization, last: Array) -> Tangent:
 
 
 def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(r,) rows about some of the named numbers and about no others; numbers are in prior units."""
+    """Mask (r,) of rows about some of the named numbers and no others; numbers are in prior units."""
     about = np.abs(rows) > UNSEEN**0.75 * np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
     return np.asarray((about & named).any(axis=1) & ~(about & ~named).any(axis=1))
 
@@ -480,7 +480,7 @@ def sqrt_information_of(gaussian_prior: GaussianPrior, scales: Sequence[float]) 
 
 
 def fewest(R: Array, d: Array, scales: Array) -> tuple[Array, Array]:
-    """As few rows of the same information, without columns that have none."""
+    """The same information in the least number of rows, without empty columns."""
     if not len(R):
         return R, d
     u, s, vt = np.linalg.svd(R * scales, full_matrices=False)

@@ -1,4 +1,4 @@
-"""What was known of the reported numbers until each of some moments, and a walking bias over time.
+"""Posterior of the reported numbers at moments of the recording, and a walking bias over time.
 
 The last few dozen states of the chain are eliminated in time order; `ChainFactorization.prefix_roots` has the
 square-root information of (node, shared unknowns) after each of them, all linearised at the final estimate. Where a
@@ -66,7 +66,7 @@ def posterior_history(
 
 
 def prefix_roots(system: ChainSystem, factorization: ChainFactorization) -> tuple[Index, list[Array]]:
-    """(M,) keyframes, and R of (their node, shared unknowns, right side) by all until then.
+    """Keyframes (M,), and R of (node, shared unknowns, right side) given all until each.
 
     The coarse chain of few pieces of a walking bias has few states; of short recordings prefixes are eliminated anew.
     """

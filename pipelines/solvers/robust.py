@@ -30,7 +30,7 @@ from alidade.pipelines.solvers.linearization import Group
 
 @dataclass(frozen=True)
 class RobustConfig:
-    """How outliers are looked for.
+    """Settings of the search for outliers.
 
     Attributes:
         minimizer: termination of every minimisation.
@@ -162,7 +162,7 @@ def _undecided(engine: Engine, values: Values) -> float:
 
 
 def _norms(group: Group, values: Values) -> Array:
-    """(n,) whitened norms of measurements."""
+    """Whitened norms (n,) of measurements."""
     return np.linalg.norm(group.weighted(group.evaluate(values)[0]), axis=1)
 
 

@@ -205,7 +205,7 @@ def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
 
 
 def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
-    """Where each variable stands when their tangents are stacked in this order."""
+    """Slice of each variable in the stacked tangents, in this order."""
     found, start = {}, 0
     for key in keys:
         found[key] = slice(start, start + dims[key])

@@ -136,7 +136,7 @@ class _Pass:
     own: tuple[Array, Array]
 
     def learned(self, some: slice, beside: Array) -> Array:
-        """(m, 1 + p, 1 + p) information on (1, shared) from the measurements of some keyframes, the state left out."""
+        """Information (m, 1 + p, 1 + p) on (1, shared) from the measurements of some keyframes, states eliminated."""
         H, g = (each[some] for each in self.own)
         X, b = self.X[some], H @ self.X[some] + g
         crossed = np.swapaxes(X, 1, 2) @ (b + g)
@@ -165,7 +165,7 @@ def _filtered(chain: LinearChain, variances: Sequence[Array]) -> _Pass:
 
 
 def _beside(chain: LinearChain, variances: Sequence[Array], begin: int, end: int) -> Array:
-    """(m, 1 + p, 1 + p) squares of what measurements of some keyframes have beside the state: residual and shared."""
+    """Squares (m, 1 + p, 1 + p) of residual and shared columns of the measurements of some keyframes."""
     out = np.zeros((end - begin, chain.prior.shape[1], chain.prior.shape[1]))
     for rows, variance in zip(chain.rows, variances, strict=True):
         if len(rows.states) == 1:
@@ -204,7 +204,7 @@ def _two_sides(
 
 
 def _alone(chain: LinearChain, variances: Sequence[Array]) -> Array:
-    """(q, q) information on (1, shared) of priors and of rows without a state."""
+    """Information (q, q) on (1, shared) of priors and of rows without a state."""
     prior = np.roll(chain.prior, 1, axis=1)
     out: Array = prior.T @ prior
     for rows, variance in zip(chain.rows, variances, strict=True):
@@ -313,7 +313,7 @@ class _Fit:
 
 
 def _maximised(engine: Linearization, values: Values, levels: Sequence[Level], outliers: Outliers) -> _Fit:
-    """From levels and values near: those of the largest likelihood."""
+    """Noise levels and values of the largest likelihood, from initial ones."""
     best = maximise_likelihood(engine, values, levels, outliers, _ROUNDS)
     return _Fit.of(engine, best.values, best.levels)
 
@@ -336,7 +336,7 @@ def _named(parameter: Parameter, steps: Array, covariance: Array) -> dict[str, t
 
 
 def _length(step: Array, covariance: Array) -> tuple[float, float]:
-    """Of a vector, and its sigma along it."""
+    """Length of a vector, and its sigma along itself."""
     length = float(np.linalg.norm(step))
     along = step / max(length, 1e-300)
     return length, float(np.sqrt(along @ covariance @ along))
@@ -385,7 +385,7 @@ def _solved_again(
 
 
 def _leads_to(rows: Rows, keyframe: int) -> NDArray[np.bool_]:
-    """(n,) which rows join a keyframe to the one before."""
+    """Mask (n,) of rows that join a keyframe to the one before."""
     if len(rows.states) != 2:
         return np.zeros(len(rows.time), dtype=bool)
     return np.asarray(rows.states[1][0] == keyframe)
@@ -448,7 +448,7 @@ def _with_late(group: Group, at: int, late: int, row: int, further: int, time: f
 
 
 def _prior(key: int, late_key: int, layout: Layout, at: int, late: int) -> Group:
-    """What is known of the step before."""
+    """Prior of the state before the step."""
     import gtsam
 
     noise = gtsam.noiseModel.Isotropic.Sigma(3, STEP_PRIOR)

@@ -120,36 +120,36 @@ class WeakDirections:
 
     @property
     def prior_covariance(self) -> Array:
-        """(w, w) of the weak directions under the prior alone, the strong ones given."""
+        """Covariance (w, w) of the weak directions under the prior alone, given the strong ones."""
         return np.asarray(np.linalg.inv(self.weak.T @ self.precision @ self.weak), dtype=float)
 
     def prior_mean(self, u: Array) -> Array:
-        """(w,) of the weak directions under the prior alone, the strong ones of u (m,) given."""
+        """Mean (w,) of the weak directions under the prior alone, given the strong ones of u (m,)."""
         given = self.strong @ (self.strong.T @ u)
         return np.asarray(-self.prior_covariance @ (self.weak.T @ (self.precision @ given)))
 
     @property
     def axes(self) -> Array:
-        """(m, m) columns, the strong directions first."""
+        """Axes (m, m) by columns, the strong directions first."""
         return np.hstack([self.strong, self.weak])
 
     @property
     def all_sigmas(self) -> Array:
-        """(m,) of the axes: posterior sigmas of the strong ones, the weak ones' under the prior alone."""
+        """Sigmas (m,) along the axes: posterior of the strong ones, prior of the weak ones."""
         return np.concatenate([self.sigmas, np.sqrt(np.diag(self.prior_covariance))])
 
     @property
     def followers(self) -> NDArray[np.bool_]:
-        """(k, m) whether a strong direction is known so much better than an axis that it follows it."""
+        """Mask (k, m): a strong direction is known so much better than an axis that it follows it."""
         return np.asarray(self.sigmas[:, None] < FOLLOWS * self.all_sigmas)
 
     def covariance(self) -> Array:
-        """(m, m) of u: posterior of the strong directions, prior of the weak ones, no correlation between the two."""
+        """Covariance (m, m) of u: posterior of strong directions, prior of weak ones, no correlation between them."""
         root = self.strong * self.sigmas
         return root @ root.T + self.weak @ self.prior_covariance @ self.weak.T
 
     def again(self, R: Array) -> WeakDirections:
-        """The same weak directions, the strong ones as another square-root information (m, m) has them."""
+        """The same weak directions with the strong ones of another square-root information (m, m)."""
         return WeakDirections.given(R, self.weak, self.precision, self.calibrated)
 
     def with_curvature(self, covariance: Array) -> WeakDirections:
@@ -166,7 +166,7 @@ class WeakDirections:
 
 
 def _calibrated(wide: Array, calibrated: NDArray[np.bool_] | None, at_least: int = 0) -> Array:
-    """Of the span of wide directions (m, n) those of which calibrated numbers have the larger part."""
+    """Directions in the span of wide ones (m, n) in which calibrated numbers have the larger part."""
     if calibrated is None or not wide.shape[1]:
         return wide
     shares, turn = np.linalg.eigh(wide[calibrated].T @ wide[calibrated])
@@ -262,7 +262,7 @@ class Posterior:
 
     @property
     def covariance(self) -> Array:
-        """(n, n) of all reported numbers."""
+        """Covariance (n, n) of all reported numbers."""
         return self.reported.covariance(self.directions.covariance())
 
 

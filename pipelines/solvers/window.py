@@ -1,4 +1,4 @@
-"""How long the incremental solver keeps states: seconds, keyframes, or for ever."""
+"""Window of the incremental solver: it keeps states for some seconds, keyframes, or for ever."""
 
 from __future__ import annotations
 
