@@ -155,7 +155,7 @@ def _jump(step: StepEstimate) -> Finding:
 
 
 def _certain_size(step: StepEstimate) -> float:
-    """What a step exceeds by two sigmas, rad."""
+    """Lower bound of a step at two sigmas, rad."""
     return step.size - _SURE * step.ratio * step.sigma
 
 
@@ -214,7 +214,7 @@ def _marginalised(sqrt_info: SqrtInformation, step: Array) -> SqrtInformation:
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
-    """Of an estimate; None where its course is not known, or holds nothing that could change.
+    """Stability of an estimate; None without a posterior over time, or without anything that could change.
 
     Quantities that walk are left out, since they may change, and those that are hardly better known than before.
 
@@ -251,7 +251,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
 
 
 def _long_enough(estimate: Estimate, numbers: int) -> float:
-    """From when on, s, all families of coloured residuals had segments enough; infinite where they never do."""
+    """Time, s, from which all families of coloured residuals have enough segments; infinite where they never do."""
     latest = -np.inf
     for family, together in estimate.colours.items():
         times = np.sort(estimate.residuals[family].time)
@@ -287,7 +287,7 @@ def _with_priors_as_found(
 
 
 def _whitening(P: Array, last: Array) -> Array:
-    """(r, n): differences between the estimate with covariance P and the last one as r unit normal numbers."""
+    """Matrix (r, n) that whitens differences between the estimate with covariance P and the last one."""
     root = np.linalg.cholesky(P + 1e-12 * np.diag(np.diag(P)))
     scaled = np.linalg.solve(root, np.linalg.solve(root, P - last).T)
     eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))

@@ -1,4 +1,4 @@
-"""What has been collected of what a method needs, for the person recording.
+"""Checklist for the person recording: collected data against the needs of the method.
 
 These are rules of thumb about the motion; whether it was enough is what the sigmas say.
 """
@@ -61,7 +61,7 @@ def swayed(name: str, turned: Array, enough: float, what: str, who: str) -> list
 
 
 def turned(t: Array, gyro: Array) -> Array:
-    """(3,) rad: how far it turned about each axis within a few seconds, at most."""
+    """Largest rotation about each axis within a few seconds, (3,) rad."""
     rate = gyro - np.median(gyro, axis=0)
     angle = np.vstack([np.zeros(3), np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t)[:, None], axis=0)])
     starts = np.searchsorted(t, np.arange(t[0], t[-1], _STRETCH))

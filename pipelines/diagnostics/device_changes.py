@@ -62,7 +62,7 @@ class Change:
 
     @property
     def z(self) -> float:
-        """In its sigmas."""
+        """Size of the change in its sigmas."""
         return self.size / self.sigma
 
 
@@ -78,7 +78,7 @@ class Together:
 
 @dataclass(frozen=True)
 class Rate:
-    """How far numbers of a kind walk in the root of a day, SI; not farther than `upper` (95 %)."""
+    """Random-walk rate of a kind of numbers, SI per root of a day, with its upper limit `upper` (95 %)."""
 
     rate: float
     upper: float
@@ -86,7 +86,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Changes:
-    """What a history of recordings says of a device.
+    """Changes of a device found in a history of recordings.
 
     Attributes:
         level: p-value of any step.
@@ -117,7 +117,7 @@ def changes(
     asked: Collection[str] | None = None,
     level: float = LEVEL,
 ) -> Changes:
-    """Of the device's numbers that count as the same in all recordings.
+    """Changes of the device's numbers, which count as the same in all recordings.
 
     Args:
         joined: the recordings, in the order of their dates.
@@ -152,7 +152,7 @@ def changes(
 
 
 def _columns(joined: Joined, questions: Sequence[tuple[str, int, int]]) -> Array:
-    """(rows, questions) of a unit step of a number in all recordings after one."""
+    """Columns (rows, questions) of a unit step of a number in all recordings after one."""
     ends = np.cumsum([len(d) for _, d in joined.rows])
     whole = np.concatenate([R for R, _ in joined.rows])
     after, last = ends[: len(joined.parts)], ends[len(joined.parts) - 1]
@@ -252,7 +252,7 @@ def _rates(
 
 
 def _rate(squares: Array, information: Array) -> Rate:
-    """From squares of independent numbers with variances 1 + rate^2 information."""
+    """Maximum-likelihood rate from squares of independent numbers with variances 1 + rate^2 information."""
 
     def doubled(rate: float) -> float:
         variance = 1.0 + rate**2 * information
@@ -310,7 +310,7 @@ class CalibrationCheck:
 
     @property
     def steps(self) -> Sequence[Change]:
-        """Of every parameter, those found as they are with all of them."""
+        """Change of every parameter; changes found are given with all others found."""
         found = {step.name: step for step in self.changes.found}
         return [found.get(step.name, step) for step in self.changes.steps]
 

@@ -1,4 +1,4 @@
-"""From an estimate to findings, a pure function: nothing is solved here, nothing is put into words."""
+"""Findings from an estimate: a pure function, without new solutions and without sentences."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def diagnose(
     contradictions: Sequence[Finding] = (),
     limits: Thresholds = DEFAULT,
 ) -> tuple[Finding, ...]:
-    """All findings, the most severe first; equally severe ones in the order of explanation, cause before symptom.
+    """All findings, the most severe first; equally severe ones in causal order, cause before symptom.
 
     Args:
         estimate: values (n,) with their final covariance (n, n).
@@ -181,7 +181,7 @@ def _correlations(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
 
 
 def _slow_errors(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
-    """What errs slowly and is no noise of the model, where that widens a required parameter."""
+    """Findings of slow errors outside the noise model that widen a required parameter."""
     ratios = estimate.sandwich
     if ratios is None:
         return

@@ -1,4 +1,4 @@
-"""Which data-sheet figures limit the accuracy of weak parameters."""
+"""Error budget: contribution of data-sheet figures to the sigmas of weak parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be wrong with a method's data, in the names of its fields; `hypothesis_tests` tests it."""
+"""Fault models of a method's data, by the names of its fields; `hypothesis_tests` tests them."""
 
 from __future__ import annotations
 

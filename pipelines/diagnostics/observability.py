@@ -1,4 +1,4 @@
-"""What a recording determined: verdicts per parameter, weak eigen-directions, time to the required accuracy.
+"""Observability: verdicts per parameter, weak eigen-directions, time to the required accuracy.
 
 The rules are those of the contract, section Verdicts.
 """

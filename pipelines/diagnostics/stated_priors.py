@@ -95,7 +95,7 @@ def contradictions(
 
 
 def _each_freed(sqrt_info: SqrtInformation, inside: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
-    """Of f fixed numbers, in units of their scales: H_AA^-1 H_AF (a, f), x (f,), I (f,), correlations (f, f)."""
+    """Solution with each of f fixed numbers freed, scaled: H_AA^-1 H_AF (a, f), x (f,), I (f,), correlations (f, f)."""
     R, a = sqrt_info.R * sqrt_info.scales, int(inside.sum())
     rows = np.column_stack([R[:, inside], R[:, ~inside], sqrt_info.d])
     T = np.asarray(np.linalg.qr(rows, mode="r"), dtype=float)

@@ -62,7 +62,7 @@ def stretches_at_rest(t: Array, sensors: Sequence[Array], gyro: Array | None = N
 
 
 def _quiet(blocks: Array) -> Mask:
-    """Which blocks (count, size, k) are at rest as one sensor sees it."""
+    """Mask of blocks (count, size, k) in which one sensor is at rest."""
     blocks = blocks - blocks[0, 0]  # readings that never change are exactly zero then
     means = blocks.mean(axis=1)
     variance = ((blocks - means[:, None]) ** 2).mean(axis=(1, 2))
@@ -82,7 +82,7 @@ def _quiet(blocks: Array) -> Mask:
 
 
 def _not_turning(gyro: Array, spans: NDArray[np.intp]) -> Mask:
-    """Which spans have the mean rate of a rest."""
+    """Mask of spans with the mean rate of a rest."""
     means = np.array([gyro[start : stop + 1].mean(axis=0) for start, stop in spans])
     rate = np.linalg.norm(means, axis=1)
     same = np.linalg.norm(means - means[np.argmin(rate)], axis=1) < _STEADY

@@ -29,7 +29,7 @@ class TrialCase:
 
 
 def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """All faults that are tested, but for those that count only where nothing else fits."""
+    """All faults to test, except those that count only where no other fits."""
     yield from data_faults(model, data, config)
     yield from inverted_signs(model, data, config)
     yield from axis_orders(model, data, config)

@@ -45,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrialFit:
-    """How well a recording fits after a change: the solution, and the loss of the measurements it rejected.
+    """Fit of a recording after a change: the solution, and the loss of the measurements it rejected.
 
     Attributes:
         quantities: of the problem.
@@ -63,7 +63,7 @@ class TrialFit:
 
     @classmethod
     def of(cls, problem: Problem, estimate: Estimate) -> TrialFit | None:
-        """None without chi-square."""
+        """Fit of an estimate; None where it has no chi-square."""
         if estimate.chi_square is None or not np.isfinite(estimate.chi_square.value):
             return None
         rejected = {f: int((~r.used).sum()) for f, r in estimate.residuals.items()}
@@ -82,7 +82,7 @@ class TrialFit:
 
     @property
     def cost_with_priors(self) -> float:
-        """The same with how far the rest of the solution is from its priors: it weighs corrections that fit alike."""
+        """Cost including the distance of the solution from its priors, to rank corrections that fit alike."""
         return self.chi_square.value + self.lost + sum(_from_priors(self.quantities, self.estimate.values))
 
     @property

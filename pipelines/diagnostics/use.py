@@ -73,7 +73,7 @@ class Applied(Protocol):
         """Parameter -> value that is applied."""
 
     def __call__(self, **measured: Array) -> Mapping[str, Array]:
-        """What follows from measurements."""
+        """Results of applying the calibration to measurements, by name."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Use:
-    """What a calibration is used for.
+    """A use of a calibration, and its error.
 
     Attributes:
         name: for programs.

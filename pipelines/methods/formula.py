@@ -1,4 +1,4 @@
-"""How a result is applied: formulas as text, and their evaluation.
+"""Formulas that apply a result: text, and evaluation.
 
     Formula("rate of the helmet, rad/s in v", "w_iv", "gyro - gyro_bias", ("gyro",))
 
@@ -55,7 +55,7 @@ class Formula:
 
     @property
     def text(self) -> str:
-        """One line of calibration.yaml."""
+        """The formula as one line of calibration.yaml."""
         return f"{self.description}: {self.name} = {self.expression}"
 
     @property

@@ -172,7 +172,7 @@ def _likelihood(means: Array, follows: Array, covariance: Array) -> float:
 
 
 def _weighed(level: Level) -> Level:
-    """With the scale that statement and finding have together."""
+    """The level with its scale weighted between the stated and the estimated one."""
     assert level.found is not None
     assert level.sigma is not None
     spread = level.sigma / level.found
@@ -205,7 +205,7 @@ def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
 
 
 def _differences(samples: Array, count: int) -> Array:
-    """Of high order, of means of `count` samples (n, k)."""
+    """High-order differences of means of `count` samples (n, k)."""
     out = np.empty((max(len(samples) // count - _ORDER, 0), samples.shape[1]))
     for begin in range(0, len(out), _BLOCK):
         end = min(begin + _BLOCK, len(out))

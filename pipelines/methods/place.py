@@ -1,4 +1,4 @@
-"""Where on the earth a recording was made, and the magnetic field there."""
+"""Place of a recording on the earth, and the magnetic field there."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ def _colour(values: Array) -> float:
 
 
 def _still_for(off: Array, count: int) -> int:
-    """How many of some samples (n, d), in units of their noise about a mean of `count` others, stay at that mean."""
+    """Number of leading samples (n, d), in units of their noise about a mean of `count` others, at that mean."""
     n = np.arange(1, len(off) + 1)
     drift = np.abs(np.cumsum(off, axis=0)).max(axis=1, initial=0.0) / np.sqrt(n * (1.0 + n / count))
     moved = np.flatnonzero(drift > _MOVED)

@@ -37,17 +37,17 @@ def reference(temperature: Temperature | None) -> float | None:
 
 
 def above(temperature: Temperature | None, reference: float | None, at: Array) -> Array | None:
-    """By how much (n,), K, it is above the reference, degrees Celsius, at times (n,), s; None where nobody measures."""
+    """Temperature (n,) above the reference, K, at times (n,), s; None without a thermometer."""
     return None if temperature is None or reference is None else temperature.above(reference, at)
 
 
 def unsettled(temperature: Temperature | None) -> float:
-    """How long it may take, s, until it is known what the temperature is: from one message to the next."""
+    """Longest time between temperature messages, s, until a temperature can be interpolated."""
     return 0.0 if temperature is None else float(np.diff(temperature.t).max(initial=0.0))
 
 
 def constants(reference: float | None) -> dict[str, float]:
-    """What formulas need to know beside the slopes."""
+    """Constants of formulas beside the slopes."""
     return {} if reference is None else {FIRST: reference}
 
 

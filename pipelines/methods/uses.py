@@ -1,4 +1,4 @@
-"""What calibrated accelerometers, gyros and magnetometers are used for, of whatever method.
+"""Uses of calibrated accelerometers, gyros and magnetometers, of whatever method.
 
 The applied side of every error is the method's own formulas; the reading of a sensor with true parameters is a function
 of the method, `Sensors`.
@@ -32,12 +32,12 @@ def raw_of(true: Truth, sensor: str, nominal: Array) -> Array:
 
 
 def along(matrices: Array, vectors: Array) -> Array:
-    """(..., 3, 3) times (..., U, 3)."""
+    """Products of matrices (..., 3, 3) and vectors (..., U, 3)."""
     return np.asarray(vectors @ np.swapaxes(matrices, -1, -2))
 
 
 def gyro_reading(true: Truth, rate: Array, force: Array, prefix: str = "gyro") -> Array:
-    """(I + S) w + G f + bias, (..., U, 3); what is not among the parameters is 0."""
+    """Gyro reading (I + S) w + G f + bias, (..., U, 3); missing parameters are 0."""
     S = true.matrix([[f"{prefix}_{'scale' if i == j else 'skew'}_{_sorted(i, j)}" for j in "xyz"] for i in "xyz"])
     sensitivity = true.matrix([[f"gyro_g_{i}{j}" for j in "xyz"] for i in "xyz"])
     bias = true.xyz(f"{prefix}_bias")

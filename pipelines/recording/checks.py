@@ -111,7 +111,7 @@ def check_time_unit(name: str, t_ns: NDArray[np.int64], slowest_s: float) -> Non
 
 
 def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
-    """What stamps, ns, have to be multiplied with (1e-3, 1e3, ...) for their usual step to be a sensor's; None: by 1.
+    """Factor (1e-3, 1e3, ...) that makes the usual step of stamps, ns, plausible for a sensor; None: 1.
 
     Args:
         t_ns: (N,), in order or not.
@@ -152,7 +152,7 @@ def check_gyro(topic: str, t: Array, gyro: Array) -> None:
 
 
 def too_fast(topic: str, t: Array, gyro: Array) -> str:
-    """What is wrong with rates, shape (N, 3), that are too high to be rad/s; empty if nothing is."""
+    """Sentence about rates (N, 3) that are too high to be rad/s; empty without fault."""
     rate = np.linalg.norm(gyro, axis=1)
     worst = int(np.argmax(rate))
     if rate[worst] <= MAX_RATE_RAD_S:
@@ -203,7 +203,7 @@ def count(dropped: dict[str, int], reason: str, number: int) -> None:
 
 
 def _copies(stamps: NDArray[np.int64], values: Array) -> NDArray[np.bool_]:
-    """Which of samples sorted by stamp are the one before once more, stamp and numbers."""
+    """Mask of samples, sorted by stamp, that repeat the one before, stamp and numbers."""
     out = np.zeros(len(stamps), dtype=bool)
     again = np.flatnonzero(np.diff(stamps) == 0) + 1
     rows = values.reshape(len(stamps), -1)

@@ -1,4 +1,4 @@
-"""What holds messages, whatever the form of the file: raw bytes, block by block, and what of them is lost.
+"""Containers of raw messages, for every file format: bytes block by block, and losses.
 
 A container knows no message type: `decoding.py` makes numbers of the bytes. A part of a file that cannot be used is a
 `DataLoss`, not an error; `require_complete` makes one of it.
@@ -69,7 +69,7 @@ class MessageBlock(NamedTuple):
 
 
 def byte_windows(buffer: NDArray[np.uint8], width: int) -> NDArray[np.void]:
-    """All windows of `width` bytes of a buffer, as one overlapping array (n,) without a copy."""
+    """All windows of `width` bytes of a buffer, as an overlapping array (n,) without a copy."""
     shape = (max(0, len(buffer) - width + 1),)
     return np.ndarray(shape, dtype=f"V{width}", buffer=buffer, strides=(1,))
 

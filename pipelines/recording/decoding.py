@@ -217,7 +217,7 @@ class MessageFormat:
 
     @property
     def advice(self) -> str:
-        """How to get an encoding that is read in place of this one, as the end of a sentence; may be empty."""
+        """End of a sentence: how to convert this encoding into one that is read; may be empty."""
         return f": {_CONVERSIONS[self.encoding]}" if self.encoding in _CONVERSIONS else ""
 
     @cached_property

@@ -30,7 +30,7 @@ def find_euroc(path: Path) -> Path | None:
 
 
 def read_euroc(path: Path, root: Path) -> ArrayContainer:
-    """All sensors of a data set."""
+    """Container of all sensors of a data set."""
     topics: dict[str, series.Topic] = {}
     assumptions = []
     for table in sorted(root.glob("*/data.csv")):
@@ -57,7 +57,7 @@ class _DataSet(ArrayContainer):
 
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
-    """What a sensor's table holds."""
+    """Topics of a sensor's table, by name."""
     layout = table_form(table, table)
     names = layout.names
     columns, _ = read_columns(table, table, layout, names)
@@ -121,7 +121,7 @@ def _camera_info(table: Path, t_ns: int, sensor: Mapping[str, Any]) -> series.Ca
 
 
 def _sensor(path: Path) -> dict[str, Any]:
-    """What a sensor.yaml says; nothing if there is none."""
+    """Content of a sensor.yaml; empty if there is none."""
     if not path.is_file() or path.stat().st_size > MAX_YAML_BYTES:
         return {}
     text = read_bytes(path, MAX_YAML_BYTES).decode(errors="replace").removeprefix("%YAML:1.0\n")

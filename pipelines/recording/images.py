@@ -110,7 +110,7 @@ def _file(pixels: Pixels) -> bytes:
 
 
 def decode_video(packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
-    """(stamp, file in the Netpbm form) of each (stamp, message): one picture a message, none out of order.
+    """Decode H.264 messages (stamp, message) into (stamp, file in the Netpbm form), one picture each, in order.
 
     Raises ValueError where that is not what the messages are, or nothing of them can be decoded.
     """

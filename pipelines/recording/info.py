@@ -72,7 +72,7 @@ def facts_of(recording: Recording, config: Config, needs: Mapping[str, Sequence[
 
 
 def lacking(needs: Sequence[Need], recording: Recording, config: Config) -> tuple[str, ...]:
-    """What a recording with this config lacks of a method's needs, one phrase each; nothing if it can serve it."""
+    """Needs of a method that a recording with this config does not meet, one phrase each."""
     phrases = []
     for groups in needs:
         texts = [" and ".join(filter(None, (_lack(one, recording, config) for one in group))) for group in groups]
@@ -98,7 +98,7 @@ def _facts(topic: TopicInfo, epoch_ns: int, t_ns: NDArray[np.int64], log_ns: NDA
 
 
 def _lack(need: Topic | Setting, recording: Recording, config: Config) -> str:
-    """What is lacking of a topic or a key of the config, as a phrase; empty if nothing."""
+    """Phrase for a missing topic or config key; empty if it is there."""
     if isinstance(need, Setting):
         return "" if need.given(config) else need.phrase
     name = config.topic(need)

@@ -55,7 +55,7 @@ class DamagedError(Exception):
 
 
 class ChunkHead(NamedTuple):
-    """What a chunk states about itself: log times, Unix ns; sizes, bytes; `packed`: where its data are."""
+    """Head of a chunk: log times, Unix ns; sizes, bytes; `packed`: position of its data."""
 
     first_ns: int
     last_ns: int
@@ -94,7 +94,7 @@ def parse(kind: type[_RecordType[_Record_co]], record: bytes) -> _Record_co:
 
 
 def chunk_head(start: bytes, length: int) -> ChunkHead:
-    """What a chunk of so many bytes states in its first 64 bytes. Raises DamagedError where that cannot be."""
+    """Head of a chunk from its first 64 bytes. Raises DamagedError where it is invalid."""
     if len(start) < _CHUNK_HEAD.size:
         raise DamagedError("it is shorter than its fields")
     first, last, size, crc, name = _CHUNK_HEAD.unpack_from(start)
@@ -129,7 +129,7 @@ def decompress_chunk(chunk: bytes) -> NDArray[np.uint8]:
 
 
 def iter_records(data: memoryview, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, int, int]]:
-    """(opcode, start, end) of the records side by side in [start, stop). Raises DamagedError if they do not fill it."""
+    """Records in [start, stop) as (opcode, start, end). Raises DamagedError if they do not fill it."""
     stop = len(data) if stop is None else stop
     while start < stop:
         opcode, length = HEAD.unpack_from(data, start) if start + HEAD.size <= stop else (0, stop)

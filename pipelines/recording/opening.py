@@ -1,4 +1,4 @@
-"""What a path names: a file of one of the forms that are read, a folder of parts, a pattern, a list of them."""
+"""Open a path: a file of a supported format, a folder of parts, a pattern, a list of them."""
 
 from __future__ import annotations
 

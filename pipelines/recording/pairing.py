@@ -1,4 +1,4 @@
-"""Which gyro turns with which attitude, from what they measured.
+"""Pairing of gyros and attitudes by the rates that they measured.
 
 How fast a body turns does not depend on how a sensor sits on it: the norm of a gyro's rate is that of the attitude's
 own rate, up to a delay. Where the norms agree, one constant rotation takes one rate vector into the other, if the
@@ -38,7 +38,7 @@ _GAP = 3.0
 
 @dataclass(frozen=True)
 class Pairing:
-    """How well a gyro and an attitude agree.
+    """Agreement of a gyro and an attitude.
 
     Attributes:
         correlation: of the norms of their rates, at the delay at which they agree best.
@@ -70,12 +70,12 @@ class _Gyro:
         self._turned = np.concatenate([np.zeros((min(1, len(rates)), 3)), np.cumsum(turned, axis=0)])
 
     def mean(self, a: Array, b: Array) -> Array:
-        """(n, 3) from a to b (n,)."""
+        """Mean rates (n, 3) from a to b (n,)."""
         ends = [np.stack([np.interp(x, self.t, column) for column in self._turned.T], axis=1) for x in (a, b)]
         return (ends[1] - ends[0]) / (b - a)[:, None]
 
     def covers(self, a: Array, b: Array) -> NDArray[np.bool_]:
-        """Which intervals it was recorded in."""
+        """Mask (n,) of intervals within the gyro's record."""
         return (a >= self.t[0]) & (b <= self.t[-1]) if len(self.t) else np.zeros(len(a), dtype=bool)
 
 
@@ -177,12 +177,12 @@ def _refined(offset: float, seen: _Seen, gyro: _Gyro, others: Sequence[_Gyro]) -
 
 
 def _by_axes(rates: Array, turned: Array) -> Array:
-    """(3 n, 9) that takes the rows of a matrix M to the vectors (n, 3) turned M rates, one after the other."""
+    """Matrix (3 n, 9) that takes the rows of M to the stacked vectors turned M rates, (n, 3) each."""
     return np.einsum("nij,nk->nijk", np.broadcast_to(turned, (len(rates), 3, 3)), rates).reshape(-1, 9)
 
 
 def _delay(middle: Array, norm: Array, a: Array, b: Array, gyro: _Gyro) -> tuple[float, float | None]:
-    """What to add to the attitude's times, and the correlation there; None where nothing moves."""
+    """Correction of the attitude's times, s, and the correlation there; None where nothing moves."""
     step = max(_FINEST, float(np.median(b - a)) / 2.0, (middle[-1] - middle[0]) / _MOST)
     grid = np.arange(max(middle[0], gyro.t[0]), min(middle[-1], gyro.t[-1]), step)
     half = 0.5 * float(np.median(b - a))

@@ -84,7 +84,7 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class _StampFacts:
-    """What the stamps of a topic show: least delay of the log times, ns (None without messages), and sentences."""
+    """Facts about a topic's stamps: least delay of the log times, ns (None without messages), and sentences."""
 
     delay_ns: int | None
     notes: tuple[str, ...]
@@ -324,7 +324,7 @@ class Recording:
             return single_messages.camera_info(next(self._decoded(topic, messages.CAMERA_INFO)))
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        """(stamp in ns, file) of the pictures on a CompressedImage or Image topic, one by one.
+        """Pictures on a CompressedImage or Image topic as (stamp in ns, file), one by one.
 
         Raw ones, and those of a H.264 video, are files in the Netpbm form.
         """
@@ -339,7 +339,7 @@ class Recording:
             return single_messages.tag_detections(self._decoded(topic, messages.TAG_DETECTIONS))
 
     def transforms(self, topic: str) -> Mapping[tuple[str, str], series.PoseSeries]:
-        """(Parent frame, child frame) -> the transforms between them on a tf2_msgs/TFMessage topic."""
+        """Transforms on a tf2_msgs/TFMessage topic by (parent frame, child frame)."""
         if topic not in self._transforms:
             with self._problems(topic):
                 self._transforms[topic] = single_messages.transforms(self._decoded(topic, messages.TF))
@@ -437,7 +437,7 @@ class Recording:
         return next(self._formats[number].advice for number, channel in channels if channel.topic == topic)
 
     def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, MessageBlock]]:
-        """(topic, messages) in file order."""
+        """Blocks of messages as (topic, messages), in file order."""
         names = set(topics)
         wanted = {n: channel.topic for n, channel in self.container.channels.items() if channel.topic in names}
         for block in self.container.blocks(set(wanted)) if wanted else ():

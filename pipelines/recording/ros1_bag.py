@@ -206,7 +206,7 @@ def _record(stream: BinaryIO, position: int, stop: int) -> tuple[dict[bytes, byt
 
 
 def _record_in(data: bytes, position: int) -> tuple[dict[bytes, bytes], int, int]:
-    """The same in a chunk's data."""
+    """Header, start and end of a record in a chunk's data."""
     try:
         (length,) = _LENGTH.unpack_from(data, position)
         start = position + length + 8

@@ -1,4 +1,4 @@
-"""What a topic holds, as arrays: the same classes come out of a recording and go into one.
+"""Series: content of a topic as arrays, the same classes for reading and writing.
 
 Stamps `t_ns` are header stamps, Unix time in integer ns, shape (N,); `stamped_by_log` counts those that had to be taken
 from the log times. Quaternions are w, x, y, z. Covariances are those of the messages: zero means unknown, and a first
@@ -28,7 +28,7 @@ _FILLED_IN: Any = None
 
 @dataclass(frozen=True)
 class Column:
-    """How an attribute of a series is held by a message: the field, the shape of one, the order of its numbers."""
+    """Mapping of a series' attribute to a message: field, shape of one value, order of its numbers."""
 
     path: str
     shape: tuple[int, ...]
@@ -234,7 +234,7 @@ class CameraInfo:
 
     @classmethod
     def of(cls, t_ns: int, size: tuple[int, int], model: str, d: Array, K: Array) -> CameraInfo:
-        """Of an unrectified camera of `size` (width, height), px."""
+        """Calibration of an unrectified camera of `size` (width, height), px."""
         return cls(t_ns, *size, model, d, K, np.eye(3), np.pad(K, ((0, 0), (0, 1))), frame_id="camera")
 
 

@@ -41,7 +41,7 @@ class Rows:
     unmeasured: tuple[int, ...] = ()
 
     def read(self, name: str, value: Any) -> Array:
-        """What somebody gives for the array of that name, as floats; what is masked is NaN.
+        """User input for the array of that name, as floats; masked values are NaN.
 
         Raises:
             InputError: it has anything but numbers, no rows, or rows of another shape.
@@ -102,7 +102,7 @@ def _without_zone(date: Any) -> Any:
 
 
 def _odd_row(value: Any) -> str:
-    """Which row is not as long as the first, as the end of a sentence."""
+    """End of a sentence: the first row of another length than row 0."""
     try:
         lengths = [len(row) if hasattr(row, "__len__") else -1 for row in value]
     except TypeError:

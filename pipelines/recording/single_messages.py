@@ -27,7 +27,7 @@ def camera_info(message: DecodedMessage) -> series.CameraInfo:
 
 
 def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
-    """(stamp in ns, file) of each picture: raw ones and those of a H.264 video in the Netpbm form."""
+    """Pictures as (stamp in ns, file): raw ones and those of a H.264 video in the Netpbm form."""
     files = (_file(message, is_raw) for message in messages)
     for t_ns, form, data in files:
         if form in images.OTHERS:
@@ -76,7 +76,7 @@ def tag_detections(messages: Iterable[DecodedMessage]) -> series.DetectionSeries
 
 
 def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], series.PoseSeries]:
-    """(Parent frame, child frame) -> transforms between them, of tf2_msgs/TFMessage messages and their log times."""
+    """Transforms in tf2_msgs/TFMessage messages with their log times, by (parent frame, child frame)."""
     rows: dict[tuple[str, str], list[tuple[int, bool, Any]]] = {}
     for message in messages:
         for one in message.content.transforms:

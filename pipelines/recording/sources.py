@@ -45,7 +45,7 @@ def along(axes: Axes | None, vectors: Array) -> Array:
 
 
 class TopicSource(BaseModel):
-    """Where a topic comes from: a recorded one as it is, one of its pairs of frames, its inverse, or two topics.
+    """Source of a topic: a recorded one, one of its pairs of frames, its inverse, or two topics.
 
     Attributes:
         topic: recorded name.
@@ -102,7 +102,7 @@ class TopicSource(BaseModel):
 
     @property
     def name(self) -> str:
-        """Of the topic recorded, or what is said of the one that is made."""
+        """Name of the recorded topic, or description of a derived one."""
         axes = f" along {', '.join(self.axes)}" if self.axes else ""
         if self.topic is None:
             return (f"{self.gyro} with {self.accel}" if self.accel else f"{self.gyro} as gyro") + axes

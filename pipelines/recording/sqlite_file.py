@@ -116,7 +116,7 @@ class SqliteFile(Container):
         return self._idle > _MOST_IDLE
 
     def _keep_whole_pages(self) -> None:
-        """Of a file that is cut read a copy with its whole pages, and their number in its head.
+        """Read a truncated file through a copy of its whole pages, their number in its header.
 
         As it is, SQLite would refuse it, or take what is missing of the last page for zeros.
         """

@@ -1,4 +1,4 @@
-"""What the stamps of a topic show: clocks that were set, stamps taken on arrival, stamps counted instead of measured.
+"""Faults of a topic's stamps: clocks that were set, stamps on arrival, stamps counted instead of measured.
 
 Three things show a clock that was set during a recording. Times that run twice: after a step back, whole runs of
 samples lie between samples taken before it, while messages that are merely late fill a hole. Stamps that step while log

@@ -51,7 +51,7 @@ class Samples(Generic[AnySeries]):
     series: AnySeries
 
     def rows(self, rows: NDArray[np.intp]) -> Samples[AnySeries]:
-        """Some of the samples."""
+        """The selected samples."""
         return Samples(checks.take_rows(self.t, rows), _rows(self.series, rows))
 
 

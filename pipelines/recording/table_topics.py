@@ -1,4 +1,4 @@
-"""What the columns of a table are, as the config says it under `columns:`, by the topic they make.
+"""Columns of a table by the config's `columns:`, and the topics that they make.
 
 columns:
   /imu: {file: imu.csv, time: t, unit: s, gyro: [wx, wy, wz], accel: [ax, ay, az], units: {gyro: deg/s}}
@@ -171,7 +171,7 @@ class TableTopic(BaseModel):
         return any(getattr(self, name) is not None for name in _SLOW)
 
     def _rows(self, path: Path, columns: Mapping[str, NDArray[np.str_]]) -> NDArray[np.bool_]:
-        """Which rows have the values that `where` asks for. Raises InputError where none has."""
+        """Mask of the rows with the values of `where`. Raises InputError where none has."""
         rows = np.ones(len(next(iter(columns.values()))), dtype=bool)
         for name, value in self.where.items():
             rows &= np.array([_is_value(text, value) for text in columns[name].tolist()], dtype=bool)
@@ -185,7 +185,7 @@ class TableTopic(BaseModel):
         return [value] if isinstance(value, str) else list(value.values() if isinstance(value, dict) else value)
 
     def _time_unit(self, form: TableForm, path: Path, notes: list[str]) -> str:
-        """As the config says it, else the header, else s."""
+        """Unit of time by the config, else by the header, else s."""
         stated = "" if self.time is None else form.units[form.index(path, self.time)]
         if self.unit is not None or stated not in TIME_UNITS:
             return self.unit or "s"
@@ -206,7 +206,7 @@ class TableTopic(BaseModel):
 
 
 def _absent(names: set[str]) -> dict[str, Any]:
-    """What an IMU has in place of a sensor that is not there: zeros whose covariance is -1, as ROS has it."""
+    """Values of an IMU's missing sensor: zeros with covariance -1, the ROS convention."""
     found: dict[str, Any] = {}
     for name in names:
         found |= {name: np.full(3, 0.0 if name == "gyro" else np.nan), f"{name}_cov": np.diag([-1.0, 0.0, 0.0])}

@@ -46,7 +46,7 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|
 
 @dataclass(frozen=True)
 class TableForm:
-    """How a table is written.
+    """Format of a table: encoding, delimiter, decimal mark, columns.
 
     Attributes:
         encoding: of its text.
@@ -119,7 +119,7 @@ def looks_like_text(start: bytes) -> bool:
 
 
 def table_form(path: Path, data: Path) -> TableForm:
-    """How a table is written. Raises InputError where it has no row of numbers."""
+    """Format of a table. Raises InputError where it has no row of numbers."""
     with data.open("rb") as stream:
         start = stream.read(_HEAD)
     encoding = _encoding(start)
@@ -196,7 +196,7 @@ def numbers(path: Path, columns: Mapping[str, NDArray[np.str_]], names: Sequence
 
 
 def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Which cells are not empty, nor stand for nothing."""
+    """Mask of cells that are neither empty nor a placeholder."""
     return ~np.isin(np.char.lower(texts), list(_ABSENT))
 
 
@@ -249,7 +249,7 @@ def _separators(lines: Sequence[str]) -> tuple[str, str]:
 
 
 def _header(lines: Sequence[str], delimiter: str, width: int) -> tuple[int | None, int | None]:
-    """Of the lines ahead of the first row the numbers of the header, and of the line of units below it."""
+    """Line numbers of the header and of the line of units, above the first row."""
     there = [i for i, line in enumerate(lines) if line.strip()]
     found: list[int] = []
     for i in reversed(there):

@@ -63,7 +63,7 @@ def read_ulog(path: Path, data: Path) -> ArrayContainer:
 
 
 def _topics(found: Any, offset: int) -> Iterator[tuple[str, series.Topic]]:
-    """What a topic of the log has, and under it the temperatures of the sensor, where it says them."""
+    """Topics from a topic of the log, with the sensor's temperature where it has one."""
     if len(found.data["timestamp"]) == 0:
         return
     name = f"/{found.name}" + (f"/{found.multi_id}" if found.multi_id else "")
@@ -77,7 +77,7 @@ def _topics(found: Any, offset: int) -> Iterator[tuple[str, series.Topic]]:
 
 
 def _unix_offset(topics: list[Any]) -> int:
-    """What makes Unix time, us, of the log's; 0 if no fix has it."""
+    """Offset from log time to Unix time, us; 0 without a GNSS fix."""
     for found in topics:
         utc = found.data.get("time_utc_usec", np.zeros(0)) if found.name in _CLOCKS else np.zeros(0)
         if utc.any():

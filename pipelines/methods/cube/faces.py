@@ -51,7 +51,7 @@ class Resting(BaseModel):
 
     @property
     def nRb(self) -> Array:
-        """(4,)"""
+        """Attitude (4,) of the resting cube."""
         up, north = np.array(SIDES[self.up]), np.array(SIDES[self.north])
         level = so3.from_matrix(np.stack([np.cross(north, up), north, up]))
         return so3.multiply(so3.exp([0.0, np.deg2rad(self.lean_deg), 0.0]), level)

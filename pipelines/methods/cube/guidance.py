@@ -100,7 +100,7 @@ _SERIES, _SEED = 6, 0
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """In words, and the changed scenario."""
+    """Proposed changes of a scenario: a phrase and the changed scenario."""
     single, series = next_poses(CubeScenario.model_validate(scenario), _SEED, _SERIES)
     for poses in (*([pose] for pose in single), series):
         more = [*scenario["attitudes"], *(pose.model_dump() for pose in poses)]
@@ -117,7 +117,7 @@ def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
 
 
 def _tag_sizes(data: CubeData, config: Config, factor: float) -> tuple[CubeData, Config] | None:
-    """All tags larger or smaller than the config says; None where it names none."""
+    """Data with all tag sizes scaled by a factor; None where the config names no tag."""
     cube = config.section(CubeConfig)
     if not cube.tags:
         return None
@@ -207,7 +207,7 @@ _REGULARISER = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _FisherInformation:
-    """Of accelerometer, magnetometer (if any) and turns, and the attitude rested in last."""
+    """Fisher information of accelerometer, magnetometer (if any) and turns, and the last attitude at rest."""
 
     accel: Array
     mag: Array | None
@@ -259,7 +259,7 @@ def _after(known: _FisherInformation, nRb: Array, field: Array | None) -> _Fishe
 
 
 def _gains(known: _FisherInformation, choices: Sequence[Resting], field: Array | None) -> Array:
-    """(choices, sensors)"""
+    """Information gain of each choice for each sensor, (choices, sensors)."""
     return np.array(
         [
             [np.log1p(row @ np.linalg.solve(information, row)) for information, row in _rows(known, each.nRb, field)]

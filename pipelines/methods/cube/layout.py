@@ -29,7 +29,7 @@ _MOST_PICTURES = 800
 
 
 def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: bool = False) -> Layout:
-    """Where the cube's tags are, seen from all sides; the first config gives their ids and sizes.
+    """Poses of the cube's tags from pictures of all sides; the first config gives ids and sizes.
 
     Of a long recording pictures are taken at even distances, a few hundred.
 
@@ -114,7 +114,7 @@ def layout_yaml(layout: Layout) -> str:
 
 
 def _covariance(layout: Layout) -> dict[str, object]:
-    """As the config's cube.covariance has it."""
+    """Covariance in the form of the config's cube.covariance."""
     known = layout.covariance if layout.with_camera is None else layout.with_camera
     rows = [" ".join(f"{x:.7g}" for x in row[: i + 1]) for i, row in enumerate(known.tolist())]
     tags: dict[str, object] = {"tags": [int(i) for i in layout.body.ids[1:]]}
@@ -122,7 +122,7 @@ def _covariance(layout: Layout) -> dict[str, object]:
 
 
 def _camera(camera: Camera) -> dict[str, object]:
-    """As the config's cube.camera has it."""
+    """Camera in the form of the config's cube.camera."""
     return {
         "focal": camera.focal.tolist(),
         "centre": camera.centre.tolist(),

@@ -29,7 +29,7 @@ _DETERMINED = 0.5
 
 
 def headline(layout: Layout) -> str:
-    """How many tags are where, how well the pictures fit, and which tag fits worst."""
+    """Sentence: number of tags placed, fit of the pictures, and the tag that fits worst."""
     placed, of = len(layout.body.ids), len(layout.body.ids) + len(layout.unplaced)
     worst, seen = max(layout.seen.items(), key=lambda item: item[1].rms_px)
     return (
@@ -39,7 +39,7 @@ def headline(layout: Layout) -> str:
 
 
 def advice(layout: Layout) -> list[str]:
-    """What to do about tags that fit badly, and those that could not be placed; sentences."""
+    """Sentences about tags that fit badly or could not be placed."""
     usual = float(np.median([seen.rms_px for seen in layout.seen.values()]))
     bad = [tag for tag, seen in layout.seen.items() if seen.rms_px > _MISFIT * usual]
     out = [f"tag {tag} could not be placed: {why}" for tag, why in layout.unplaced.items()]

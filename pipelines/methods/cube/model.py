@@ -148,7 +148,7 @@ def _trajectory(model: Model, poses: Sequence[int], values: gtsam.Values) -> Att
 
 
 def _process(model: Model, k: int) -> list[Factor]:
-    """What leads to the attitude of pose k: the turn before it, or nothing."""
+    """Factors that lead to the attitude of pose k: the turn before it, or none."""
     if k > 0 and model.samples(k).whole:
         return [turn_factor(model, k)]
     return [rotation_about(pose_key(k), model.initial[k], np.eye(3) / _ATTITUDE_PRIOR_SIGMA)]
@@ -218,7 +218,7 @@ class Model:
     dropped: Mapping[str, int]  # reason -> measurements left out
 
     def samples(self, k: int) -> Turning:
-        """What gyro and accelerometer said over the turn that ends in pose k."""
+        """Readings of gyro and accelerometer over the turn that ends in pose k."""
         rows = turn(self.data, self.poses.span[k - 1, 1], self.poses.span[k, 0])
         raw = self.config.section(CubeConfig).raw
         gyro, accel = nominal(self.data.gyro[rows], raw.gyro), nominal(self.data.accel[rows], raw.accel)
@@ -226,7 +226,7 @@ class Model:
         return Turning(t, gyro, accel, None if warming is None else warming.above(warming.first, t))
 
     def temperature_rise(self, sensor: str, k: int) -> Array | None:
-        """(1,) K, mean temperature in pose k above the recording's first; None where a sensor's offset ignores it."""
+        """Mean temperature in pose k above the first, (1,) K; None where a sensor's offset ignores it."""
         warming, celsius = self.data.temperature, self.poses.celsius
         if warming is None or celsius is None or sensor not in self.parameters.slopes:
             return None
@@ -303,7 +303,7 @@ def _levelled(nRb: Array, accel: Array) -> Array:
 
 @computed_once
 def noises(data: CubeData, config: Config) -> dict[str, Level]:
-    """What is in force, by name, in nominal SI. Raises InputError when there is no static pose."""
+    """Noises in use, by name, in nominal SI. Raises InputError when there is no static pose."""
     raw, poses = config.section(CubeConfig).raw, static_poses(data, config)
     gyro = stated_density("gyro_density", data, config, "gyro turns", "gyro at rest")
     accel = stated_density("accel_density", data, config)
@@ -374,7 +374,7 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
 
 
 def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
-    """All tags seen in pose k."""
+    """Factor of all tags seen in pose k."""
     from alidade.pipelines.vision.pose import TagBody
 
     body = TagBody.from_board(model.config.section(CubeConfig))
@@ -428,7 +428,7 @@ def _by_lens(camera: Camera, corners: Array) -> Array:
 
 
 def turn_factor(model: Model, k: int) -> Factor:
-    """What the gyro turned from pose k - 1 to pose k."""
+    """Factor of the gyro's rotation from pose k - 1 to pose k."""
     samples, feels = model.samples(k), model.parameters.sensitivity is not None
     t = samples.t
     duration = float(t[-1] - t[0])

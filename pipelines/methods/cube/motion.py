@@ -1,4 +1,4 @@
-"""How a simulated cube is moved by hand through its static poses, in closed form."""
+"""Motion of a simulated cube, by hand through its static poses, in closed form."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ class Parameters:
 
     @property
     def all(self) -> tuple[Parameter, ...]:
-        """In reporting order."""
+        """All parameters in reporting order."""
         rest = [*self.rotations[:1], self.said, *self.rotations[1:], *self.places, self.field, *self.assumed]
         return (*self.triads.values(), *(p for p in rest if p is not None))
 
@@ -258,7 +258,7 @@ def is_stated(assumption: ParameterSpec, config: Config) -> bool:
 
 
 def _slopes(config: Config) -> dict[str, Parameter]:
-    """Those over temperature that are not all fixed."""
+    """Slopes over temperature that are not all fixed, by sensor."""
     found = {name: parameter(SLOPE_KEYS[name], (each,), config) for name, each in TEMPERATURE.items()}
     return {name: parameter for name, parameter in found.items() if parameter is not None}
 

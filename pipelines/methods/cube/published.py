@@ -145,7 +145,7 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
 
 
 def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArray[np.intp], Array]:
-    """Which poses (indices) show the cube, and nRb = nRB BRC cRb there, all mounts taken as given.
+    """Indices of the poses that show the cube, and nRb = nRB BRC cRb there, with all mounts as given.
 
     Raises:
         InputError: there is no camera or no reference.
@@ -172,7 +172,7 @@ def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArr
 
 
 def _coverage(nRb: Array) -> str:
-    """How often each face was up, and whether that is the published practice."""
+    """Sentence: how often each face was up, against the published practice."""
     up = so3.rotate(so3.inverse(nRb), np.array([0.0, 0.0, 1.0]))
     axis = np.argmax(np.abs(up), axis=1)
     sign = np.take_along_axis(up, axis[:, None], axis=1)[:, 0] > 0.0

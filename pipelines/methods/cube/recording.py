@@ -58,7 +58,7 @@ class Raw(Section):
 
 
 class LayoutCovariance(Section):
-    """What cube-layout knows of its tags: covariance of rotation (rad) and position (m) of each, six numbers a tag."""
+    """Covariance of the tags' rotations (rad) and positions (m) from cube-layout, six numbers a tag."""
 
     tags: list[int]  # ids in order
     camera: bool = False  # whether its focal length (a share) and centre (px) follow after the tags
@@ -76,7 +76,7 @@ class LayoutCovariance(Section):
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """(6 n, 6 n), of a layout with camera (6 n + 3, 6 n + 3)."""
+        """Covariance matrix (6 n, 6 n); of a layout with camera (6 n + 3, 6 n + 3)."""
         out = np.zeros((len(self.rows), len(self.rows)))
         for i, row in enumerate(self.rows):
             try:
@@ -90,7 +90,7 @@ class LayoutCovariance(Section):
 
 
 class RefinedCamera(Section):
-    """What cube-layout found of the camera, which goes before the numbers of its CameraInfo."""
+    """Camera intrinsics estimated by cube-layout, which replace those of its CameraInfo."""
 
     focal: Annotated[tuple[Sigma, Sigma], Field(strict=False)]  # px
     centre: Annotated[tuple[float, float], Field(strict=False)]  # px
@@ -152,7 +152,7 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class CubeData:
-    """What a cube session measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+    """Measurements of a cube session. Times are s from epoch_ns (Unix ns), strictly increasing.
 
     imu_t (N,), gyro (N, 3), accel (N, 3): the device's, as recorded, rad/s and m/s^2 or counts. mag_t (L,), mag (L, 3):
     T or counts; None when it has none. reference_t (R,), reference_wxyz (R, 4): attitude nRB of the reference in
@@ -185,7 +185,7 @@ class CubeData:
 
     @cached_property
     def computed(self) -> dict[tuple[str, str], object]:
-        """What functions made by `computed_once` have found in these data: (function, config) -> result."""
+        """Cache of functions made by `computed_once`: (function, config) -> result."""
         return {}
 
 
@@ -232,7 +232,7 @@ def stated_density(name: str, data: CubeData, config: Config, *families: str) ->
 
 
 def noise_densities(data: CubeData, config: Config) -> tuple[float, ...]:
-    """Of gyro, accelerometer and magnetometer as stated, nominal SI per sqrt(Hz)."""
+    """Stated noise densities of gyro, accelerometer and magnetometer, nominal SI per sqrt(Hz)."""
     return tuple(stated_density(name, data, config).stated for name in DENSITIES)
 
 

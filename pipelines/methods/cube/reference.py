@@ -36,7 +36,7 @@ class Reference:
 
     @property
     def nRC(self) -> Array:
-        """(P, 4) attitude of the camera with the mount as given."""
+        """Attitude (P, 4) of the camera with the mount as given."""
         return so3.multiply(self.nRB, self.BRC)
 
 
@@ -96,7 +96,7 @@ def _squares(errors: Array, covariance: Array) -> float:
 
 
 def _on_the_right(mean: Array, about_n: Array, copies: int) -> Array:
-    """(copies, 3, 3) covariance of delta in mean Exp(delta), from the one about the axes of n."""
+    """Covariance (copies, 3, 3) of delta in mean Exp(delta), from the one about the axes of n."""
     R = so3.matrix(mean)
     return np.tile(R.T @ about_n @ R, (copies, 1, 1))
 

@@ -511,7 +511,7 @@ def calibrated(
 
 
 def calibrated_rates(data: CubeData, config: Config, values: Mapping[str, float]) -> Array:
-    """All of the gyro's samples calibrated, (N, 3) rad/s in b."""
+    """Calibrated rates of all gyro samples, (N, 3) rad/s in b."""
     raw = config.section(CubeConfig).raw
     celsius = None if data.temperature is None else data.temperature.above(0.0, data.imu_t)
     accel = nominal(data.accel, raw.accel) if "accel_k11" in values else None
@@ -539,7 +539,7 @@ _NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg
 
 
 def cube_tables(calibration: Calibration) -> list[Table]:
-    """Of what was found beside the parameters; empty ones are left out."""
+    """Tables of the findings beside the parameters; empty ones are left out."""
     tables = (
         _noise_table(calibration),
         _static_poses(calibration),

@@ -1,4 +1,4 @@
-"""What the cube's simulator is asked for, and the config that its recordings carry."""
+"""Settings of the cube's simulator, and the config that its recordings carry."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class FieldErrors(_Part):
 
 
 class Place(_Part):
-    """Where on the earth."""
+    """Place on the earth."""
 
     latitude_deg: float = 40.0
     longitude_deg: float = 116.3
@@ -70,7 +70,7 @@ class TagCube(_Part):
 
 
 class Pictures(_Part):
-    """Of the camera, where they are drawn in place of detections."""
+    """Settings of the camera, where pictures replace detections."""
 
     rate_hz: Positive = 5.0
     blur_px: NotNegative = 0.7
@@ -106,7 +106,7 @@ class ReferenceAttitude(_Part):
 
 
 class CubeScenario(_Part):
-    """What the `cube` simulator is asked for; every key has a default, `null` leaves a sensor out."""
+    """Settings of the `cube` simulator; every key has a default, `null` leaves a sensor out."""
 
     poses: Annotated[int, Field(ge=0)] = 24  # in random attitudes
     attitudes: list[Resting] = []  # of more poses, after those

@@ -274,7 +274,7 @@ class _World:
         return [*others, *(tag_quad(i, self.scenario.cube.tag_size, cRt, centre) for i, (cRt, centre) in tags)]
 
     def _finger(self, t: float) -> list[Quad]:
-        """At times a finger lies on the edge of a tag."""
+        """A finger on the edge of a tag, drawn at random, as a quad; often none."""
         tags, camera = list(self._tags_at(t).values()), self.scenario.camera
         if not tags or camera is None or self.rng.random() > camera.occluded * len(tags):
             return []

@@ -1,4 +1,4 @@
-"""What each static pose of a cube session says: means of the sensors, and of the tags' corners with their pose."""
+"""Measurements in each static pose of a cube session: means of the sensors and of the tags' corners."""
 
 from __future__ import annotations
 

@@ -191,7 +191,7 @@ def tag_places(config: Config) -> tuple[Parameter, ...]:
 
 
 def layout_prior(config: Config) -> GaussianPrior | None:
-    """What the layout's covariance says of tags and of the camera, but for numbers with a prior given elsewhere."""
+    """Prior of tags and camera by the layout's covariance, except numbers with a prior of their own."""
     cube = config.section(CubeConfig)
     if cube.covariance is None:
         return None

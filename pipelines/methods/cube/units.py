@@ -37,7 +37,7 @@ _ROUND = 0.12
 
 @dataclass(frozen=True)
 class Readings:
-    """What a sensor said: its topic, stamps (n,), s, values (n, 3) as recorded, and the config's conversion."""
+    """Readings of a sensor: topic, stamps (n,), s, values (n, 3) as recorded, and the config's conversion."""
 
     topic: str
     t: Array
@@ -61,7 +61,7 @@ def check_units(accel: Readings, gyro: Readings, mag: Readings | None = None) ->
 
 
 def _wrong(name: str, readings: Readings) -> str:
-    """What is implausible about a sensor, empty if nothing is."""
+    """Sentence about an implausible sensor; empty without fault."""
     values = nominal(readings.values, readings.conversion)
     if name == "gyro":
         said = too_fast(readings.topic, readings.t, values)
@@ -107,7 +107,7 @@ def _accel(values: Array) -> tuple[float, float] | None:
 
 
 def _mag(values: Array) -> tuple[float, float] | None:
-    """By what is usual for the field's strength, all directions seen; no offset, which is iron as well."""
+    """Conversion by the usual strength of the field over all directions; no offset, which may be hard iron."""
     low, high = np.quantile(values, [0.005, 0.995], axis=0)
     radius = 0.5 * float(np.median(high - low))
     return (_FIELD / radius, 0.0) if radius > 0.0 else None

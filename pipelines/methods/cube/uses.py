@@ -1,4 +1,4 @@
-"""What a cube result is used for."""
+"""Uses of a cube result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the offset of a cube's gyro wanders about its mean over the session."""
+"""Random walk of a cube gyro's offset about its mean over the session."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sum_key(k: int) -> int:
 
 @dataclass(frozen=True)
 class GaussMarkovDeviation:
-    """How the gyro's offset deviates from its mean over the session: a random walk that stays bounded.
+    """Deviation of the gyro's offset from its mean over the session: a random walk that stays bounded.
 
     A first-order Gauss-Markov process: over short times the walk, over the session the deviation that a walk has from
     its own mean, whose variance is walk^2 times a sixth of the session.
@@ -45,7 +45,7 @@ class GaussMarkovDeviation:
 
     @classmethod
     def over(cls, poses: StaticPoses, walk: float) -> GaussMarkovDeviation:
-        """For a walk in rad/s/sqrt(s)."""
+        """Deviation for a walk in rad/s/sqrt(s)."""
         start, stop = poses.span.T
         middle = 0.5 * (start + stop)
         length = float(stop[-1] - start[0])
@@ -55,7 +55,7 @@ class GaussMarkovDeviation:
         return cls(stationary * np.sqrt(1.0 - correlation**2), correlation, np.diff(edges) / length)
 
     def factors(self, k: int) -> list[Factor]:
-        """How the offset came to where it is in pose k, and its mean so far; after the last, that c is the mean.
+        """Factors of the offset's walk to pose k and of its mean so far; after the last, that c is the mean.
 
         The mean of the session is zero to `_STEADY`, in variance half by the steps of the sum and half by its end.
         """

@@ -35,7 +35,7 @@ _SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """In words, and the changed scenario."""
+    """Proposed changes of a scenario: a phrase and the changed scenario."""
     for who, key in (("head", "head"), ("platform", "platform")):
         for words, motion in sways(scenario[key], _SWAY):
             yield f"the {who}: {words}", {**scenario, key: motion}

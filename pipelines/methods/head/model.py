@@ -128,7 +128,7 @@ def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
 
 
 def _noises(data: HeadData, config: Config) -> dict[str, Level]:
-    """What is in force, by name."""
+    """Noises in use, by name."""
     found = [
         estimated("vision_attitude", config, (_FAMILY,), typical(data.vision_cov, 0, 1, 2)),
         estimated("gyro_density", config, ("gyro",), data.gyro_density),
@@ -256,7 +256,7 @@ def _all_around(attitudes: Array) -> bool:
 
 
 def _inside(data: HeadData, taken: Array) -> NDArray[np.bool_]:
-    """Which frames were taken within the gyros' records. Raises InputError if these are too few."""
+    """Mask of frames within the gyros' records. Raises InputError if these are too few."""
     inside = (taken >= data.head_t[0]) & (taken <= data.head_t[-1])
     if data.platform_t is not None:
         inside &= (taken >= data.platform_t[0]) & (taken <= data.platform_t[-1])
@@ -269,7 +269,7 @@ def _inside(data: HeadData, taken: Array) -> NDArray[np.bool_]:
 
 
 def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], config: Config) -> Array:
-    """(n, 3, 3): from the config, else from the messages, else the default."""
+    """Square-root information (n, 3, 3) of attitudes: by the config, else by the messages, else the default."""
     if covariance is None or config.noise.vision_attitude is not None:
         sigma = first_given(config.noise.vision_attitude, DEFAULT_NOISE.vision_attitude)
         return np.broadcast_to(np.eye(3) / sigma, (int(inside.sum()), 3, 3))

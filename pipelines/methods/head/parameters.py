@@ -97,7 +97,7 @@ class HeadParameters:
         stamp_sigma: float = 0.0,
         all_around: bool = False,
     ) -> HeadParameters:
-        """With the priors in force; a camera without a moving platform is fixed by default.
+        """Parameters with the priors of the config; a camera without a moving platform is fixed by default.
 
         Motion capture has no scale of its angles, unless the config says something of it.
 
@@ -140,7 +140,7 @@ class HeadParameters:
 
     @property
     def all(self) -> tuple[Parameter, ...]:
-        """In reporting order."""
+        """All parameters in reporting order."""
         found = (self.bias, self.helmet, self.camera, self.picture, self.gyro, self.platform)
         return tuple(each for each in found if each is not None)
 

@@ -28,7 +28,7 @@ _NEAREST_TO_VERTICAL = np.deg2rad(5.0)
 
 @dataclass(frozen=True)
 class HeadFilterResult:
-    """What the filter knows at each vision frame, after using it.
+    """State of the published filter at each vision frame, after its update.
 
     Attributes:
         t: (K,) stamps of the vision frames used, s from the session's start.
@@ -216,7 +216,7 @@ def _nearest_angles(measured: Array, predicted: Array) -> Array:
 
 
 def _steps(data: HeadData, vision_t: Array) -> list[list[tuple[float, Array, Array]]]:
-    """For each interval between vision frames its steps (dt, w_iv, w_ib), from gyro stamp to gyro stamp.
+    """Integration steps (dt, w_iv, w_ib) of each interval between vision frames, from gyro stamp to gyro stamp.
 
     A sample is the mean rate about its stamp, so each step takes the rate at its middle (trapezoid).
     """

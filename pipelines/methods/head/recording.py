@@ -53,7 +53,7 @@ _ROTATION = slice(3, 6)  # of the 6x6 covariance of a pose
 
 @dataclass(frozen=True, eq=False)
 class HeadData:
-    """What a head session measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+    """Measurements of a head session. Times are s from epoch_ns (Unix ns), strictly increasing.
 
     head_t (N,), head_gyro (N, 3) rad/s: helmet gyro w_iv in v. platform_t (M,), platform_gyro (M, 3) rad/s: platform
     gyro w_ib in b; both None when there is no platform topic. vision_t (K,), vision_wxyz (K, 4): measured cRh, unit.

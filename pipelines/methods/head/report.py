@@ -201,7 +201,7 @@ class _Applied:
 
     @classmethod
     def of(cls, data: HeadData, values: Mapping[str, float]) -> _Applied:
-        """From parameter values; those not there are zero."""
+        """Corrections from parameter values; missing ones are zero."""
         known = dict.fromkeys(_MOUNTS, 0.0) | dict(values)
         mounts = apply([each for each in formulas(known) if not each.inputs], known, {})
         helmet, platform = helmet_gyro(data, known), _platform_gyro(data, known)
@@ -283,7 +283,7 @@ def _validation(against: str, time: Array, errors: Sequence[Array], note: str = 
 
 
 def _vision_noise(data: HeadData, config: Config, start: NDArray[np.intp], stop: NDArray[np.intp]) -> str:
-    """What the noise of the two vision frames alone makes of the error."""
+    """Phrase: part of the error that the noise of the two vision frames causes."""
     if config.noise.vision_attitude is not None:
         variance = 6.0 * config.noise.vision_attitude**2
     elif data.vision_cov is not None:

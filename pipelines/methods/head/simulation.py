@@ -130,7 +130,7 @@ class HeadNoise(BaseModel):
 
 
 class HeadScenario(BaseModel):
-    """What the `head` simulator is asked for; every key has a default."""
+    """Settings of the `head` simulator; every key has a default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -266,7 +266,7 @@ def _gyro(scenario: HeadScenario, rate_hz: float, phase: float, helmet: bool) ->
 
 
 def _specific_force(scenario: HeadScenario, t: Array) -> Array:
-    """What the helmet's accelerometer would read without noise, (N, 3) m/s^2 in v: it turns about a point at rest."""
+    """Specific force of the helmet in v without noise, (N, 3) m/s^2, rotating about a point at rest."""
     nRv = scenario.head.attitude(t)
     if scenario.platform is not None:
         nRv = so3.multiply(scenario.platform.attitude(t), nRv)

@@ -1,4 +1,4 @@
-"""What a head result is used for: the helmet's attitude, from vision and, where there is none, from the gyro."""
+"""Use of a head result: the helmet's attitude, from vision and, without vision, from the gyro."""
 
 from __future__ import annotations
 

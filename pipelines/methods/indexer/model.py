@@ -121,7 +121,7 @@ def problem(data: IndexerData, config: Config) -> Problem:
 
 
 def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[Level, ...]:
-    """What mean rates repeat to, by kind of window: noise of gyro and encoders, and what else there is."""
+    """Repeatability of mean rates, by kind of window: noise of gyro and encoders, and additional noise."""
     found = []
     known = max(gyro.noise.known, encoders.noise.known)
     source = gyro.noise.source if encoders.noise.known < known else encoders.noise.source

@@ -36,7 +36,7 @@ _FLAT = 1e-9
 
 @dataclass(frozen=True)
 class HalfDifference:
-    """Of one position.
+    """Half difference of the mean rates of one position.
 
     Attributes:
         position: 1 and 2 outer axis, 3 and 4 inner axis, with the other at 0 and at half a turn.
@@ -53,7 +53,7 @@ class HalfDifference:
 
 @dataclass(frozen=True)
 class ThinShell:
-    """What the search found.
+    """Result of the thin-shell search.
 
     Attributes:
         theta: (3,) rad.
@@ -117,7 +117,7 @@ def published_estimate(data: IndexerData, config: Config, problem: Problem) -> E
 
 
 def _covariance(found: ThinShell, density: float) -> Array:
-    """(3, 3) rad^2: white gyro noise through the eight components; an angle without influence gets 1 rad."""
+    """Covariance (3, 3) rad^2 of white gyro noise through the eight components; 1 rad for an unobserved angle."""
     step = 1e-6
     information = np.eye(3)
     for i, half in enumerate(found.half_differences):
@@ -129,7 +129,7 @@ def _covariance(found: ThinShell, density: float) -> Array:
 
 
 def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
-    """Of the positions that the recording has, in their order; several visits of a position are averaged.
+    """Half differences of the positions in the recording, in order; visits of a position are averaged.
 
     Raises:
         InputError: no position has whole turns forward and back.
@@ -199,7 +199,7 @@ def search(measured: tuple[HalfDifference, ...], half_width: float, iterations: 
 
 @dataclass
 class _Tally:
-    """What a sweep met, by angle."""
+    """Counts of a sweep, per angle."""
 
     fourth: list[int] = field(default_factory=lambda: [0, 0, 0])
     flat: list[bool] = field(default_factory=lambda: [False, False, False])

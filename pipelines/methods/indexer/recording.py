@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class IndexerData:
-    """What an indexer session has measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+    """Measurements of an indexer session. Times are s from epoch_ns (Unix ns), strictly increasing.
 
     gyro_t (N,), gyro (N, 3) rad/s: rate w_im of the IMU on the indexer, in m. encoder_t (M,), outer (M,), inner (M,)
     rad: axis angles as recorded, wrapped or continuous. latitude_deg: from /fix or the config, None if unknown.

@@ -67,7 +67,7 @@ class IndexerNoise(BaseModel):
 
 
 class IndexerScenario(BaseModel):
-    """What the `indexer` simulator is asked for; every key has a default."""
+    """Settings of the `indexer` simulator; every key has a default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -199,7 +199,7 @@ def indexer_config(scenario: IndexerScenario) -> str:
 
 
 def _program(scenario: IndexerScenario) -> tuple[list[_Drive], float]:
-    """All motions in time order and the duration, s."""
+    """Motions in time order and the duration, s."""
     drives: list[_Drive] = []
     at = np.zeros(2)
     now = scenario.dwell_s
@@ -270,7 +270,7 @@ def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t:
 
 
 def _once_per_turn(angles: Array, effects: Mapping[str, float]) -> Array:
-    """What the encoders read too much at the axes' angles (2, N), rad."""
+    """Once-per-turn errors of the encoders at the axes' angles (2, N), rad."""
     sine, cosine = ([[effects[f"encoder_{joint}_{part}"]] for joint in JOINTS] for part in ("sin", "cos"))
     return np.asarray(sine * np.sin(angles) + cosine * np.cos(angles))
 

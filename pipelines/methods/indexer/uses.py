@@ -1,4 +1,4 @@
-"""What an indexer result is used for: attitude by the IMU on it over an hour of indexing."""
+"""Use of an indexer result: attitude by its IMU over an hour of indexing."""
 
 from __future__ import annotations
 

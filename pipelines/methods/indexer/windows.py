@@ -229,7 +229,7 @@ class Group:
 
     @property
     def mean_gyro(self) -> Array:
-        """(3,) mean rate over the whole group, rad/s."""
+        """Mean rate (3,) over the whole group, rad/s."""
         return np.asarray(np.diff(self.rates.edges) @ self.gyro / self.duration)
 
     def temperature_rise(self, reference: float | None) -> Array | None:
@@ -238,7 +238,7 @@ class Group:
 
     @property
     def mean_platform(self) -> Array:
-        """(3,) mean rate of the platform over the whole group with perpendicular axes, in t, rad/s."""
+        """Mean rate (3,) of the platform over the whole group with perpendicular axes, in t, rad/s."""
         return np.asarray(np.diff(self.rates.edges) @ (self.rates.fixed + self.rates.cosine) / self.duration)
 
     @property
@@ -286,7 +286,7 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
 
 
 def _borders(motion: AxisMotion, run: Run) -> Iterator[tuple[str, Array]]:
-    """For each group of a run its kind and the times at which its windows begin and end."""
+    """Kind and window edges, s, of each group of a run."""
     if run.axis == "none":
         # Ends early enough for the motion that follows to start where it does.
         yield "dwell", np.array([run.start, run.stop - _DWELL_MARGIN * float(np.median(np.diff(motion.t)))])

@@ -34,7 +34,7 @@ _ADDED_SWAY = {"amplitude_deg": 5.0, "frequency_hz": 0.29}
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """In words, and the changed scenario."""
+    """Proposed changes of a scenario: a phrase and the changed scenario."""
     for words, motion in sways(scenario["carrier"], _ADDED_SWAY):
         yield f"the carrier: {words}", {**scenario, "carrier": motion}
     # Another target from the middle of the longest segment of one target.

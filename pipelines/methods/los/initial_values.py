@@ -106,7 +106,7 @@ def foreseen(chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measur
 
 
 def _broken_line(t: Array, values: Array) -> Array:
-    """(n, d) the least-squares fit to values (n, d) at times (n,) of a piecewise linear function with given knots.
+    """Least-squares fit (n, d) of a piecewise linear function with given knots to values (n, d) at times (n,).
 
     Its normal equations are tridiagonal: knots and times without the product of their numbers.
     """
@@ -206,7 +206,7 @@ def guess_picture_clock(
 
 
 def _sigmas(angles: Parameter) -> Array:
-    """(d,) rad, of the mounting angles and what is assumed with them."""
+    """Prior sigmas (d,) of the mounting angles and nuisance parameters, rad."""
     return np.where([q.assumed for q in angles.quantities], _HELD, 1.0) * prior_sigmas(angles)
 
 
@@ -219,7 +219,7 @@ def _miss_by_clock(
     gimbal: GimbalPath,
     gyro: GyroPath,
 ) -> Miss:
-    """What `_miss` says near some x whose last two numbers are the clock's, the gyro's turns looked up there alone."""
+    """Function `_miss` near x whose last two numbers are the clock's; the gyro's rotations are computed once."""
 
     def taken(x: Array) -> tuple[Array, Array]:
         clock = Clock(begun, *x[-2:])
@@ -237,7 +237,7 @@ def _miss_by_clock(
 def _miss(
     x: Array, names: tuple[str, ...], turns: Increments, gimbal: tuple[Array, Array], before: Array, after: Array
 ) -> Array:
-    """By how much LOS errors before a turn, carried on by it, miss those after it (n, 2), rad.
+    """Prediction errors (n, 2) of LOS errors after a rotation from those before it, rad.
 
     Args:
         x: mounting angles of these names and bias.
@@ -331,7 +331,7 @@ def _in_gap(t: Array, at: Array) -> NDArray[np.bool_]:
 
 
 def _first_of_target(data: LosData, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Where a chain starts: after a gap in which the target may have changed, and after a gap of the gyro."""
+    """Mask of first pictures of a chain: after a gap in which the target may have changed, or of the gyro."""
     starts = np.ones(len(rows), dtype=bool)
     if len(rows) < 2:
         return starts
@@ -344,7 +344,7 @@ def _first_of_target(data: LosData, rows: NDArray[np.intp]) -> NDArray[np.bool_]
 
 
 def _wrong_before_followers(error: Array, sigma: Array) -> int:
-    """How many LOS errors at the start of a chain disagree with the median of those that follow."""
+    """Number of LOS errors at the start of a chain that disagree with the median of the next."""
     for i in range(len(error) - _FOLLOWERS):
         after = error[i + 1 : i + 1 + _FOLLOWERS]
         drift = np.median(np.abs(np.diff(after, axis=0)), axis=0)

@@ -108,7 +108,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
 
 
 def _noises(data: LosData, config: Config) -> dict[str, Level]:
-    """What is in force, by name; that of the encoders is part of what the tracker's rows have."""
+    """Noises in use, by name; the encoders' noise is part of the tracker's rows."""
     los, roll = typical(data.error_cov, 0, 1), typical(data.error_cov, 2)
     found = [Level(stated("los_error", config, los, _FAMILIES, (0, 1)))]
     if np.isfinite(data.error[:, 2]).any():
@@ -224,7 +224,7 @@ class _Used:
     def of(
         cls, data: LosData, config: Config, gimbal: GimbalPath, margin: float, start: float
     ) -> tuple[_Used, dict[str, int]]:
-        """Those from `start` on, `margin` s away from gaps, and how many are left out for which reason."""
+        """Pictures used, from `start` on and `margin` s away from gaps, and the numbers left out by reason."""
         covariance = _covariance(data, gimbal, config)
         rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), margin)
         late = data.image_t[rows] >= start
@@ -248,7 +248,7 @@ def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> 
 
 
 def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
-    """(K, 3, 3) of phx, phz, roll: the tracker's or the config's, and the encoders'; NaN where not measured."""
+    """Covariance (K, 3, 3) of phx, phz, roll: tracker's or config's, and the encoders'; NaN where not measured."""
     if data.error_cov is None:
         los = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
         roll = first_given(config.noise.los_roll, DEFAULT_NOISE.los_roll)
@@ -266,7 +266,7 @@ def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
 
 
 def _sqrt_information(covariance: Array) -> Array:
-    """(K, 3, 3) upper triangular R with R'R the information; the last row and column are zero without roll."""
+    """Square-root information R (K, 3, 3), upper triangular; last row and column are zero without roll."""
     out = np.zeros_like(covariance)
     rolls = np.isfinite(covariance[:, 2, 2])
     for size, mine in ((3, rolls), (2, ~rolls)):
@@ -357,7 +357,7 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str)
 
 
 def _advice(weights: Mapping[str, float]) -> Motion:
-    """What would make a weak direction observable."""
+    """Motion that would make a weak direction observable."""
     strong = {name for name, weight in weights.items() if abs(weight) > 0.3}
     if {each.name for each in AZIMUTH_ZEROS} <= strong:
         return Motion(

@@ -106,7 +106,7 @@ class LosParameters:
 
     @classmethod
     def of(cls, config: Config, drivers: Sequence[ParameterSpec], stamp_sigma: float = 0.0) -> LosParameters:
-        """With the priors in force.
+        """Parameters with the priors of the config.
 
         Args:
             config: priors, data sheets, accuracies wanted.
@@ -139,7 +139,7 @@ class LosParameters:
 
     @property
     def all(self) -> tuple[Parameter, ...]:
-        """In reporting order."""
+        """All parameters in reporting order."""
         return tuple(each for each in (self.angles, self.bias, self.sight, self.gyro) if each is not None)
 
 

@@ -26,7 +26,7 @@ NAMES = ("delta_px", "delta_gx", "delta_gy", "delta_z")
 
 @dataclass(frozen=True, eq=False)
 class LosLeastSquares:
-    """What the filter knows after each interval between pictures.
+    """Estimates of the published least squares after each interval between pictures.
 
     Attributes:
         t: (n,) ends of the intervals, s from the session's start.

@@ -77,7 +77,7 @@ _ERRORS = Rows((3,), unmeasured=_ROLL)
 
 @dataclass(frozen=True, eq=False)
 class LosData:
-    """What a los session measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+    """Measurements of a los session. Times are s from epoch_ns (Unix ns), strictly increasing.
 
     gyro_t (N,), gyro (N, 3) rad/s: carrier gyro in m. gimbal_t (G,), gimbal (G, 2) rad: azimuth (continuous) and
     elevation. image_t (K,), error (K, 3) rad: phx, phz and the camera's roll since its target was found, NaN where the

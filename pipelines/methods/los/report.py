@@ -255,7 +255,7 @@ def _camera_attitude(gimbal: Array, px: float) -> Array:
 
 
 def _near_neighbours(error: Array) -> NDArray[np.bool_]:
-    """Which LOS errors (n, 2) lie near the median of those around them."""
+    """Mask of LOS errors (n, 2) near the median of their neighbours."""
     if len(error) < _NEIGHBOURS:
         return np.ones(len(error), dtype=bool)
     half = _NEIGHBOURS // 2

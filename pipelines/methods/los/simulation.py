@@ -100,7 +100,7 @@ class LosCamera(BaseModel):
 
 
 class LosScenario(BaseModel):
-    """What the `los` simulator is asked for; every key has a default."""
+    """Settings of the `los` simulator; every key has a default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -150,7 +150,7 @@ class LosScenario(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class LosMotion:
-    """What happened, before anything but the gyro measured it.
+    """True motion of a simulated los session, without sensor errors.
 
     Attributes:
         edges: (N + 1,) s, ends of the gyro's intervals.
@@ -174,7 +174,7 @@ class LosMotion:
         return np.stack([np.interp(t, self.edges, self.gimbal[:, k]) for k in range(2)], axis=1)
 
     def covers(self, t: Array) -> NDArray[np.bool_]:
-        """Which of the times (n,) lie in what happened."""
+        """Mask of the times (n,) within the simulated motion."""
         return np.asarray((t >= self.edges[0]) & (t <= self.edges[-1]))
 
 

@@ -1,4 +1,4 @@
-"""What a los result is used for: pointing, and stabilising the line of sight."""
+"""Uses of a los result: pointing, and stabilising the line of sight."""
 
 from __future__ import annotations
 
