@@ -90,6 +90,15 @@ class Line:
 
 
 @dataclass(frozen=True)
+class Coefficients:
+    """Numbers that describe a curve of a scalar error: `of` maps errors (..., U) to (..., k), nan where undefined."""
+
+    names: tuple[str, ...]
+    of: Callable[[Array], Array]
+    formula: str
+
+
+@dataclass(frozen=True)
 class Use:
     """A use of a calibration, and its error.
 
@@ -103,6 +112,7 @@ class Use:
         label: of the headline figure.
         at: operating point of the headline figure; None: the worst.
         signed: a scalar error.
+        coefficients: of each curve of a scalar error.
     """
 
     name: str
@@ -118,6 +128,7 @@ class Use:
     label: str
     at: int | None = None
     signed: bool = False
+    coefficients: Coefficients | None = None
 
 
 @dataclass(frozen=True)
@@ -152,6 +163,7 @@ class Band:
         uncorrelated: bound from the sigmas alone.
         whole: bound if all estimates were applied, those of nuisance parameters too.
         actual: error by the truth, where known.
+        coefficients: (k, 4) before, sigma, after, sigma; None where the use has none.
     """
 
     before: Array
@@ -162,6 +174,7 @@ class Band:
     uncorrelated: Array
     whole: Array
     actual: Array | None
+    coefficients: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -186,6 +199,21 @@ class UseBands:
     def after(self) -> float:
         """Largest 95 % bound after calibration."""
         return self.figure(lambda band: band.bound + np.abs(band.after) * self.use.signed)
+
+    @property
+    def coefficients(self) -> dict[str, dict[str, dict[str, float]]] | None:
+        """Line -> name -> before, before_sigma, after, after_sigma, in the use's unit; None where the use has none."""
+        if self.use.coefficients is None:
+            return None
+        columns = ("before", "before_sigma", "after", "after_sigma")
+        return {
+            line: {
+                name: dict(zip(columns, (self.use.factor * row).tolist(), strict=True))
+                for name, row in zip(self.use.coefficients.names, band.coefficients, strict=True)
+            }
+            for line, band in self.bands.items()
+            if band.coefficients is not None
+        }
 
 
 def use_bands(use: Use, posterior: Posterior) -> UseBands:
@@ -246,7 +274,8 @@ def _band(use: Use, line: Line, posterior: Posterior) -> Band:
             Z95 * np.sqrt(each[:, 0, 0]) for each in (S + noise, alone, allowed, S_w)
         )
         bounds = mean0[:, 0] - spread, mean0[:, 0] + spread
-        return Band(mean0[:, 0], bounds, mean[:, 0], half, half_allowed, half_alone, half_w, flat)
+        numbers = None if use.coefficients is None else _coefficients(use.coefficients, line, posterior)
+        return Band(mean0[:, 0], bounds, mean[:, 0], half, half_allowed, half_alone, half_w, flat, numbers)
     return Band(
         length,
         (np.maximum(length - spread, 0.0), length + spread),
@@ -257,6 +286,19 @@ def _band(use: Use, line: Line, posterior: Posterior) -> Band:
         _length_bound(mean_w, S_w + noise),
         None if actual is None else np.linalg.norm(actual, axis=-1),
     )
+
+
+def _coefficients(coefficients: Coefficients, line: Line, posterior: Posterior) -> Array:
+    """(k, 4) of a line: values with nominal parameters applied, sigmas, and both with the estimated ones."""
+    columns = []
+    for applied in (posterior.nominal, posterior.applied):
+
+        def compute(t: Array, applied: Applied = applied) -> Array:
+            return coefficients.of(line.error(applied, Truth(posterior.names, t)))[..., None]
+
+        mean, J = _linearised(compute, posterior)
+        columns += [mean[:, 0], np.sqrt(np.einsum("ki,ij,kj->k", J[:, 0], posterior.P, J[:, 0]))]
+    return np.stack(columns, axis=1)
 
 
 def _linearised(error: Callable[[Array], Array], posterior: Posterior) -> tuple[Array, Array]:

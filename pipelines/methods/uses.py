@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
+from alidade.pipelines.diagnostics.use import Applied, Coefficients, Line, Truth, Use
 from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.triads import gain_names
@@ -22,6 +22,7 @@ Sensors = Callable[[Truth, Mapping[str, Array]], dict[str, Array]]
 _EZ = np.array([0.0, 0.0, 1.0])
 # Dip that is assumed where nothing says it, rad.
 _DIP = 1.0
+_DEVIATION = "deviation = magnetic heading − compass heading = −e = A + B sin h + C cos h + D sin 2h + E cos 2h"
 
 
 def raw_of(true: Truth, sensor: str, nominal: Array) -> Array:
@@ -58,32 +59,29 @@ def _sorted(i: str, j: str) -> str:
 def _heading(true: Truth, sensors: Sensors) -> Use:
     psi = np.arange(0.0, 361.0, 5.0)
     tilted = "accel_k11" in true
-    if "field_n" in true:
-        horizontal, up = float(np.hypot(true.get("field_e"), true.get("field_n"))), float(true.get("field_u"))
-    else:
-        strength, dip = float(true.get("field_strength", 1.0)), float(true.get("field_dip", _DIP))
-        horizontal, up = strength * np.cos(dip), -strength * np.sin(dip)
-    field = np.array([horizontal, 0.0, up])  # magnetic north, west, up
+    usual = float(true.get("field_dip", _DIP))
 
     def error(roll_deg: float) -> Callable[[Applied, Truth], Array]:
         nRb = so3.multiply(so3.exp(-np.deg2rad(psi)[:, None] * _EZ), so3.exp(np.deg2rad([roll_deg, 0.0, 0.0])))
-        nominal = {"mag": so3.rotate(so3.inverse(nRb), field), "accel": so3.rotate(so3.inverse(nRb), G * _EZ)}
+        up = so3.rotate(so3.inverse(nRb), G * _EZ)
         ahead = so3.rotate(nRb, np.array([1.0, 0.0, 0.0]))
         truth = np.arctan2(-ahead[:, 1], ahead[:, 0])
 
         def compute(applied: Applied, true: Truth) -> Array:
-            found = applied(**sensors(true, nominal))
+            field = so3.rotate(so3.inverse(nRb), _field(true, usual)[..., None, :])
+            found = applied(**sensors(true, {"mag": field, "accel": up}))
             m = found["m_b"]
-            up = found["f_b"] / np.linalg.norm(found["f_b"], axis=-1, keepdims=True) if tilted else _EZ
-            west = np.cross(up, m)
-            north = np.cross(west, up)
+            zenith = found["f_b"] / np.linalg.norm(found["f_b"], axis=-1, keepdims=True) if tilted else _EZ
+            west = np.cross(zenith, m)
+            north = np.cross(west, zenith)
             e = np.arctan2(-west[..., 0], north[..., 0]) - truth
             return np.asarray((e + np.pi) % (2.0 * np.pi) - np.pi)
 
         return compute
 
     lines = [Line("level", error(0.0))] + ([Line("rolled 30 deg", error(30.0), "series1")] if tilted else [])
-    dip = np.degrees(np.arctan2(-up, horizontal))
+    north, _, up = _field(true, usual)
+    dip = np.degrees(np.arctan2(-up, north))
     return Use(
         "heading",
         "Heading from the magnetometer",
@@ -97,7 +95,32 @@ def _heading(true: Truth, sensors: Sensors) -> Use:
         f"dip {dip:.1f} deg, {'tilt from the accelerometer' if tilted else 'level'}",
         "heading, any direction",
         signed=True,
+        coefficients=Coefficients(tuple("ABCDE"), deviation_coefficients, _DEVIATION),
     )
+
+
+def _field(true: Truth, dip: float) -> Array:
+    """(..., 3) to magnetic north, west and up, in the unit of the strength; `dip`, rad, where none is known."""
+    if "field_n" in true:
+        north, up = np.hypot(true.get("field_e"), true.get("field_n")), true.get("field_u")
+    else:
+        strength, dips = true.get("field_strength", 1.0), true.get("field_dip", dip)
+        north, up = strength * np.cos(dips), -strength * np.sin(dips)
+    return np.stack([north, 0.0 * north, up], axis=-1)
+
+
+def deviation_coefficients(e: Array) -> Array:
+    """(..., 5) A to E of the deviation -e, first and second harmonic, of heading errors (..., U) over 0 to 2 pi, rad.
+
+    The first and the last error are of one heading. nan where the hard iron is stronger than the horizontal field,
+    so that the compass does not turn once with the heading. Formula: Archibald Smith, in the Admiralty Manual for
+    Ascertaining and Applying the Deviations of the Compass.
+    """
+    turned = np.unwrap(e, axis=-1)
+    closed = np.abs(turned[..., -1] - turned[..., 0]) < np.pi
+    h = np.linspace(0.0, 2.0 * np.pi, e.shape[-1])[:-1]
+    waves = np.stack([0.5 * np.ones_like(h), np.sin(h), np.cos(h), np.sin(2.0 * h), np.cos(2.0 * h)], axis=1)
+    return np.where(closed[..., None], -2.0 / len(h) * turned[..., :-1] @ waves, np.nan)
 
 
 def _rate(sensors: Sensors) -> Use:

@@ -254,10 +254,31 @@ def _use_card(found: UseBands) -> Card:
     curves = Curves(tuple(zip(captions, (plain, applied), strict=True)), tuple(legend))
     condition = Text(f"{use.condition[:1].upper()}{use.condition[1:]}.")
     return Card(
-        (Text(" ".join(parts), soft=False), curves, condition, Details("Formula", formula, "screen")),
+        (
+            Text(" ".join(parts), soft=False),
+            curves,
+            condition,
+            *_coefficients(found),
+            Details("Formula", formula, "screen"),
+        ),
         use.title,
         f"use-{use.name}",
     )
+
+
+def _coefficients(found: UseBands) -> tuple[Block, ...]:
+    """The coefficients of each curve with their sigmas, before and after calibration."""
+    use = found.use
+    if use.coefficients is None:
+        return ()
+    rows = [
+        (name, line, *(rounded(use.factor * number, 3) if math.isfinite(number) else "none" for number in numbers))
+        for line, band in found.bands.items()
+        if band.coefficients is not None
+        for name, numbers in zip(use.coefficients.names, band.coefficients, strict=True)
+    ]
+    columns: Columns = ("coefficient", Column("", "text"), f"before, {use.unit}", "σ", f"after, {use.unit}", "σ")
+    return (Table("", use.coefficients.formula, columns, tuple(rows), "", "dense"),)
 
 
 def _diagnostics(c: Calibration) -> tuple[Block, ...]:

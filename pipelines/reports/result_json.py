@@ -268,6 +268,7 @@ class UseResult(_Record):
     after95: float  # 95 % bound with it
     required: float | None  # at the requirements
     at: str  # operating point, in words
+    coefficients: dict[str, dict[str, dict[str, float | None]]] | None = None  # curve: A to E of a compass deviation
 
 
 class Result(_Record):
@@ -390,6 +391,7 @@ def result(calibration: Calibration) -> Result:
                     "after95": found.after,
                     "required": found.figure(lambda band: band.allowed) or None,
                     "at": found.use.label,
+                    "coefficients": found.coefficients and _json(found.coefficients),
                 }
                 for found in c.uses
             ],

@@ -35,7 +35,8 @@ def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
     if not c.estimate.converged or not np.isfinite(c.covariance).all():
         return ()
     posterior, noise = posterior_of(c), {noise.name: noise.used for noise in c.noises}
-    true = Truth(posterior.names, posterior.x)
+    known = {**c.problem.constants, **c.values}
+    true = Truth([*known], np.array([*known.values()]))
     found = []
     for use in c.method.report.uses(true, c.config, noise):
         with suppress(AttributeError, KeyError):  # its formulas need parameters that this graph has not got

@@ -12,6 +12,8 @@ import pytest
 import alidade
 from alidade.pipelines.diagnostics.use import Applied, Line, Posterior, Truth, Use, coverage, use_bands
 from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.methods.triads import triad_of
+from alidade.pipelines.methods.uses import deviation_coefficients
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.uses import posterior_of
 
@@ -69,6 +71,64 @@ def test_before_is_worse_than_after_and_actual_error_lies_within_the_bound() -> 
     assert np.abs(band.actual - band.after).max() < 2.0 * band.bound.max()
     # The strength of the field is common to all of K and leaves the heading alone.
     assert band.uncorrelated.max() > 3.0 * band.bound.max()
+
+
+def _smith(values: Mapping[str, float], dip: float, h: Array) -> Array:
+    """Deviation, rad, of an uncorrected compass by Archibald Smith's exact formula; x fore, y starboard, z down."""
+    K, b = triad_of("mag", values)
+    down = np.diag([1.0, -1.0, -1.0])
+    (a, s, c), (d, e, f), _ = (down @ np.linalg.inv(K) @ down - np.eye(3)).tolist()
+    P, Q, _ = -down @ np.linalg.solve(K, b) / (values["field_strength"] * np.cos(dip))
+    A, D, E = (d - s) / 2.0, (a - e) / 2.0, (d + s) / 2.0
+    B, C = c * np.tan(dip) + P, f * np.tan(dip) + Q
+    lam = 1.0 + (a + e) / 2.0
+    across = A + B * np.sin(h) + C * np.cos(h) + D * np.sin(2 * h) + E * np.cos(2 * h)
+    along = lam + B * np.cos(h) - C * np.sin(h) + D * np.cos(2 * h) - E * np.sin(2 * h)
+    return np.arctan2(across, along)
+
+
+@pytest.mark.parametrize("beside", [{}, {"gyro": {"rate_hz": 50.0, "mounting_deg": 4.0}}])
+def test_deviation_coefficients_are_those_of_smiths_formula_integrated(beside: dict[str, object]) -> None:
+    """Values by quadrature over 3,600 headings, sigmas by draws from the joint posterior; a gyro makes K whole."""
+    scenario = {"attitudes": 15, "magnetometer": {"rate_hz": 20.0, "hard_iron": 1e-5}, **beside}
+    c = alidade.calibrate(alidade.simulate("tumble", scenario, seed=1))
+    found, posterior = c.uses[0], posterior_of(c)
+    h = np.linspace(0.0, 2.0 * np.pi, 3600, endpoint=False)
+    waves = np.stack([0.5 * np.ones_like(h), np.sin(h), np.cos(h), np.sin(2 * h), np.cos(2 * h)]) * 2.0 / len(h)
+
+    def direct(x: Array) -> Array:
+        values = {**c.problem.constants, **dict(zip(posterior.names, x.tolist(), strict=True))}
+        return np.degrees(waves @ _smith(values, values["field_dip"], h))
+
+    assert found.coefficients is not None
+    level = found.coefficients["level"]
+    before, before_sigma, after, after_sigma = (
+        np.array([level[name][key] for name in "ABCDE"]) for key in ("before", "before_sigma", "after", "after_sigma")
+    )
+    draws = np.random.default_rng(3).multivariate_normal(posterior.x, posterior.P, 4000, method="eigh")
+    # Across the axes of a symmetric K nothing turns, so that its A is 0 but for rounding.
+    shown = slice(0 if beside else 1, None)
+    assert before == pytest.approx(direct(posterior.x), abs=1e-3)
+    assert before_sigma[shown] == pytest.approx(np.std([direct(x) for x in draws], axis=0)[shown], rel=0.05)
+    assert np.abs(after).max() < 1e-9
+    assert np.abs(direct(posterior.x)).max() > 5.0 > 50.0 * after_sigma.max()
+    line = found.use.lines[0]
+    errors = np.degrees(line.error(posterior.applied, Truth(posterior.names, draws)))
+    grid = np.deg2rad(found.use.x[:-1])
+    fits = np.linalg.lstsq(_waves(grid), -errors[:, :-1].T, rcond=None)[0]
+    assert after_sigma == pytest.approx(fits.std(axis=1), rel=0.05)
+
+
+def _waves(h: Array) -> Array:
+    return np.stack([np.ones_like(h), np.sin(h), np.cos(h), np.sin(2 * h), np.cos(2 * h)], axis=1)
+
+
+def test_deviation_of_a_compass_that_does_not_turn_has_no_coefficients() -> None:
+    """Hard iron stronger than the horizontal field: the compass heading comes back without having turned once."""
+    h = np.deg2rad(np.arange(0.0, 361.0, 5.0))
+    weak, strong = (np.angle(np.exp(1j * h) + iron) - h for iron in (0.5, 1.5))
+    assert deviation_coefficients(np.angle(np.exp(1j * weak)))[1] == pytest.approx(0.5, abs=1e-3)
+    assert np.isnan(deviation_coefficients(np.angle(np.exp(1j * strong)))).all()
 
 
 class _Identity:

@@ -69,9 +69,15 @@ def problem(data: TumbleData, config: Config) -> Problem:
         premises=model.premises,
         noises=tuple(noises),
         elsewhere=partial(_mirrored, model),
-        constants=temperature.constants(temperature.reference(data.temperature)),
+        constants=_constants(data, model),
         layout=ChainLayout(),
     )
+
+
+def _constants(data: TumbleData, model: Model) -> dict[str, float]:
+    """The first temperature and, for the heading of a magnetometer alone, the dip of the field's model, rad."""
+    dip = {} if model.dip is not None or model.modelled_dip is None else {"field_dip": model.modelled_dip}
+    return temperature.constants(temperature.reference(data.temperature)) | dip
 
 
 def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[Step]:

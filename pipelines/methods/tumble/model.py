@@ -174,6 +174,7 @@ class Model:
         declination: of the field, rad east, where the place is known.
         premises: sentences about assumptions that a user should know.
         dropped: what was left out.
+        modelled_dip: of the field, rad, where the place is known.
     """
 
     sensors: tuple[Sensor, ...]
@@ -183,6 +184,7 @@ class Model:
     declination: float
     premises: tuple[str, ...]
     dropped: Mapping[str, int]
+    modelled_dip: float | None = None
 
 
 def prepare(data: TumbleData, config: Config) -> Model:
@@ -219,7 +221,16 @@ def prepare(data: TumbleData, config: Config) -> Model:
     if modelled is None and len(sensors) > 1 and dip is not None and np.sin(dip.start) < -_SINE:
         premises.append(_NEGATIVE_DIP)
     declination = 0.0 if field is None else float(np.arctan2(field[0], field[1]))
-    return Model(tuple(sensors), dip, moments, gyro, declination, tuple(premises), data.dropped)
+    return Model(
+        tuple(sensors),
+        dip,
+        moments,
+        gyro,
+        declination,
+        tuple(premises),
+        data.dropped,
+        None if modelled is None else modelled[0],
+    )
 
 
 def _modelled(config: Config, field: Array) -> tuple[float, float]:
