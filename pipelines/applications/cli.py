@@ -659,12 +659,12 @@ def fleet(
 def export(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
     form: Annotated[
-        str, typer.Option("--format", help="px4, ardupilot, ros2, kalibr, openvins (sensors); tf, urdf (mounts).")
+        str, typer.Option("--format", help="px4, ardupilot, betaflight, inav, ros2, kalibr, openvins; tf, urdf.")
     ],
     out: Annotated[Path | None, typer.Option(help="File to write [default: printed].")] = None,
     as_json: Json = False,
 ) -> None:
-    """Export to PX4, ArduPilot, ROS 2, URDF, Kalibr, OpenVINS.
+    """Export to flight controllers, ROS 2, URDF, Kalibr, OpenVINS.
 
     Each in the conventions of that program.
     """

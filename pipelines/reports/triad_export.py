@@ -1,4 +1,4 @@
-"""A cube calibration for the programs that will apply it, in their own conventions.
+"""Sensors of three axes for the programs that will apply their calibration, in the conventions of each.
 
 The numbers are for the axes as recorded. Where a format has no place for a part of K, a comment says how much is lost.
 """
@@ -131,6 +131,45 @@ def _ardupilot(saved: SavedCalibration) -> str:
     return "\n".join([*notes, *(f"{name},{value:.9g}" for name, value in rows), ""])
 
 
+def _betaflight(saved: SavedCalibration) -> str:
+    """A command of the CLI: the offset in counts, which Betaflight subtracts after mag_align (sensors/compass.c)."""
+    S, offset, notes = _compass_in_counts(saved)
+    lost = _lost("magnetometer", S / np.cbrt(np.linalg.det(S)) - np.eye(3))
+    return "\n".join([f"# {lost}", *notes, f"set mag_calibration = {','.join(map(str, offset))}", ""])
+
+
+def _inav(saved: SavedCalibration) -> str:
+    """Commands of the CLI; INAV computes (raw - magzero) 1024 / maggain per axis, then aligns (sensors/compass.c)."""
+    S, offset, notes = _compass_in_counts(saved)
+    diagonal = np.diag(S)
+    size = float(np.cbrt(diagonal.prod()))
+    # A field of the earth's strength becomes 1024, where K has its unit; else the mean gain is 1.
+    gain = np.round((1.0 if _unit(saved) == "1/count" else 1024.0 * size) / diagonal).astype(int)
+    lost = _lost("magnetometer", (S - np.diag(diagonal)) / size)
+    rows = (("magzero", offset), ("maggain", gain))
+    commands = [f"set {name}_{axis} = {n}" for name, three in rows for axis, n in zip("xyz", three, strict=True)]
+    return "\n".join([f"# {lost}", *notes, *commands, ""])
+
+
+def _compass_in_counts(saved: SavedCalibration) -> tuple[Array, NDArray[np.int64], list[str]]:
+    """The symmetric part of the magnetometer's K, its offset in whole counts, and a comment on its mounting.
+
+    Raises InputError when it was not recorded in counts, or the offset is beyond 16 bits.
+    """
+    if "mag_k11" not in saved.parameters or not _unit(saved).endswith("/count"):
+        raise InputError("this format corrects a magnetometer in counts: calibrate what the flight controller logs")
+    K, b = _triad(saved, "mag")
+    offset = np.round(zero_offset(K, b)).astype(np.int64)
+    if np.abs(offset).max() > np.iinfo(np.int16).max:
+        raise InputError(f"mag has an offset of {np.abs(offset).max()} counts, and this format has 16 bits")
+    S, angle = symmetric_part(K)
+    return S, offset, [f"# {_turned(angle)}"]
+
+
+def _unit(saved: SavedCalibration) -> str:
+    return saved.parameters["mag_k11"].unit
+
+
 def _ros2(saved: SavedCalibration) -> str:
     """Parameters of a node: rows of K and b of each sensor, in the units of sensor_msgs, whole.
 
@@ -222,6 +261,8 @@ def _matrix(name: str, rows: Array) -> list[str]:
 FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {
     "px4": _px4,
     "ardupilot": _ardupilot,
+    "betaflight": _betaflight,
+    "inav": _inav,
     "ros2": _ros2,
     "kalibr": _kalibr,
     "openvins": _openvins,

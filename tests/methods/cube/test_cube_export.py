@@ -199,10 +199,60 @@ def test_a_magnetometer_without_a_known_strength_keeps_its_scale() -> None:
     assert "its scale is as recorded" in text
 
 
+def _in_counts(K: np.ndarray, offset: np.ndarray, unit: str) -> tuple[SavedCalibration, np.ndarray]:
+    """A magnetometer of about 300 counts in the earth's field, and its readings of all directions."""
+    u = RNG.normal(size=(50, 3))
+    raw = u / np.linalg.norm(u, axis=1)[:, None] @ np.linalg.inv(K).T + offset
+    return _calibration({"mag": K}, {"mag": -K @ offset}, method="tumble", unit=unit), raw
+
+
+def test_betaflight_subtracts_counts() -> None:
+    """magADC -= magZero, whole numbers, after the alignment: what is left is the soft iron."""
+    offset = np.array([120.0, -333.0, 41.0])
+    saved, raw = _in_counts(np.eye(3) / 300.0, offset + 0.3, "1/count")
+    command = exported(saved, "betaflight").splitlines()[-1]
+    found = re.fullmatch(r"set mag_calibration = (-?\d+),(-?\d+),(-?\d+)", command)
+    assert found
+    corrected = raw - np.array([int(x) for x in found.groups()])
+    # Whole counts: half a count along each axis.
+    np.testing.assert_allclose(np.linalg.norm(corrected, axis=1), 300.0, atol=0.5 * 3**0.5)
+    bent = _in_counts(np.diag([1.1, 1.0, 1.0 / 1.1]) / 300.0, offset, "1/count")[0]
+    assert "terms of K up to 0.1 have no place" in exported(bent, "betaflight")
+
+
+@pytest.mark.parametrize(("unit", "strength", "length"), [("1/count", 1.0, 1024.0), ("T/count", 5e-5, 300.0)])
+def test_inav_scales_counts(unit: str, strength: float, length: float) -> None:
+    """(raw - magzero) 1024 / maggain: the field is 1024 where its strength is the unit, else about as recorded."""
+    offset, gain = np.array([120.0, -333.0, 41.0]), np.array([1.08, 1.0, 1.0 / 1.08])
+    saved, raw = _in_counts(np.diag(gain) / 300.0, offset, unit)
+    saved = _calibration({"mag": strength * np.diag(gain) / 300.0}, {"mag": -strength * gain * offset / 300.0},
+                         method="tumble", unit=unit)  # fmt: skip
+    rows = dict(re.findall(r"set (mag\w+) = (-?\d+)", exported(saved, "inav")))
+    zero, scale = (np.array([int(rows[f"{name}_{axis}"]) for axis in "xyz"]) for name in ("magzero", "maggain"))
+    corrected = (raw - zero) * 1024.0 / scale
+    np.testing.assert_allclose(np.linalg.norm(corrected, axis=1), length, rtol=2e-3)
+    assert np.ptp(np.linalg.norm(raw - zero, axis=1)) > 0.1 * 300.0
+
+
+@pytest.mark.parametrize("form", ["betaflight", "inav"])
+def test_flight_controllers_of_counts_refuse_tesla_and_what_does_not_fit(form: str) -> None:
+    with pytest.raises(InputError, match="corrects a magnetometer in counts"):
+        exported(_fits({"mag": np.eye(3)})[0], form)
+    with pytest.raises(InputError, match="has an offset of 40000 counts"):
+        exported(_in_counts(np.eye(3), np.array([4e4, 0.0, 0.0]), "1/count")[0], form)
+
+
+def test_a_compass_on_other_axes_has_its_gains_along_its_own() -> None:
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ np.diag([1.1, 1.0, 1.0]) / 300.0
+    text = exported(_in_counts(turned, np.zeros(3), "1/count")[0], "inav")
+    assert "its mounting, 90.00 deg in all" in text
+    assert "set maggain_x = 273\nset maggain_y = 300\nset maggain_z = 300\n" in text
+
+
 def test_wrong_format_and_method() -> None:
     saved, _, _ = _fits(_diagonal())
     with pytest.raises(
-        InputError, match="a calibration of cube has no format yaml; it has px4, ardupilot, ros2, kalibr"
+        InputError, match="a calibration of cube has no format yaml; it has px4, ardupilot, betaflight, inav, ros2"
     ):
         exported(saved, "yaml")
     with pytest.raises(InputError, match="this calibration of head holds nothing"):
