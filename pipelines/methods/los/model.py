@@ -243,7 +243,7 @@ def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> 
         # The data are the recording's end, and its first target may have been found before.
         k = int(np.searchsorted(before.chain.time, start))
         clock = Clock(start - before.around.elapsed[k])
-        found[0] = start - before.around.watched[k]
+        found[0] = start - before.around.tracked[k]
     return clock, used.time - found[np.cumsum(used.starts) - 1]
 
 
