@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,12 +37,16 @@ class GaussianPrior:
         known = tuple(self.names[i] for i in kept)
         return GaussianPrior(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source)
 
-    def given_others(self, names: Collection[str]) -> GaussianPrior:
-        """These of its numbers, all others exactly at their means."""
-        one, other = (np.array([(n in names) is among for n in self.names], dtype=bool) for among in (True, False))
-        shared, C = self.covariance[np.ix_(one, other)], self.of(names)
-        rest = np.linalg.pinv(self.covariance[np.ix_(other, other)], hermitian=True)
-        return GaussianPrior(C.names, C.mean, C.covariance - shared @ rest @ shared.T, self.source)
+    def given(self, known: Mapping[str, float]) -> GaussianPrior:
+        """Conditional distribution of the other numbers, these being known exactly."""
+        rest = self.of([name for name in self.names if name not in known])
+        one, other = (np.array([(n in known) is among for n in self.names], dtype=bool) for among in (False, True))
+        scale = np.where(self.sigmas > 0.0, self.sigmas, 1.0)
+        C = self.covariance / np.outer(scale, scale)
+        gain = C[np.ix_(one, other)] @ np.linalg.pinv(C[np.ix_(other, other)], hermitian=True)
+        off = (np.array([known[name] for name in self.names if name in known]) - self.mean[other]) / scale[other]
+        lost = np.outer(scale[one], scale[one]) * (gain @ C[np.ix_(other, one)])
+        return GaussianPrior(rest.names, rest.mean + scale[one] * (gain @ off), rest.covariance - lost, self.source)
 
     @property
     def sigmas(self) -> Array:

@@ -98,13 +98,14 @@ def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier
         replace(p, quantities=tuple(replacements.get(q.name, q) for q in p.quantities)).near(means)
         for p in problem.parameters
     )
+    others = known.given({name: mean for name, mean in means.items() if name not in replaced})
     factors = _PriorFactors(parameters, known, replaced)
     steps, after, continuation, finer = problem.steps, problem.steps_after, problem.continuation, problem.finer
     premise = f"The prior of {len(replaced)} parameters is {gaussian_prior.source}." if gaussian_prior.source else ""
     return replace(
         problem,
         parameters=parameters,
-        gaussian_priors=(*problem.gaussian_priors, known.given_others(replaced)),
+        gaussian_priors=(*problem.gaussian_priors, others),
         steps=lambda chunk: factors.steps(steps(chunk), before),
         steps_after=None if after is None else lambda time: factors.steps(after(time), lambda: _until(steps, time)),
         continuation=None

@@ -114,14 +114,18 @@ def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Ma
         if all(needed - measured.keys() for needed in beside):
             fewest = min((needed - measured.keys() for needed in beside), key=len)
             raise InputError(f"apply: {name} serves only together with {', '.join(sorted(fewest))}")
+    return {name: value.array for name, value in results(formulas, values, measured).items()}
+
+
+def results(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Value]:
+    """As `apply`, with the kinds of the results; measurements that no formula takes are not looked at."""
     space = {name: Value.constant(array) for name, array in (with_vectors(values) | AXES).items()}
     space |= {name: Value(input_kind(name), np.asarray(given, dtype=float)) for name, given in measured.items()}
-    results: dict[str, Array] = {}
+    found: dict[str, Value] = {}
     for formula in formulas:
         if all(name in measured for name in formula.inputs):
-            space[formula.name] = evaluate(formula.tree, space)
-            results[formula.name] = space[formula.name].array
-    return results
+            space[formula.name] = found[formula.name] = evaluate(formula.tree, space)
+    return found
 
 
 def evaluate(tree: ast.expr, names: Mapping[str, Value]) -> Value:

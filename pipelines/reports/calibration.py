@@ -25,12 +25,14 @@ from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import invalid
-from alidade.pipelines.reports.values import SensorValues
+from alidade.pipelines.reports.values import Application, SensorValues
 from alidade.pipelines.settings import Config
 
 _HEAD = """\
 # Calibration by alidade. Units are SI and radians, quaternions w x y z. aRb maps coordinates in b to coordinates in a,
 # Exp turns a rotation vector into a rotation. Do not apply parameters whose verdict is weak or unobservable.
+# Formulas leave out what the recording does not determine, and use `applied` where a parameter has one: the best value
+# without that, its estimate if what is left out is at its prior mean.
 """
 # More digits than any sigma needs, fewer than tire the eye.
 _DIGITS = 12
@@ -46,12 +48,18 @@ class _Record(BaseModel):
 
 
 class SavedParameter(_Record):
-    """A parameter; SI."""
+    """A parameter; SI. `applied`: value in formulas, which leave out what was estimated with it; None: `value`."""
 
     value: float
     sigma: float
     unit: str
     verdict: Verdict | None
+    applied: float | None = None
+
+    @property
+    def in_formulas(self) -> float:
+        """The value that formulas use."""
+        return self.value if self.applied is None else self.applied
 
     def __repr__(self) -> str:
         return f"<{self.value:.6g} ± {self.sigma:.2g} {self.unit}, {self.verdict}>"
@@ -112,7 +120,7 @@ class SavedCalibration(_Record, SensorValues):
 
     @property
     def values(self) -> dict[str, float]:
-        """What formulas are computed with: parameters and constants by name."""
+        """Parameters and constants by name."""
         return {**self.constants, **{name: parameter.value for name, parameter in self.parameters.items()}}
 
     def _joint(self) -> tuple[Sequence[str], Array]:
@@ -136,29 +144,18 @@ class SavedCalibration(_Record, SensorValues):
             raise InputError(f"the calibration has no parameter {name}; it has {', '.join(self.parameters)}")
         return self.parameters[name].value
 
-    def apply(self, **measured: Any) -> dict[str, Array]:
-        """The formulas, computed: everything that follows from what is measured.
-
-            alidade.load("results/calibration.yaml").apply(gyro=w)["w_iv"]
-
-        Args:
-            measured: by the names in the formulas: numbers, vectors (..., 3), quaternions w, x, y, z (..., 4); SI.
-
-        Raises:
-            InputError: something is given that no formula measures, or the formulas of the file are not those of its
-                parameters and config: it was made with another config, or by the published solver, which does not know
-                all of them.
-        """
+    def _application(self) -> Application:
         from alidade.pipelines.methods import method
 
         text = "\n".join(self.formulas)
         # A formula names a parameter, or the vector that it is a component of.
         applied = [name for name in self.parameters if re.search(rf"\b({name}|{name[:-2]})\b", text)]
-        formulas = method(self.method).report.formulas(applied, self._config)
+        formulas_of = method(self.method).report.formulas
+        formulas = formulas_of(applied, self._config)
         if [formula.text for formula in formulas] != self.formulas:
             raise InputError("apply: the formulas in the calibration are not those of its parameters and this config")
-        values = {name: value for name, value in self.values.items() if name in applied or name in self.constants}
-        return apply(formulas, values, measured)
+        values = {name: self.parameters[name].in_formulas for name in applied}
+        return Application(formulas, formulas_of(list(self.parameters), self._config), values, self.constants)
 
 
 def calibration_yaml(calibration: Calibration) -> str:
@@ -177,6 +174,9 @@ def calibration_yaml(calibration: Calibration) -> str:
 
     Representer.add_representer(float, _float)
     content = saved(calibration).model_dump(by_alias=True, mode="json")
+    for entry in content["parameters"].values():
+        if entry["applied"] is None:
+            del entry["applied"]
     for section in ("parameters", "rotations", "transforms"):
         content[section] = {name: one_line(entry) for name, entry in content[section].items()}
     content["findings"] = {name: [one_line(row) for row in rows] for name, rows in content["findings"].items()}
@@ -194,7 +194,13 @@ def saved(calibration: Calibration) -> SavedCalibration:
     """What calibration.yaml says."""
     method = calibration.problem.method
     parameters = {
-        p.name: SavedParameter(value=_rounded(p.value), sigma=_rounded(p.sigma), unit=p.unit, verdict=p.observability)
+        p.name: SavedParameter(
+            value=_rounded(p.value),
+            sigma=_rounded(p.sigma),
+            unit=p.unit,
+            verdict=p.observability,
+            applied=_other(calibration.applied_values.get(p.name, p.value), p.value),
+        )
         for p in calibration.parameters.values()
     }
     return SavedCalibration(
@@ -248,18 +254,20 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
         needed = {name: given[name] for formula in formulas for name in formula.inputs}
         return apply(formulas, {**unknown, **dict(zip(estimate.names, values.tolist(), strict=True))}, needed)
 
+    best = np.array([calibration.applied_values.get(name, value) for name, value in calibration.values.items()])
+
     for formula in calibration.formulas:
         if given.keys() >= set(formula.inputs):
             formulas.append(formula)
             try:
-                at(estimate.values)
+                at(best)
             except AttributeError:  # of parameters that this graph has not got
                 formulas.pop()
-    results = at(estimate.values)
+    results = at(best)
     rotations = {f.name: f for f in formulas if results[f.name].shape == (4,) and _FRAMES.match(f.description)}
     if not rotations:
         return {}
-    ends = [(at(estimate.values + step), at(estimate.values - step)) for step in _STEP * np.eye(len(estimate.names))]
+    ends = [(at(best + step), at(best - step)) for step in _STEP * np.eye(len(estimate.names))]
     found = {}
     for name, formula in rotations.items():
         turns = [so3.log(so3.multiply(ahead[name], so3.inverse(behind[name]))) for ahead, behind in ends]
@@ -292,6 +300,10 @@ def _plain(row: Mapping[str, object]) -> dict[str, object]:
         return _rounded(value, _FEWER_DIGITS) if isinstance(value, float) else value
 
     return {name: rounded(value) for name, value in row.items()}
+
+
+def _other(value: float, usual: float) -> float | None:
+    return None if _rounded(value) == _rounded(usual) else _rounded(value)
 
 
 def _rounded(value: float, digits: int = _DIGITS) -> float:

@@ -446,13 +446,12 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     ]
     if not formulas or c.status not in ("calibrated", "weak"):
         return ()
-    values = {name: c.parameters[name].value for name in c.applied if name in c.parameters}
-    numbers = {**c.problem.constants, **values}
+    numbers = {**c.problem.constants, **c.applied_values}
     code: list[tuple[str, str]] = []
     # A plug-in may write formulas that only a person can read.
     with suppress(ValueError, KeyError, SyntaxError):
         code = [(name, generate(c.formulas, numbers)) for name, generate in _LANGUAGES.items()]
-    code.append(("ROS 2 parameters", ros_parameters(file, list(values))))
+    code.append(("ROS 2 parameters", ros_parameters(file, list(c.applied_values))))
     said = Text(
         "SI units. calibration.yaml has the numbers, and rotations as quaternions; the same with these numbers in it:"
     )

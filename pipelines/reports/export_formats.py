@@ -79,15 +79,15 @@ _TRANSFORMS: Mapping[str, Callable[[SavedCalibration], str]] = {"tf": _tf, "urdf
 
 
 def ros_parameters(saved: SavedCalibration, names: Collection[str]) -> str:
-    """The parameters of these names, SI, three of them name_x, name_y, name_z as one list, and the transforms."""
+    """Values that formulas use, SI, three of them name_x, name_y, name_z as one list, and the transforms."""
     content: dict[str, Any] = {"method": saved.method, "sha256": saved.recording.sha256}
     for name in names:
         stem, _, axis = name.rpartition("_")
         triple = [f"{stem}_{each}" for each in "xyz"]
         if axis in "xyz" and all(each in saved.parameters for each in triple):
-            content.setdefault(stem, [saved.value(each) for each in triple])
+            content.setdefault(stem, [saved.parameters[each].in_formulas for each in triple])
         else:
-            content[name] = saved.value(name)
+            content[name] = saved.parameters[name].in_formulas
     lines = ["/**:", "  ros__parameters:", "    alidade:"]
     lines += [f"      {name}: {_text(value)}" for name, value in content.items()]
     for name, each in saved.transforms.items():

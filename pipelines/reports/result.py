@@ -16,6 +16,8 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.device_changes import Changes
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest, SolverDifference
@@ -26,6 +28,7 @@ from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.reports import sentences
@@ -36,7 +39,7 @@ from alidade.pipelines.reports.result_json import (
     PartResult,
     SensitivityResult,
 )
-from alidade.pipelines.reports.values import SensorValues
+from alidade.pipelines.reports.values import Application, SensorValues
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -135,6 +138,11 @@ class Calibration(SensorValues):
 
     def _joint(self) -> tuple[Sequence[str], Array]:
         return self.estimate.names, self.covariance
+
+    def _application(self) -> Application:
+        unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
+        whole = self.method.report.formulas(list(unknown), self.config)
+        return Application(self.formulas, whole, self.applied_values, {**self.problem.constants, **unknown})
 
     @cached_property
     def uses(self) -> tuple[UseBands, ...]:
@@ -289,31 +297,6 @@ class Calibration(SensorValues):
 
         return write_results(Path(folder), self)
 
-    def apply(self, **measured: Any) -> dict[str, Array]:
-        """The formulas of calibration.yaml, computed: everything that follows from what is measured.
-
-            calibration.apply(gyro=w)["w_iv"]
-
-        What the solver does not know counts as zero, and so do assumptions that it does not determine: what would be
-        measured for these alone is not looked at.
-
-        Args:
-            measured: by the names in the formulas: numbers, vectors (..., 3), quaternions w, x, y, z (..., 4); SI.
-
-        Raises:
-            InputError: something is given that no formula measures.
-        """
-        from alidade.pipelines.methods.formula import apply
-
-        values = {name: parameter.value for name, parameter in self.parameters.items() if name in self.applied}
-        unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
-        needed, possible = (
-            {name for formula in formulas for name in formula.inputs}
-            for formulas in (self.formulas, self.method.report.formulas(list(unknown), self.config))
-        )
-        given = {name: value for name, value in measured.items() if name in needed or name not in possible}
-        return apply(self.formulas, {**self.problem.constants, **unknown, **values}, given)
-
     def __repr__(self) -> str:
         """One line."""
         return f"<Calibration {self.method.name}, {self.estimate.solver}, of {self.recording}: {self.status}>"
@@ -357,6 +340,21 @@ class Calibration(SensorValues):
             for q in self.problem.quantities
             if q.group is None or (q.name in sigmas and q.determined(sigmas[q.name]))
         ]
+
+    @cached_property
+    def applied_values(self) -> dict[str, float]:
+        """Values that the formulas use: estimates, given that what they leave out is at its prior mean.
+
+        A nuisance parameter that the recording does not determine is left out, but what was estimated jointly with it
+        is not: without a g-sensitivity the best bias is the one that has its effect in it.
+        """
+        quantities, applied = self.quantities, set(self.applied)
+        left_out = {name: quantities[name].prior_mean for name in self.values if name not in applied}
+        best = self.values
+        if np.isfinite(self.covariance).all():
+            joint = GaussianPrior(tuple(best), self.estimate.values, self.covariance).given(left_out)
+            best = dict(zip(joint.names, joint.mean.tolist(), strict=True))
+        return {name: value for name, value in best.items() if name in applied}
 
     @property
     def counts(self) -> dict[str, int]:

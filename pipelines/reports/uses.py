@@ -72,7 +72,7 @@ def posterior_of(c: Calibration) -> Posterior:
         x=c.estimate.values,
         P=c.covariance,
         require=np.array(require),
-        applied=formulas(c.applied, c.values),
+        applied=formulas(c.applied, c.applied_values),
         nominal=formulas(c.applied, nominal),
         whole=formulas(everything, c.values),
         truth=truth,

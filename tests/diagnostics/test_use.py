@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import alidade
+from alidade.factors import so3
 from alidade.pipelines.diagnostics.use import Applied, Line, Posterior, Truth, Use, coverage, use_bands
 from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.methods.formula import input_kind, results
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.uses import deviation_coefficients
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.reports.uses import posterior_of
+from alidade.pipelines.reports.uses import AppliedFormulas, posterior_of
 
 SCENARIOS: dict[str, object] = {
     "tumble": None,
@@ -129,6 +132,55 @@ def test_deviation_of_a_compass_that_does_not_turn_has_no_coefficients() -> None
     weak, strong = (np.angle(np.exp(1j * h) + iron) - h for iron in (0.5, 1.5))
     assert deviation_coefficients(np.angle(np.exp(1j * weak)))[1] == pytest.approx(0.5, abs=1e-3)
     assert np.isnan(deviation_coefficients(np.angle(np.exp(1j * strong)))).all()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_values_applied_leave_hardly_more_than_all_estimates_would(name: str) -> None:
+    """head once left .60 deg after 10 s: the bias had been estimated with a g-sensitivity that no formula applies."""
+    for found in calibrated(name).uses:
+        assert found.after < 1.1 * found.figure(lambda band: band.whole), found.use.name
+
+
+def test_what_was_estimated_with_parameters_left_out_is_applied_without_them() -> None:
+    c = calibrated("head")
+    estimates = replace(posterior_of(c), applied=AppliedFormulas(c.formulas, c.values, c.problem.constants))
+    (outage,) = (found for found in c.uses if found.use.name == "outage")
+    assert outage.after < 0.5 * use_bands(outage.use, estimates).after
+    assert c.parameters["gyro_bias_x"].value == c.values["gyro_bias_x"] != c.applied_values["gyro_bias_x"]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_results_have_the_sigmas_of_draws(name: str, tmp_path: Path) -> None:
+    """Root mean square of what is applied less what drawn true parameters give."""
+    c = calibrated(name)
+    everything = c.method.report.formulas([q.name for q in c.problem.quantities], c.config)
+    rng = np.random.default_rng(4)
+    inputs = dict.fromkeys(name for formula in everything for name in formula.inputs)
+    measured = {
+        each: {"rotation": so3.exp(rng.normal(size=(5, 3))), "vector": rng.normal(size=(5, 3))}.get(
+            input_kind(each), rng.normal(size=5)
+        )
+        for each in inputs
+    }
+    constants = {**dict.fromkeys((q.name for q in c.problem.quantities), 0.0), **c.problem.constants}
+    errors: dict[str, list[Array]] = {}
+    found = c.apply(sigma=True, **measured)
+    for draw in rng.multivariate_normal(c.estimate.values, c.covariance, 2000):
+        space = {**constants, **dict(zip(c.estimate.names, draw.tolist(), strict=True))}
+        for name, true in results(everything, space, measured).items():
+            if name in found:
+                turned = true.kind == "rotation"
+                value = found[name].value
+                off = so3.log(so3.multiply(value, so3.inverse(true.array))) if turned else value - true.array
+                errors.setdefault(name, []).append(off)
+    assert errors.keys() == found.keys()
+    for name, each in errors.items():
+        rms = np.sqrt(np.mean(np.square(each), axis=0))
+        np.testing.assert_allclose(found[name].sigma, rms, rtol=0.08, atol=1e-8, err_msg=name)
+    c.write(tmp_path)
+    loaded = alidade.load(tmp_path / "calibration.yaml").apply(sigma=True, **measured)
+    for name, (_, sigma) in found.items():
+        np.testing.assert_allclose(loaded[name].sigma, sigma, rtol=1e-4, atol=1e-9)
 
 
 class _Identity:

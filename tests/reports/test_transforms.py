@@ -95,7 +95,7 @@ def test_a_cubes_mounts_are_those_of_its_config_corrected() -> None:
     transforms = saved(calibration).transforms
     assert (transforms["BRC"].parent, transforms["BRC"].child) == ("reference", "camera")
     given = np.array(cube.report.fixed_rotations(calibration.config)["camera_rotation"])
-    mount = np.array([calibration.parameters[f"camera_mount_{axis}"].value for axis in "xyz"])
+    mount = np.array([calibration.applied_values[f"camera_mount_{axis}"] for axis in "xyz"])
     expected = so3.matrix(so3.compose(given, so3.exp(mount)))
     np.testing.assert_allclose(so3.matrix(np.array(transforms["BRC"].wxyz)), expected, atol=1e-10)
     assert {f"bodyRtag_{tag}" for tag in range(16, 22)} < set(transforms)
