@@ -196,7 +196,7 @@ def test_a_saved_calibration_applies_as_the_one_it_is_of(
     numbers = ("azimuth", "elevation", "outer", "inner", "stamp")
     names = dict.fromkeys(name for formula in calibration.formulas for name in formula.inputs)
     vectors = {name: rng.normal(size=3) for name in names}
-    measured = {
+    measured: dict[str, Any] = {
         name: vector[0] if name in numbers else so3.exp(vector) if re.search("R|rotation", name) else vector
         for name, vector in vectors.items()
     }
