@@ -65,8 +65,9 @@ def _told(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
     if not source.startswith(_PRIOR):
         return f"{source} noise", "record longer, or measure it better"
     of = source.removeprefix(_PRIOR)
-    if of in assumed:
-        return f"assumed {kind(of)}", "state its data sheet if yours is better, or move so that it shows"
+    kinds = ", ".join(dict.fromkeys(map(kind, of.split(", "))))
+    if assumed.issuperset(of.split(", ")):
+        return f"assumed {kinds}", "state its data sheet if yours is better, or move so that it shows"
     if of == name:
         return "its own prior", "the recording adds little to what was known"
-    return f"the prior of {kind(of)}", "know it better, or move so that it shows"
+    return f"the prior of {kinds}", "know it better, or move so that it shows"

@@ -104,11 +104,15 @@ class Influence:
         return moved
 
 
+# Numbers that a joint prior is named after: a vector's. One of more is about a transformation of many.
+_MOST_NAMED = 3
+
+
 def error_budget(influence: Influence, added: Mapping[str, Array], covariance: Array) -> dict[str, dict[str, float]]:
     """Number -> source -> share of the number's variance, the largest first; shares sum to one.
 
-    Sources are the families of the noise, each prior ("prior of NAME"), and what no measurement model has, together
-    with what is of second order ("not modelled").
+    Sources are the families of the noise, each prior ("prior of NAME, ..."; "prior" of many numbers together), and what
+    no measurement model has, together with what is of second order ("not modelled").
 
     Args:
         influence: of the residuals.
@@ -148,7 +152,8 @@ def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[s
     A = np.pad(rows[..., :-1].reshape(-1, layout.sizes[4]), ((0, 0), (layout.sizes[3], 0)))
     about = np.abs(A @ np.linalg.pinv(reported.jacobian)[:, reported.free] * reported.scale)
     largest = about > ROUNDING * about.max(axis=1, keepdims=True, initial=0.0)
-    labels = [f"prior of {influence.names[int(row.argmax())]}" if row.sum() == 1 else group.family for row in largest]
+    about_each = [[influence.names[i] for i in np.flatnonzero(row)] for row in largest]
+    labels = [f"prior of {', '.join(n)}" if 0 < len(n) <= _MOST_NAMED else group.family for n in about_each]
     return list(zip(labels, squares.reshape(-1, squares.shape[2]), strict=True))
 
 

@@ -64,3 +64,14 @@ def test_a_plan_tells_what_will_limit() -> None:
     found = predict("head", dict(SHORT), None, {})
     free = {q.name for q in found.quantities if q.prior_sigma != 0.0}
     assert set(found.budget) == free
+
+
+@pytest.mark.slow
+def test_a_prior_of_a_few_numbers_together_is_named_after_them() -> None:
+    """That of the field, most of what limits a cube's magnetometer, was called `prior`."""
+    cube = alidade.calibrate(alidade.simulate("cube", {"poses": 20}, seed=1))
+    assert cube.budget is not None
+    assert cube.budget["mag_k22"]["prior of field_e, field_n, field_u"] > 0.8
+    assert cube.budget["mag_k22"].get("prior", 0.0) < 0.01
+    (limit,) = limits({"mag_k22": cube.budget["mag_k22"]}, cube.problem.quantities)
+    assert limit.parts[0][0] == "assumed field"
