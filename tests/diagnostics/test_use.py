@@ -76,12 +76,11 @@ def test_before_is_worse_than_after_and_actual_error_lies_within_the_bound() -> 
     assert band.uncorrelated.max() > 3.0 * band.bound.max()
 
 
-def _smith(values: Mapping[str, float], dip: float, h: Array) -> Array:
-    """Deviation, rad, of an uncorrected compass by Archibald Smith's exact formula; x fore, y starboard, z down."""
-    K, b = triad_of("mag", values)
+def _smith(K: Array, b: Array, field: float, dip: float, h: Array) -> Array:
+    """Deviation, rad, of a compass that reads K^-1 (field - b): Smith's exact formula; x fore, y starboard, z down."""
     down = np.diag([1.0, -1.0, -1.0])
     (a, s, c), (d, e, f), _ = (down @ np.linalg.inv(K) @ down - np.eye(3)).tolist()
-    P, Q, _ = -down @ np.linalg.solve(K, b) / (values["field_strength"] * np.cos(dip))
+    P, Q, _ = -down @ np.linalg.solve(K, b) / (field * np.cos(dip))
     A, D, E = (d - s) / 2.0, (a - e) / 2.0, (d + s) / 2.0
     B, C = c * np.tan(dip) + P, f * np.tan(dip) + Q
     lam = 1.0 + (a + e) / 2.0
@@ -99,32 +98,28 @@ def test_deviation_coefficients_are_those_of_smiths_formula_integrated(beside: d
     h = np.linspace(0.0, 2.0 * np.pi, 3600, endpoint=False)
     waves = np.stack([0.5 * np.ones_like(h), np.sin(h), np.cos(h), np.sin(2 * h), np.cos(2 * h)]) * 2.0 / len(h)
 
-    def direct(x: Array) -> Array:
+    def direct(x: Array, applied: Mapping[str, float] | None) -> Array:
         values = {**c.problem.constants, **dict(zip(posterior.names, x.tolist(), strict=True))}
-        return np.degrees(waves @ _smith(values, values["field_dip"], h))
+        K, b = triad_of("mag", values)
+        if applied is not None:  # K_a raw + b_a is the reading of a compass with K K_a^-1 and b - K K_a^-1 b_a
+            K_a, b_a = triad_of("mag", applied)
+            K = K @ np.linalg.inv(K_a)
+            b = b - K @ b_a
+        return np.degrees(waves @ _smith(K, b, values["field_strength"], values["field_dip"], h))
 
     assert found.coefficients is not None
-    level = found.coefficients["level"]
-    before, before_sigma, after, after_sigma = (
-        np.array([level[name][key] for name in "ABCDE"]) for key in ("before", "before_sigma", "after", "after_sigma")
-    )
     draws = np.random.default_rng(3).multivariate_normal(posterior.x, posterior.P, 4000, method="eigh")
-    # Across the axes of a symmetric K nothing turns, so that its A is 0 but for rounding.
+    # Across the axes of a symmetric K nothing turns, so that A is 0 but for rounding before.
     shown = slice(0 if beside else 1, None)
-    assert before == pytest.approx(direct(posterior.x), abs=1e-3)
-    assert before_sigma[shown] == pytest.approx(np.std([direct(x) for x in draws], axis=0)[shown], rel=0.05)
-    # Values applied are conditional on what formulas leave out: what is known to be left is less than its sigma.
-    assert (np.abs(after) < np.maximum(after_sigma, 1e-9)).all()
-    assert np.abs(direct(posterior.x)).max() > 5.0 > 50.0 * after_sigma.max()
-    line = found.use.lines[0]
-    errors = np.degrees(line.error(posterior.applied, Truth(posterior.names, draws)))
-    grid = np.deg2rad(found.use.x[:-1])
-    fits = np.linalg.lstsq(_waves(grid), -errors[:, :-1].T, rcond=None)[0]
-    assert after_sigma == pytest.approx(fits.std(axis=1), rel=0.05)
-
-
-def _waves(h: Array) -> Array:
-    return np.stack([np.ones_like(h), np.sin(h), np.cos(h), np.sin(2 * h), np.cos(2 * h)], axis=1)
+    sizes = {}
+    for when, applied in (("before", None), ("after", posterior.applied.values)):
+        mean, sigma = (
+            np.array([found.coefficients["level"][name][key] for name in "ABCDE"]) for key in (when, f"{when}_sigma")
+        )
+        assert mean == pytest.approx(direct(posterior.x, applied), abs=1e-3 if applied is None else 1e-6)
+        assert sigma[shown] == pytest.approx(np.std([direct(x, applied) for x in draws], axis=0)[shown], rel=0.05)
+        sizes[when] = np.abs(mean).max(), sigma.max()
+    assert sizes["before"][0] > 5.0 > 50.0 * sizes["after"][1] > 50.0 * sizes["after"][0]
 
 
 def test_deviation_of_a_compass_that_does_not_turn_has_no_coefficients() -> None:
