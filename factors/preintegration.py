@@ -128,7 +128,7 @@ class GyroPath:
         return self._kept[number]
 
     def _found(self, i: NDArray[np.intp], of: Callable[[_Block], Array], adds: bool = False) -> Array:
-        """What blocks say of the samples (n,), (n, ...).
+        """Per-sample values (n, ...) from the blocks of samples (n,).
 
         Args:
             i: the samples.

@@ -24,7 +24,7 @@ import numpy as np
 
 from alidade.pipelines import progress
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.applications.sharing import DAY_S, walk_as_told, walks
+from alidade.pipelines.applications.sharing import DAY_S, stated_walks, walks
 from alidade.pipelines.diagnostics.device_changes import Changes, Rate, changes
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
@@ -246,7 +246,7 @@ def _far_apart(joined: Joined) -> bool:
 def _walks(alone: Sequence[Alone], rates: Mapping[str, float]) -> dict[str, Rate]:
     """Kind of numbers -> how far these walk, where that is stated, or estimated from the recordings."""
     config = alone[0].calibration.config
-    asked = {kind(name) for name in walk_as_told(config, list(rates))}
+    asked = {kind(name) for name in stated_walks(config, list(rates))}
     days = [each.day for each in alone]
     sqrt_info = _changes(alone, join([each.sqrt_info for each in alone], rates, days)).rates if asked else {}
     stated = {kind(name): Rate(rate, rate) for name, rate in rates.items() if rate}

@@ -477,8 +477,8 @@ class Session:
     ) -> tuple[Estimate, SolverDifference | None]:
         """An incremental estimate, and its difference from batch's, which has nothing of what a report needs.
 
-        Where noise levels maximise the marginal likelihood the estimate is that of all rows then, by batch; the course
-        until there stays that of the run.
+        Where noise levels maximise the marginal likelihood, the estimate is that of all rows, by batch; the posterior
+        over time stays that of the run.
         """
         from alidade.pipelines.solvers.batch import solve_batch
 

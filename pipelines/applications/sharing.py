@@ -41,7 +41,7 @@ def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, flo
     return rates
 
 
-def walk_as_told(config: Config, names: Sequence[str]) -> list[str]:
+def stated_walks(config: Config, names: Sequence[str]) -> list[str]:
     """The parameters whose walk several recordings are to determine."""
     return [name for name in names if _share(config, name) == "walks"]
 
@@ -73,7 +73,7 @@ def device_prior(known: Known, method: Method, config: Config, sha256: str, star
     if known.sha256 == sha256:
         raise InputError(f"{source}: was made of this very recording, which would count twice; name another one's")
     rates = walks(method, config, known.gaussian_prior.names)
-    for name in walk_as_told(config, known.gaussian_prior.names):
+    for name in stated_walks(config, known.gaussian_prior.names):
         raise InputError(f"share: how far {name} walks, only several recordings together determine it; give a number")
     uncertain = [
         name for name, sigma in zip(known.gaussian_prior.names, known.gaussian_prior.sigmas, strict=True) if sigma > 0.0

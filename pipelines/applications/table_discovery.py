@@ -1,4 +1,4 @@
-"""What the columns of tables are, concluded from their headers and numbers, for people to put under `columns:`.
+"""Columns of tables, inferred from headers and numbers, as proposals for the config's `columns:`.
 
 Names say what a column is; where there are none, numbers do as far as they can: gravity and the earth's field have
 sizes that identify an accelerometer or a magnetometer and its unit. Nothing is taken silently: a proposal comes with

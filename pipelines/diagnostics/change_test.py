@@ -219,21 +219,23 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     Quantities that walk are left out, since they may change, and those that are hardly better known than before.
 
     Args:
-        estimate: with its course.
+        estimate: with its `posterior_history`.
         quantities: of the estimate, in its order.
     """
-    course = estimate.course
-    if course is None:
+    posterior_history = estimate.posterior_history
+    if posterior_history is None:
         return None
     # Information about other numbers is as much the noise of its states, which moves the estimate without being
     # chance as the covariances have it.
     sqrt_info = [q.determined(sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True)]
-    kept = np.flatnonzero(course.steady & sqrt_info)
-    late = course.time >= _long_enough(estimate, len(kept))
+    kept = np.flatnonzero(posterior_history.steady & sqrt_info)
+    late = posterior_history.time >= _long_enough(estimate, len(kept))
     if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
-    time = course.time[late]
-    values, covariance = _with_priors_as_found(estimate, quantities, course.values[late], course.covariance[late])
+    time = posterior_history.time[late]
+    values, covariance = _with_priors_as_found(
+        estimate, quantities, posterior_history.values[late], posterior_history.covariance[late]
+    )
     # By one factor: each by its own would turn the directions that are known well, where many are correlated.
     P = float(estimate.inflations[kept].max()) ** 2 * covariance[:, kept[:, None], kept]
     difference = values[:-1, kept] - values[-1, kept]
@@ -264,7 +266,7 @@ def _long_enough(estimate: Estimate, numbers: int) -> float:
 def _with_priors_as_found(
     estimate: Estimate, quantities: Sequence[Quantity], values: Array, P: Array
 ) -> tuple[Array, Array]:
-    """The course (k, n), (k, n, n) as it is when no parameter lies far beyond its prior.
+    """Posterior (k, n), (k, n, n) over time under priors widened so that no parameter lies far beyond its own.
 
     Widening priors changes the information by numbers on the diagonal (Woodbury 1950), of all of them at once.
     Variances above the priors', as terms of second order may make them, count as the priors'.

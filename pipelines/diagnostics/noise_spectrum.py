@@ -211,13 +211,13 @@ def _likelihood(bins: _Bins, squares: Array) -> float:
     return -float(bins.count @ (np.log(variance) + bins.power / variance))
 
 
-def _maximise(bins: _Bins, model: Mask, held: tuple[int, float] | None = None) -> Array:
-    """Squares (4,) of the largest likelihood, zero outside the model; `held` is one of them and its fixed value.
+def _maximise(bins: _Bins, model: Mask, fixed: tuple[int, float] | None = None) -> Array:
+    """Squares (4,) of the largest likelihood, zero outside the model; `fixed` is one of them and its fixed value.
 
     Fisher scoring in the logarithms, which keeps variances positive; a noise that is not there goes to nearly zero.
     """
     basis = bins.basis[:, model]
-    rest = np.zeros(len(bins.hz)) if held is None else held[1] * bins.basis[:, held[0]]
+    rest = np.zeros(len(bins.hz)) if fixed is None else fixed[1] * bins.basis[:, fixed[0]]
     weight = np.sqrt(bins.count)
     # To begin with each explains its part of the power where it is strongest.
     theta = (weight * bins.power) @ basis / (weight @ basis**2) / basis.shape[1]
@@ -246,8 +246,8 @@ def _maximise(bins: _Bins, model: Mask, held: tuple[int, float] | None = None) -
             break
     out = np.zeros(4)
     out[model] = theta
-    if held is not None:
-        out[held[0]] = held[1]
+    if fixed is not None:
+        out[fixed[0]] = fixed[1]
     return out
 
 

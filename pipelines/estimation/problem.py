@@ -418,7 +418,7 @@ class History:
 
 
 @dataclass(frozen=True)
-class Course:
+class PosteriorHistory:
     """Joint posterior at moments, given all before each, with the same noise levels at all.
 
     Attributes:
@@ -556,7 +556,7 @@ class Estimate:
         residuals: family -> residuals of measurements at the estimate; innovations if `has_innovations`.
         chi_square: None for solvers that have none.
         history: values and sigmas from what was recorded until each moment.
-        course: the same at some moments, jointly; None where moments are not weighed alike.
+        posterior_history: joint posterior at moments; None where noise levels differ between moments.
         smoothed: values and sigmas at each moment from the whole recording, where parameters move along; the others
             are as they are at the end.
         attitudes: the trajectory, if the method has one.
@@ -586,7 +586,7 @@ class Estimate:
     residuals: Mapping[str, Residuals] = field(default_factory=dict)
     chi_square: ChiSquare | None = None
     history: History | None = None
-    course: Course | None = None
+    posterior_history: PosteriorHistory | None = None
     smoothed: History | None = None
     attitudes: Attitudes | None = None
     budget: Mapping[str, Mapping[str, float]] | None = None

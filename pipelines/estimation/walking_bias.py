@@ -79,7 +79,7 @@ class WalkingBias:
 
     @property
     def nodes(self) -> int:
-        """Number of nodes."""
+        """Number of bias nodes."""
         return len(self.edges) - 1
 
     def node_at(self, time: Array) -> NDArray[np.intp]:

@@ -452,7 +452,7 @@ def _message_block(number: int, buffer: NDArray[np.uint8], offsets: NDArray[np.i
 
 
 def _may_be_record(stream: BinaryIO, position: int, stop: int) -> bool:
-    """Whether a record of the data section may begin there, or the section end."""
+    """Whether a record of the data section, or the section's end, may begin at this position."""
     if position >= stop:
         return position == stop
     stream.seek(position)

@@ -46,7 +46,7 @@ def _limit(name: str, shares: Mapping[str, float], assumed: set[str]) -> Limit:
     parts: dict[str, float] = {}
     advice: dict[str, str] = {}
     for source, share in shares.items():
-        label, what = _told(name, source, assumed)
+        label, what = _described(name, source, assumed)
         parts[label] = parts.get(label, 0.0) + share
         advice.setdefault(label, what)
     order = sorted(parts.items(), key=lambda part: -part[1])
@@ -56,7 +56,7 @@ def _limit(name: str, shares: Mapping[str, float], assumed: set[str]) -> Limit:
     return Limit(name, (*kept, *last), advice[kept[0][0]])
 
 
-def _told(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
+def _described(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
     """A source in words, and what would make it smaller."""
     if source.startswith(RECORDING):
         return source, "record longer, or more often"

@@ -179,7 +179,7 @@ def solve_batch(
     found = time.perf_counter()
     estimate = _estimate(solved, config, budget, changed)
     if device:
-        estimate = replace(estimate, sqrt_info=_told(solved, device, elsewhere))
+        estimate = replace(estimate, sqrt_info=_information_of(solved, device, elsewhere))
     done = time.perf_counter()
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
 
@@ -230,10 +230,10 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         steps = largest_steps(compiled, solved.levels, solved.solution)
         wide = by * np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
     covariance = posterior.covariance * np.outer(wide, wide)
-    system, course = posterior.system, None
+    system, history = posterior.system, None
     if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
         final = posterior.reported.numbers, posterior.covariance
-        course = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time, final)
+        history = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time, final)
     residuals = residuals_by_family(engine, values)
     out = Estimate(
         solver="batch",
@@ -248,8 +248,8 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         message=solved.solution.message,
         residuals=residuals,
         chi_square=chi_square(leverages(engine, system, found, values)),
-        history=None if course is None else course.history.inflated(wide),
-        course=course,
+        history=None if history is None else history.history.inflated(wide),
+        posterior_history=history,
         smoothed=_smoothed(solved, covariance),
         attitudes=_attitudes(solved) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
@@ -341,7 +341,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     return dict(zip(influence.names, moves.tolist(), strict=True))
 
 
-def _told(
+def _information_of(
     solved: Solved, device: Collection[str], elsewhere: Callable[[SqrtInformation], Mapping[str, float]] | None
 ) -> SqrtInformation:
     """Square-root information of a graph about its numbers, linearised at its solution or at `elsewhere`."""

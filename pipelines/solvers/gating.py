@@ -100,11 +100,11 @@ class Prediction:
         dims = self.about.dims()
         fresh = list(self.new.keys())
         involved = set(self._process.keyVector())
-        held = [k for k in dict.fromkeys([*keys, *involved]) if k not in fresh]
-        P, moves = self.smoother.covariance(held), self.smoother.moves(held)
-        where = slices(held + fresh, dims)
+        known_keys = [k for k in dict.fromkeys([*keys, *involved]) if k not in fresh]
+        P, moves = self.smoother.covariance(known_keys), self.smoother.moves(known_keys)
+        where = slices(known_keys + fresh, dims)
         if fresh:
-            order = [k for k in held if k in involved] + fresh
+            order = [k for k in known_keys if k in involved] + fresh
             A, b = self._process.jacobian(ordering_of(order))
             columns = slices(order, dims)
             inverse = np.linalg.pinv(A[:, columns[fresh[0]].start :])

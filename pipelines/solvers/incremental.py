@@ -37,10 +37,10 @@ from alidade.pipelines.estimation.problem import (
     Array,
     Attitudes,
     ChiSquare,
-    Course,
     Estimate,
     Factor,
     History,
+    PosteriorHistory,
     Problem,
     Step,
 )
@@ -147,12 +147,12 @@ class MomentRecorder:
         self.rows = RowBuffer() if rows is None else rows
 
     @classmethod
-    def after(cls, course: Course | None) -> MomentRecorder:
+    def after(cls, posterior_history: PosteriorHistory | None) -> MomentRecorder:
         """A recorder that continues from the moments of a batch solution."""
-        if course is None:
+        if posterior_history is None:
             return cls()
-        covariance = course.covariance.reshape(len(course.time), -1)
-        return cls(RowBuffer(np.column_stack([course.time, course.values, covariance])))
+        covariance = posterior_history.covariance.reshape(len(posterior_history.time), -1)
+        return cls(RowBuffer(np.column_stack([posterior_history.time, posterior_history.values, covariance])))
 
     def is_due(self, time: float, spacing: float) -> bool:
         """Whether a moment is to be added at a time, s."""
@@ -163,13 +163,15 @@ class MomentRecorder:
         """Add a moment."""
         self.rows.add(np.concatenate([[time], values, covariance.ravel()])[None])
 
-    def course(self, time: float, values: Array, covariance: Array, steady: NDArray[np.bool_]) -> Course | None:
+    def posterior_history(
+        self, time: float, values: Array, covariance: Array, steady: NDArray[np.bool_]
+    ) -> PosteriorHistory | None:
         """The moments before a time, s, with the estimate then as the last; None: the beginning is not known."""
         past, n = self.rows.array, len(values)
         if not len(past):
             return None
         past = past[past[:, 0] < time]
-        return Course(
+        return PosteriorHistory(
             np.append(past[:, 0], time),
             np.vstack([past[:, 1 : 1 + n], values]),
             np.concatenate([past[:, 1 + n :].reshape(-1, n, n), covariance[None]]),
@@ -265,7 +267,7 @@ class IncrementalSolver:
         self._known = np.empty(0)  # (m,) variances of the free reported numbers after the last batch solution
         self._second: Array | None = None  # (m, m) covariance of second order in the last batch solution, prior units
         self._beyond = np.ones(len(problem.quantities), dtype=bool)  # numbers that need more than second order
-        self._course: Callable[[], Course | None] = lambda: None  # of the last batch solution
+        self._posterior_history: Callable[[], PosteriorHistory | None] = lambda: None  # of the last batch solution
 
     @classmethod
     def resumed(
@@ -370,15 +372,15 @@ class IncrementalSolver:
         """Joint covariance (n, n) of `values`."""
         return self._constrained()[1]
 
-    def course(self) -> Course | None:
+    def posterior_history(self) -> PosteriorHistory | None:
         """Joint estimates at moments; in the initialisation phase until its last batch solution."""
         if self.initialising:
-            return self._course()
+            return self._posterior_history()
         steady = np.repeat(
             [p.key not in self.walked for p in self.problem.parameters],
             [len(p.quantities) for p in self.problem.parameters],
         )
-        return self.recorder.course(self.time, *self._constrained(), steady)
+        return self.recorder.posterior_history(self.time, *self._constrained(), steady)
 
     def chi_square(self) -> ChiSquare:
         """The sum of the squared innovations of the measurements used."""
@@ -414,7 +416,7 @@ class IncrementalSolver:
             residuals=self.gate.residuals(),
             chi_square=self.chi_square(),
             history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]).inflated(inflation),
-            course=self.course(),
+            posterior_history=self.posterior_history(),
             attitudes=None if self.problem.attitudes is None else Attitudes(attitudes[:, 0], attitudes[:, 1:]),
             rejected=self.gate.rejected(),
             levels=self.levels,
@@ -556,9 +558,9 @@ class IncrementalSolver:
         self._restart(solved, values, stamps, since)
         if from_start:
             self.moments += 1
-            self._course = cache(lambda: _course_of(solved))
+            self._posterior_history = cache(lambda: _posterior_history_of(solved))
             if not self.initialising:
-                self.recorder, self._course = MomentRecorder.after(self._course()), lambda: None
+                self.recorder, self._posterior_history = MomentRecorder.after(self._posterior_history()), lambda: None
             self.attitudes.clear()
         self._record(solved.compiled.keyframes if from_start else last, values)
         self._solved = len(self.steps_since), since
@@ -666,7 +668,7 @@ def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[
     return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]
 
 
-def _course_of(solved: Solved) -> Course | None:
+def _posterior_history_of(solved: Solved) -> PosteriorHistory | None:
     """Posterior at moments before a batch solution."""
     compiled, posterior = solved.compiled, solved.posterior
     engine, system, found = solved.engine, posterior.system, posterior.factorization

@@ -478,7 +478,7 @@ def _maximum(
         gradient, information = solution.score([_parts(chain, tried, i) for i in free], signs)
         gradient, information = gradient + u / known**2, information + np.diag(known**-2.0)
         move = -np.linalg.solve(information, gradient)
-        foreseen, before = -float(gradient @ move), value
+        predicted, before = -float(gradient @ move), value
         move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
         for _ in range(_HALVINGS):
             ahead = at(u + move)
@@ -490,7 +490,7 @@ def _maximum(
         u = u + move
         value, tried, solution = ahead
         assert solution is not None
-        if min(foreseen, before - value) < _SETTLED:
+        if min(predicted, before - value) < _SETTLED:
             break
     return LevelEstimate(_known(tried, free, np.sqrt(np.diag(np.linalg.inv(information)))), value)
 

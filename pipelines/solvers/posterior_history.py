@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alidade.pipelines.estimation.problem import Course, History, Problem
+from alidade.pipelines.estimation.problem import History, PosteriorHistory, Problem
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, IndeterminateStateError, Index
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.linearization import Linearization
@@ -32,7 +32,7 @@ def posterior_history(
     current_keys: Mapping[int, int],
     time: Array,
     final: tuple[Array, Array] | None = None,
-) -> Course | None:
+) -> PosteriorHistory | None:
     """Values and joint covariance of the reported numbers at moments, weak directions at their priors.
 
     Args:
@@ -62,7 +62,7 @@ def posterior_history(
     numbers, covariances = (np.array(each) for each in zip(*found, strict=True))
     moving = [layout.sizes[3] > 0 and layout.node[layout.at([key])[0]] >= 0 for key in own.values()]
     steady = ~np.repeat(moving, [len(p.quantities) for p in problem.parameters])
-    return Course(time[keyframes], numbers, covariances, steady)
+    return PosteriorHistory(time[keyframes], numbers, covariances, steady)
 
 
 def prefix_roots(system: ChainSystem, factorization: ChainFactorization) -> tuple[Index, list[Array]]:

@@ -15,7 +15,7 @@ from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.parameters import prior_z_score
-from alidade.pipelines.estimation.problem import Array, Course, Estimate, History, Quantity, SqrtInformation
+from alidade.pipelines.estimation.problem import Array, Estimate, History, PosteriorHistory, Quantity, SqrtInformation
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
@@ -52,9 +52,9 @@ def walk(rng: np.random.Generator, change: float = 0.0, n: int = 40) -> tuple[Es
     k = np.arange(1, n + 1)
     values = np.cumsum(z, axis=0) / k[:, None]
     P = np.eye(2) / k[:, None, None]
-    course = Course(k.astype(float), values, P, np.array([True, True]))
+    posterior_history = PosteriorHistory(k.astype(float), values, P, np.array([True, True]))
     quantities = tuple(Quantity(name, "rad", 10.0, 10.0, 1.0) for name in "ab")
-    return Estimate("batch", ("a", "b"), values[-1], P[-1], True, "", course=course), quantities
+    return Estimate("batch", ("a", "b"), values[-1], P[-1], True, "", posterior_history=posterior_history), quantities
 
 
 def test_the_level_is_what_it_says() -> None:
@@ -81,8 +81,10 @@ def test_a_value_far_beyond_its_prior_is_no_change() -> None:
     k = np.arange(1, n + 1)
     values = np.cumsum(rng.normal(10.0, 1.0, n)) / (k + 1)
     P = np.asarray(1.0 / (k + 1.0), dtype=float)
-    course = Course(k.astype(float), values[:, None], P[:, None, None], np.array([True]))
-    estimate = Estimate("batch", ("a",), values[-1:], np.array([[P[-1]]]), True, "", course=course)
+    posterior_history = PosteriorHistory(k.astype(float), values[:, None], P[:, None, None], np.array([True]))
+    estimate = Estimate(
+        "batch", ("a",), values[-1:], np.array([[P[-1]]]), True, "", posterior_history=posterior_history
+    )
     found = stability(estimate, [Quantity("a", "rad", 1.0, 1.0, 1.0)])
     assert found is not None
     assert not found.changed
@@ -94,11 +96,15 @@ def test_a_value_far_beyond_its_prior_is_no_change() -> None:
 def test_numbers_whose_sum_is_known_far_better_are_inflated_alike() -> None:
     """Inflated each by its own factor, the sum would no longer be what is known."""
     estimate, quantities = walk(np.random.default_rng(4))
-    course = estimate.course
-    assert course is not None
+    posterior_history = estimate.posterior_history
+    assert posterior_history is not None
     mix = np.array([[1.0, 1e-3], [-1.0, 1e-3]])
-    mixed = replace(course, values=course.values @ mix.T, covariance=mix @ course.covariance @ mix.T)
-    last = {"values": mixed.values[-1], "covariance": mixed.covariance[-1], "course": mixed}
+    mixed = replace(
+        posterior_history,
+        values=posterior_history.values @ mix.T,
+        covariance=mix @ posterior_history.covariance @ mix.T,
+    )
+    last = {"values": mixed.values[-1], "covariance": mixed.covariance[-1], "posterior_history": mixed}
     found = stability(replace(estimate, **last, inflation=np.array([1.0, 2.0])), quantities)
     assert found is not None
     assert not found.changed
@@ -130,11 +136,13 @@ def test_numbers_far_beyond_their_priors_have_wider_ones(departure: float, exces
     root = rng.standard_normal((n, n))
     P: Array = np.asarray(np.linalg.inv(root @ root.T + np.eye(n)), dtype=float)
     values, steady = departure + rng.standard_normal((3, n)), np.ones(n, dtype=bool)
-    course = Course(np.arange(3.0), values, np.tile((1.0 + excess) * P, (3, 1, 1)), steady)
+    posterior_history = PosteriorHistory(np.arange(3.0), values, np.tile((1.0 + excess) * P, (3, 1, 1)), steady)
     quantities = tuple(Quantity(f"q{i}", "rad", 1.0, 1.0, 1.0) for i in range(n))
     names = tuple(q.name for q in quantities)
-    estimate = Estimate("batch", names, course.values[-1], P, True, "", course=course)
-    values, covariance = change_test._with_priors_as_found(estimate, quantities, course.values, course.covariance)
+    estimate = Estimate("batch", names, posterior_history.values[-1], P, True, "", posterior_history=posterior_history)
+    values, covariance = change_test._with_priors_as_found(
+        estimate, quantities, posterior_history.values, posterior_history.covariance
+    )
     assert np.isfinite(values).all()
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
     assert (np.diagonal(covariance, axis1=1, axis2=2) <= 4.0 * departure**2 * (1.0 + excess)).all()
@@ -142,20 +150,20 @@ def test_numbers_far_beyond_their_priors_have_wider_ones(departure: float, exces
         sizes = [prior_z_score(q, v, s) for q, v, s in zip(quantities, estimate.values, estimate.sigmas, strict=True)]
         information = np.linalg.inv(P) - np.diag(1.0 - np.array(sizes, dtype=float) ** -2)
         np.testing.assert_allclose(covariance[-1], np.linalg.inv(information), rtol=1e-6)
-        gradient = np.linalg.inv(P) @ course.values[-1]
+        gradient = np.linalg.inv(P) @ posterior_history.values[-1]
         np.testing.assert_allclose(values[-1], np.linalg.solve(information, gradient), rtol=1e-6)
 
 
 def test_what_walks_or_is_fixed_may_change() -> None:
     estimate, quantities = walk(np.random.default_rng(1), change=3.0)
-    course = estimate.course
-    assert course is not None
-    walking = replace(estimate, course=replace(course, steady=np.array([False, True])))
+    posterior_history = estimate.posterior_history
+    assert posterior_history is not None
+    walking = replace(estimate, posterior_history=replace(posterior_history, steady=np.array([False, True])))
     found = stability(walking, quantities)
     assert found is not None
     assert not found.changed
     assert stability(estimate, [replace(q, prior_sigma=0.0) for q in quantities]) is None
-    assert stability(replace(estimate, course=None), quantities) is None
+    assert stability(replace(estimate, posterior_history=None), quantities) is None
 
 
 def test_a_mount_that_slips_is_inconsistent_with_the_time_and_the_step() -> None:

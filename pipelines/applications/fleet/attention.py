@@ -44,7 +44,7 @@ class Unit:
 def units_of_interest(
     results: Mapping[str, UnitResult], fleet: Sequence[Population], found: Sequence[History]
 ) -> list[Unit]:
-    """The units that need attention, those that changed or are outlying by most first."""
+    """The units that need attention: changed ones first, then outliers by distance."""
     units: dict[str, list[Finding]] = {}
     populations = {(p.method, p.name): p for p in fleet}
     for history in found:

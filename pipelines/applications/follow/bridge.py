@@ -66,7 +66,7 @@ class Bridge(Stream):
     def __init__(self, url: str, folder: Path | None, say: Callable[[str], None]) -> None:
         self._connect = websockets().sync.client.connect
         super().__init__(url, folder, say)
-        self._url, self._told = url, ""
+        self._url, self._sentence = url, ""
         self.refused = 0
 
     def _write(self, out: Spool) -> None:
@@ -96,8 +96,8 @@ class Bridge(Stream):
 
     def _tell(self, sentence: str) -> None:
         """Say it, but not twice in a row."""
-        if sentence != self._told:
-            self._told = sentence
+        if sentence != self._sentence:
+            self._sentence = sentence
             self._say(sentence)
 
     def _listen(self, connection: Any, record: _Record) -> None:

@@ -43,7 +43,7 @@ class Spool:
         return len(self._waiting) > MAX_WAITING_BYTES
 
     def write(self, data: bytes | memoryview) -> int:
-        """Keep a part of a record, which stands on the disk after the next `flush` at the earliest."""
+        """Buffer a part of a record; the next `flush` may write it to the disk."""
         self._waiting += data
         return len(data)
 

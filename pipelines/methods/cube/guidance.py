@@ -146,7 +146,7 @@ def _focal_length(data: CubeData, config: Config, change: float) -> tuple[CubeDa
 
 
 def _as_found(data: CubeData, config: Config, changed: CubeData, other: Config) -> tuple[CubeData, Config]:
-    """Changed data and config with the poses that were found in the data as they are.
+    """Changed data and config with the static poses found in the unchanged data.
 
     They would be the same, but for first guesses; finding them takes longer than all the rest.
     """

@@ -62,7 +62,7 @@ class Place(_Part):
 
 
 class TagCube(_Part):
-    """The cube that the device is in, m."""
+    """Size and tags of the cube that carries the device, m."""
 
     edge: Positive = 0.16
     tag_size: Positive = 0.12

@@ -71,7 +71,7 @@ def _platform_rate(parameters: Collection[str]) -> list[Formula]:
 
 
 def findings(data: HeadData, config: Config, _: Estimate) -> Findings:
-    """Rows of `fixed_assumptions`: those that the recording gives no hold on, and why."""
+    """Rows of `fixed_assumptions`: nuisance parameters that the recording cannot estimate, with the reason."""
     return {} if data.head_force is not None else fixed_without_force(SENSITIVITY, config, config.topic(HEAD_IMU))
 
 
@@ -214,7 +214,7 @@ def _picture_times(data: HeadData, values: Mapping[str, float]) -> Array:
 
 
 def validate(data: HeadData, config: Config, values: Mapping[str, float]) -> tuple[Validation, ...]:
-    """Errors of attitudes carried on by the gyros, against vision and, where it is known, against the truth.
+    """Errors of attitudes propagated by the gyros, against vision and, where it is known, against the truth.
 
     Args:
         data: the session.

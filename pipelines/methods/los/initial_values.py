@@ -91,7 +91,9 @@ def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath, tar
     return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), target))
 
 
-def foreseen(chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
+def predicted_errors(
+    chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measured: Array, gyro: GyroPath
+) -> Array:
     """phx, phz (n, 2), rad, as gyro and gimbal carry them on, brought near the measured ones by slow broken lines.
 
     The lines have so few numbers that next to nothing of a picture's noise is in them; cRm (n, 4) are to be of smoothed

@@ -34,10 +34,10 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.formula import clock_constants
 from alidade.pipelines.methods.los.initial_values import (
     camera,
-    foreseen,
     guess,
     guess_picture_clock,
     initial_attitudes,
+    predicted_errors,
     seen,
     select_pictures,
 )
@@ -178,7 +178,7 @@ def _prepare(
     around, clock = None, clock or Clock(float(data.image_t[0]))
     if parameters.sight is not None:
         motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving)
-        errors = foreseen(chains, time, camera(motion.gimbal, mount, parameters.names), measured, chain.gyro)
+        errors = predicted_errors(chains, time, camera(motion.gimbal, mount, parameters.names), measured, chain.gyro)
         clock, watched = _watched(used, clock, before, start)
         elapsed = clock.elapsed(time)
         around = LosContext(motion, elapsed, watched, errors, clock.late(elapsed))

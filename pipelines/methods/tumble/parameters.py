@@ -1,4 +1,4 @@
-"""What the tumble method calibrates: names, units, priors and the accuracy wanted."""
+"""Parameters of the tumble method: names, units, priors and required accuracy."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Additional:
         return numbers[..., : c * n].reshape(*numbers.shape[:-1], c, n), numbers[..., c * n :]
 
     def off(self, bundle: Bundle) -> Array:
-        """(k,) how far a bundle is from what is known beforehand."""
+        """Deviation (k,) of a bundle's intrinsics and line times from their priors."""
         out = np.zeros_like(self.intrinsics)
         for row, now, given in zip(out, bundle.cameras, self.given, strict=True):
             row[: len(now.intrinsics)] = now.intrinsics - given.intrinsics
