@@ -86,7 +86,7 @@
       x_range: range(spec.x_range), y_range: spec.y_shared ? new Bokeh.Range1d() : range(spec.y_range),
       match_aspect: spec.square, tools: [zoom, new Bokeh.PanTool(), new Bokeh.ResetTool(), new Bokeh.SaveTool()],
       active_drag: zoom, toolbar_location: "right",
-      background_fill_color: null, border_fill_color: null, outline_line_color: color("faint"),
+      background_fill_color: null, border_fill_color: null, outline_line_color: color("grid"),
     });
     figure.toolbar.autohide = true;
     figure.toolbar.logo = null;
@@ -94,12 +94,12 @@
       axis.axis_label_text_color = axis.major_label_text_color = color("soft");
       axis.axis_label_text_font_style = "normal";
       axis.axis_label_text_font_size = axis.major_label_text_font_size = "12px";
-      axis.axis_line_color = axis.major_tick_line_color = color("faint");
+      axis.axis_line_color = axis.major_tick_line_color = color("grid");
       axis.minor_tick_line_color = null;
       if (narrow) axis.ticker.desired_num_ticks = 4;
       axis.visible = !spec.bare;
     }
-    for (const grid of figure.grids) { grid.grid_line_color = color("faint"); grid.grid_line_alpha = 0.6; grid.visible = !spec.bare; }
+    for (const grid of figure.grids) { grid.grid_line_color = color("grid"); grid.grid_line_alpha = 0.6; grid.visible = !spec.bare; }
     if (spec.bare) figure.outline_line_color = null;
     for (const [axis, grid, labels, turn] of [[figure.xaxes[0], figure.xgrids[0], spec.x_labels, 1.0], [figure.yaxes[0], figure.ygrids[0], spec.y_labels, 0]]) {
       if (!labels.length) continue;
