@@ -3,7 +3,7 @@
     python -m tests.support.soak --minutes 30 --clients 200
 
 The bridge and the clients are processes of their own; follow, its page and its server are this one, whose memory is
-looked at. The disk is full for 3 s of every 10 s: the system's call that writes refuses.
+looked at. While it plays the disk is full for 3 s of every 10 s: the system's call that writes refuses.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def soak(folder: Path, seconds: float, clients: int) -> Soak:
         _apart(_play, whole, drops) as bridge,
         _apart(_attack, clients, page, served) as attackers,
         _sampled(memory),
-        _filling_disk() as full,
+        _filling_disk(seconds) as full,
     ):
         settings = Settings(config=config, patience=min(8.0, 0.3 * seconds))
         live = following.follow(bridge.recv(), settings, served, kept, True, ("127.0.0.1", page))
@@ -148,12 +148,13 @@ def _sampled(memory: list[tuple[float, float]]) -> Iterator[None]:
 
 
 @contextmanager
-def _filling_disk() -> Iterator[list[int]]:
-    """How many writes found the disk full."""
+def _filling_disk(seconds: float) -> Iterator[list[int]]:
+    """How many writes found the disk full, which it is for so many seconds at most: in the end there is room."""
     began, write, full = time.monotonic(), os.pwrite, [0]
 
     def limited(file: int, data: memoryview, at: int) -> int:
-        if (time.monotonic() - began) % _PERIOD_S < _FULL_S:
+        since = time.monotonic() - began
+        if since < seconds and since % _PERIOD_S < _FULL_S:
             full[0] += 1
             raise OSError(28, "No space left on device")
         return write(file, data, at)
