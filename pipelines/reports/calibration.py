@@ -22,10 +22,10 @@ from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.gaussian_prior import GaussianPrior
-from alidade.pipelines.methods.formula import Formula, apply
+from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import invalid
-from alidade.pipelines.reports.values import Application, SensorValues
+from alidade.pipelines.reports.values import Application, SensorValues, difference
 from alidade.pipelines.settings import Config
 
 _HEAD = """\
@@ -248,32 +248,24 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
     estimate, covariance = calibration.estimate, calibration.covariance
     unknown = dict.fromkeys((q.name for q in calibration.problem.quantities), 0.0)
     given = calibration.method.report.fixed_rotations(calibration.config)
-    formulas: list[Formula] = []
 
-    def at(values: Array) -> dict[str, Array]:
-        needed = {name: given[name] for formula in formulas for name in formula.inputs}
-        return apply(formulas, {**unknown, **dict(zip(estimate.names, values.tolist(), strict=True))}, needed)
+    def at(values: Array) -> dict[str, Value]:
+        known = {**unknown, **dict(zip(estimate.names, values.tolist(), strict=True))}
+        return results(calibration.formulas, known, given)
 
     best = np.array([calibration.applied_values.get(name, value) for name, value in calibration.values.items()])
-
-    for formula in calibration.formulas:
-        if given.keys() >= set(formula.inputs):
-            formulas.append(formula)
-            try:
-                at(best)
-            except AttributeError:  # of parameters that this graph has not got
-                formulas.pop()
-    results = at(best)
-    rotations = {f.name: f for f in formulas if results[f.name].shape == (4,) and _FRAMES.match(f.description)}
+    there = at(best)
+    computed = [formula for formula in calibration.formulas if formula.name in there]
+    rotations = {f.name: f for f in computed if there[f.name].kind == "rotation" and _FRAMES.match(f.description)}
     if not rotations:
         return {}
     ends = [(at(best + step), at(best - step)) for step in _STEP * np.eye(len(estimate.names))]
     found = {}
     for name, formula in rotations.items():
-        turns = [so3.log(so3.multiply(ahead[name], so3.inverse(behind[name]))) for ahead, behind in ends]
+        turns = [difference(ahead[name], behind[name]) for ahead, behind in ends]
         J = np.array(turns).T / (2.0 * _STEP)
         child, parent = (word.strip().lower().replace(" ", "_") for word in _frames(formula.description))
-        w, x, y, z = (_rounded(v) for v in results[name].tolist())
+        w, x, y, z = (_rounded(v) for v in there[name].array.tolist())
         spread = tuple(_rounded(float(v), _FEWER_DIGITS) for v in (J @ covariance @ J.T).ravel())
         found[name] = SavedTransform(parent=parent, child=child, wxyz=(w, x, y, z), covariance=spread)
     return found

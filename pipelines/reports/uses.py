@@ -9,7 +9,7 @@ import numpy as np
 
 from alidade.pipelines.diagnostics.use import Posterior, Truth, UseBands, use_bands
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.formula import Formula, apply
+from alidade.pipelines.methods.formula import Formula, results
 from alidade.pipelines.reports.result import Calibration, quantities_of
 
 
@@ -23,10 +23,8 @@ class AppliedFormulas:
 
     def __call__(self, **measured: Array) -> Mapping[str, Array]:
         """What follows from measurements, at the first temperature."""
-        given = {**measured, **self._first}
-        usable = [formula for formula in self._formulas if given.keys() >= {*formula.inputs}]
-        needed = {name for formula in usable for name in formula.inputs}
-        return apply(usable, self._all, {name: given[name] for name in needed})
+        found = results(self._formulas, self._all, {**measured, **self._first})
+        return {name: value.array for name, value in found.items()}
 
 
 def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
@@ -39,7 +37,7 @@ def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
     true = Truth([*known], np.array([*known.values()]))
     found = []
     for use in c.method.report.uses(true, c.config, noise):
-        with suppress(AttributeError, KeyError):  # its formulas need parameters that this graph has not got
+        with suppress(KeyError):  # its formulas need what this graph has not got
             found.append(use_bands(use, posterior))
     return tuple(found)
 

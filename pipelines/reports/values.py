@@ -148,16 +148,16 @@ class SensorValues:
             return {**results(known.formulas, space, measured), **results(known.whole, space, measured)}
 
         best = at(x)
-        square = {name: _difference(Value(best[name].kind, array), best[name]) ** 2 for name, array in found.items()}
+        square = {name: difference(Value(best[name].kind, array), best[name]) ** 2 for name, array in found.items()}
         for step in _STEP * root.T:
             ahead, behind = at(x + step), at(x - step)
             for name in found:
-                square[name] = square[name] + (_difference(ahead[name], behind[name]) / (2.0 * _STEP)) ** 2
+                square[name] = square[name] + (difference(ahead[name], behind[name]) / (2.0 * _STEP)) ** 2
         return {name: WithSigma(array, np.sqrt(square[name])) for name, array in found.items()}
 
 
-def _difference(one: Value, other: Value) -> Array:
-    """Of a rotation the rotation vector about the axes of its parent."""
+def difference(one: Value, other: Value) -> Array:
+    """One value less another: of rotations the rotation vector between them about the axes of the parent."""
     if one.kind == "rotation":
         return so3.log(so3.multiply(one.array, so3.inverse(other.array)))
     return np.asarray(one.array - other.array)
