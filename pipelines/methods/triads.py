@@ -6,7 +6,7 @@ definition of the body's axes there are only the six on and above the diagonal.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +34,7 @@ _STEP = 1e-6
 def triad_specs(
     name: str, unit: str, gain: tuple[float, float], bias: tuple[float, float], per_recording: bool = False
 ) -> tuple[ParameterSpec, ...]:
-    """The numbers of a triad: entries of K on and off the diagonal, b.
+    """Parameter specifications of a triad sensor: entries of K on and off the diagonal, and its offset b.
 
     Args:
         name: of the sensor.
@@ -128,16 +128,22 @@ def parts_of(K: Array) -> Array:
     return np.concatenate([scale, np.arcsin(np.clip(across, -1.0, 1.0)), mounting])
 
 
+def numeric_jacobian(function: Callable[[Array], Array], x: Array, step: Array) -> Array:
+    """Jacobian (m, n) of a function (n,) -> (m,) by central differences of `step` (n,), 0 where the step is 0."""
+    J = np.zeros((len(function(x)), len(x)))
+    for j in np.flatnonzero(step):
+        h = step[j] * np.eye(len(x))[j]
+        J[:, j] = (function(x + h) - function(x - h)) / (2.0 * step[j])
+    return J
+
+
 def parts_with_sigmas(K: Array, covariance: Array) -> tuple[Array, Array] | None:
     """`parts_of` K, and their sigmas by the covariance (9, 9) of its rows; None for a K that is no sensor's."""
     try:
-        found = parts_of(K)
-        steps = (_STEP * np.eye(9)).reshape(9, 3, 3)
-        columns = [parts_of(K + s) - parts_of(K - s) for s in steps]
+        J = numeric_jacobian(lambda rows: parts_of(rows.reshape(3, 3)), K.ravel(), np.full(9, _STEP))
     except ValueError:
         return None
-    J = np.array(columns).T / (2.0 * _STEP)
-    return found, np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0))
+    return parts_of(K), np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0))
 
 
 def parts_row(name: str, parts: Array, sigmas: Array) -> dict[str, object]:

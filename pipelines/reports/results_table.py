@@ -15,14 +15,14 @@ import numpy as np
 from alidade.pipelines.diagnostics.observability import Verdict, rejects_many, verdict
 from alidade.pipelines.display.table import Cell, Column, Interval, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.estimation.parameters import SENSORS
 from alidade.pipelines.estimation.problem import Array, Quantity
-from alidade.pipelines.methods.triads import TRIADS, parts_of, sensor_model
+from alidade.pipelines.methods.triads import TRIADS, numeric_jacobian, parts_of, sensor_model
 from alidade.pipelines.reports.plots import variables
 from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.reports.result_json import truth_errors
 
 _G, _DEG = 9.80665, math.degrees(1.0)
-_SENSORS = {"accel": "Accelerometer", "gyro": "Gyro", "mag": "Magnetometer"}
 _BIAS_UNITS = {"accel": ("mg", 1e3 / _G), "gyro": ("deg/s", _DEG), "mag": ("µT", 1e6)}
 _FACTORS = {"deg": _DEG, "deg/s": _DEG, "deg/h": 3600.0 * _DEG, "ms": 1e3, "%": 100.0, "ppm": 1e6, "µT": 1e6}
 # Scale errors below this are shown in ppm.
@@ -197,7 +197,7 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     try:
         rows = _derived(c, names, parts)
     except ValueError:  # K is no sensor's
-        return ResultCard(_SENSORS[sensor], (_group(c, "K and b", "", names),))
+        return ResultCard(SENSORS[sensor].capitalize(), (_group(c, "K and b", "", names),))
     scale = [row.times(100.0) for row in rows[:3]]
     percent = "%"
     if plain and max(abs(row.value) + row.sigma for row in scale) < 100.0 * _PPM:
@@ -212,7 +212,7 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     ]
     if symmetric:
         groups[2] = ResultGroup("Misalignment", "", (), "0 by definition: it defines the body's axes")
-    return ResultCard(_SENSORS[sensor], tuple(groups))
+    return ResultCard(SENSORS[sensor].capitalize(), tuple(groups))
 
 
 _LABELS = (*"xyz", "xy", "xz", "yz", *"xyz", *"xyz")
@@ -223,13 +223,10 @@ def _derived(c: Calibration, names: Sequence[str], function: Callable[[Array], A
     quantities = [c.quantities[name] for name in names]
     x, P = np.array([c.values[name] for name in names]), c.covariance_of(names)
     step = np.where(np.diag(P) > 0.0, _STEP * np.sqrt(np.diag(P)), 0.0)
-    value, J = function(x), np.zeros((len(_LABELS), len(x)))
-    for j in np.flatnonzero(step):
-        h = step[j] * np.eye(len(x))[j]
-        J[:, j] = (function(x + h) - function(x - h)) / (2.0 * step[j])
+    value, J = function(x), numeric_jacobian(function, x, step)
     wanted = np.array([q.require if q.judged else 0.0 for q in quantities])
     prior = np.array([q.scale for q in quantities])
-    sigma, require, scale = (np.sqrt((J**2) @ v**2) for v in (np.zeros(len(x)), wanted, prior))
+    require, scale = (np.sqrt((J**2) @ v**2) for v in (wanted, prior))
     sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, P, J), 0.0))
     truth = {name: found.value for name, found in truth_errors(c).items()}
     error = value - function(np.array([truth[n] for n in names])) if truth.keys() >= set(names) else None
