@@ -504,26 +504,33 @@ def widened(
     the innovation of the first measurements has no prediction.
 
     Raises:
-        IndeterminateStateError: states or parameters are not determined without what was rejected.
+        IndeterminateStateError: states or parameters are not determined without what was rejected, if anything was.
     """
     variances = chain.variances(levels)
     before = [out > 0.0 for out in _by_row(chain, rejected, 0.0)]
     kept = [np.where(out, _NO_SAY * v, v) for out, v in zip(before, variances, strict=True)]
-    solution = chain.solved(kept)
-    if solution is None:
-        raise IndeterminateStateError(UNDETERMINED)
-    moves = chain.moves(solution.states[:, None], solution.shared[:, None])
+    # Only what was rejected is judged by the residuals that the solution leaves.
+    residuals = _residuals_of(chain, kept) if any(out.any() for out in before) else [r.residuals for r in chain.rows]
     limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
     wide: dict[int, Array] = {}
     outlying: dict[int, NDArray[np.bool_]] = {}
     for kind, each in chain.innovations(kept, limits).items():
         rows = chain.rows[kind]
-        left = ((rows.residuals + moves[kind][..., 0]) ** 2).sum(axis=1) / variances[kind]
+        left = (residuals[kind] ** 2).sum(axis=1) / variances[kind]
         out = before[kind] & (left > OUTLIER_GATES**2 * limits[kind])
         squares = np.where(before[kind], left, each.squares)
         wide[rows.group] = np.where(out, 1.0, np.sqrt(np.maximum(squares / limits[kind], 1.0)))
         outlying[rows.group] = out
     return wide, outlying
+
+
+def _residuals_of(chain: LinearChain, variances: Sequence[Array]) -> list[Array]:
+    """Residuals (n, m) of each kind at the solution with these variances, whitened as stated."""
+    solution = chain.solved(variances)
+    if solution is None:
+        raise IndeterminateStateError(UNDETERMINED)
+    moves = chain.moves(solution.states[:, None], solution.shared[:, None])
+    return [rows.residuals + move[..., 0] for rows, move in zip(chain.rows, moves, strict=True)]
 
 
 def step(
