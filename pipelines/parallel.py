@@ -181,7 +181,7 @@ class _Worker:
         return answer
 
     def close(self) -> None:
-        """Close the connection, which ends the process."""
+        """Close the connection to the worker, whose process ends with it."""
         self._connection.close()
 
 

@@ -7,7 +7,7 @@ its joint covariance P, and x_a, the values that the formulas apply,
     after:   m(u) = e(u; x_a, x),      J(u) = d e(u; x_a, t) / d t at t = x,  S(u) = J P J' + N(u)
     before:  the same with nominal values applied: K = I, b = 0, mounts and delays 0.
 
-N is noise of the use itself (angle random walk of a integrated attitude; 0 elsewhere). A scalar error has the band
+N is noise of the use itself (angle random walk of an integrated attitude; 0 elsewhere). A scalar error has the band
 m +- 1.96 sqrt(S). Of a vector the length is shown with the 95 % quantile of |N(m, S)|, whose square is matched in mean
 and variance by a scaled chi-square (Patnaik 1949): mean tr S + m'm, variance 2 tr S^2 + 4 m' S m. Derivatives are
 central differences of a tenth of a sigma. Where 2,000 draws of true ~ N(x, P) show that the error is not linear, the

@@ -49,7 +49,7 @@ class Badge:
 
 @dataclass(frozen=True)
 class Heading:
-    """The title of what follows within a section."""
+    """A subheading within a section of a report."""
 
     text: str
 

@@ -38,7 +38,7 @@ class GtsamEngine:
 
     @classmethod
     def of(cls, factors: Sequence[Factor], layout: Layout) -> GtsamEngine:
-        """Engine of a graph's factors."""
+        """Build the engine that eliminates these factors by gtsam."""
         return cls(Linearization.of(factors, layout, chain=False))
 
     @property

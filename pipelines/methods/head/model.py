@@ -269,7 +269,7 @@ def _inside(data: HeadData, taken: Array) -> NDArray[np.bool_]:
 
 
 def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], config: Config) -> Array:
-    """Square-root information (n, 3, 3) of attitudes: by the config, else by the messages, else the default."""
+    """Square-root information (n, 3, 3) of vision attitudes, 1/rad: by config, else messages, else default."""
     if covariance is None or config.noise.vision_attitude is not None:
         sigma = first_given(config.noise.vision_attitude, DEFAULT_NOISE.vision_attitude)
         return np.broadcast_to(np.eye(3) / sigma, (int(inside.sum()), 3, 3))
