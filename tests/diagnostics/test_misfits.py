@@ -18,10 +18,12 @@ from tests.support.builders import make_calibration
 
 @pytest.mark.parametrize(("noise", "most"), [("corner_px", 5.0), ("vision_attitude", 7.0), ("gyro_density", 60.0)])
 @pytest.mark.parametrize(
-    ("share", "told"), [(0.4, []), (0.9, [Severity.NOTE]), (1.1, [Severity.INCONSISTENT])], ids=["less", "note", "more"]
+    ("share", "severities"),
+    [(0.4, []), (0.9, [Severity.NOTE]), (1.1, [Severity.INCONSISTENT])],
+    ids=["less", "note", "more"],
 )
 def test_what_scatters_by_many_times_its_default_does_not_fit(
-    noise: str, most: float, share: float, told: list[Severity]
+    noise: str, most: float, share: float, severities: list[Severity]
 ) -> None:
     calibration = make_calibration()
     scale = share * most
@@ -29,7 +31,7 @@ def test_what_scatters_by_many_times_its_default_does_not_fit(
     estimate = replace(calibration.estimate, levels=(level,))
     findings = diagnose(estimate, calibration.problem.quantities)
     found = [each for each in findings if each.kind == "noise"]
-    assert [each.severity for each in found] == told
+    assert [each.severity for each in found] == severities
     assert all(each.evidence["noise"] == noise for each in found)
     assert is_suspect(estimate, findings) is (share > 1.0)
 

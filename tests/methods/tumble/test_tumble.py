@@ -200,7 +200,7 @@ def _turned(hz: float, beside: bool) -> TumbleScenario:
 
 @pytest.mark.parametrize(("hz", "beside"), [(5.0, False), (25.0, True), (400.0, False)])
 def test_gyro_of_any_rate_is_consistent(hz: float, beside: bool) -> None:
-    """Sensors turned against each other, a late magnetometer, a gyro that is off and feels force."""
+    """Sensors rotated relative to each other, a late magnetometer, a gyro that is off and feels force."""
     _assert_consistent(_turned(hz, beside), range(2, 4))
 
 
@@ -301,15 +301,15 @@ def test_a_gyro_in_degrees_is_not_used_and_that_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("axes", "told"),
+    ("axes", "named"),
     [
         ([[1, 0, 0], [0, -1, 0], [0, 0, 1]], True),
         pytest.param([[0, 1, 0], [1, 0, 0], [0, 0, 1]], True, marks=pytest.mark.slow),
         pytest.param([[-1, 0, 0], [0, -1, 0], [0, 0, 1]], False, marks=pytest.mark.slow),
     ],
 )
-def test_an_accelerometer_of_other_axes_is_calibrated_beside_a_gyro(axes: list[list[int]], told: bool) -> None:
-    """One axis inverted, two swapped: left-handed, and told; turned by half a turn: right-handed."""
+def test_an_accelerometer_of_other_axes_is_calibrated_beside_a_gyro(axes: list[list[int]], named: bool) -> None:
+    """One axis inverted, two swapped: left-handed, and named; turned by half a turn: right-handed."""
     simulated, P = _simulated(TURNING, 2), np.array(axes, dtype=float)
     assert simulated.data.accel is not None
     data = replace(simulated.data, accel=simulated.data.accel @ P.T)
@@ -319,7 +319,7 @@ def test_an_accelerometer_of_other_axes_is_calibrated_beside_a_gyro(axes: list[l
     at = [calibration.estimate.names.index(name) for name in names]
     error = calibration.estimate.values[at] - K.ravel()
     assert np.abs(error / calibration.estimate.sigmas[at]).max() < 4.0
-    assert ("the accelerometer's axes are left-handed" in " ".join(calibration.notes)) == told
+    assert ("the accelerometer's axes are left-handed" in " ".join(calibration.notes)) == named
 
 
 def test_left_handed_axes_are_told_beside_a_gyro() -> None:
