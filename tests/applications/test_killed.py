@@ -32,7 +32,10 @@ def _parts(few: int, count: int) -> pytest.MarkDecorator:
     return pytest.mark.parametrize(("part", "kills"), [pytest.param(0, few, id="few"), *slow])
 
 
-_FORK = multiprocessing.get_context("fork")
+# A server of its own forks the commands, which have imported what they need: a fork of a process with threads,
+# as that of pytest is after other tests, may never end.
+_FORK = multiprocessing.get_context("forkserver")
+_FORK.set_forkserver_preload([__name__, "alidade.pipelines.solvers.batch"])
 
 
 @pytest.fixture(scope="module")
