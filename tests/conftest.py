@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import subprocess
 import sys
 from collections import defaultdict
@@ -18,6 +19,9 @@ import pytest
 
 from alidade.pipelines.applications import cli
 from tests.support.command import Command, Run
+
+# A shell's background jobs, and so the commands that tests start, are told to ignore Ctrl-C; a terminal's are not.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

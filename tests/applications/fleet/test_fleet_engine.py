@@ -56,11 +56,6 @@ def written(folder: Path, duration_s: float) -> Path:
     return folder
 
 
-def _as_in_a_terminal() -> None:
-    """Ctrl-C is heard, which a shell's background jobs, and so these tests among them, are told to ignore."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Starts a process of its own group on this checkout or another; all end with the test."""
@@ -75,7 +70,6 @@ def start() -> Iterator[Start]:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            preexec_fn=_as_in_a_terminal,
         )
         processes.append(process)
         return process
