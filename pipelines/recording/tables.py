@@ -204,9 +204,9 @@ def _whole_rows(path: Path, data: Path, form: TableForm, wanted: Sequence[int]) 
     """The wanted cells of each row, and sentences about rows that are left out; see `read_columns`."""
     rows: list[list[str]] = []
     cut: list[tuple[int, int]] = []
-    headers = 1
+    headers, needed = 1, max(form.width, *(i + 1 for i in wanted))
     for number, row in _rows(path, data, form):
-        if len(row) < form.width:
+        if len(row) < needed:
             cut.append((number, len(row)))
         elif row[: len(form.names)] == list(form.names[: len(row)]):
             headers += 1
@@ -214,7 +214,7 @@ def _whole_rows(path: Path, data: Path, form: TableForm, wanted: Sequence[int]) 
             rows.append([row[i] for i in wanted])
     if len(cut) > max(1, _MOST_CUT * len(rows)):
         number, width = cut[0]
-        raise InputError(f"{path}: line {number} has {width} columns instead of {form.width}")
+        raise InputError(f"{path}: line {number} has {width} columns instead of {needed}")
     notes = [f"{path.name}: rows cut short, the first in line {cut[0][0]}: {len(cut)} left out"] if cut else []
     if headers > 1:
         notes.append(f"{path.name}: its header is there {headers} times, as of a logger that was started again")
