@@ -144,7 +144,8 @@ def test_ninety_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
     finished = calibrate(whole, ["incremental"])[0]
     for name, p in finished.parameters.items():
         # The LOS errors that los_scale goes by are smoothed over what there was: it was 0.11 sigma off.
-        sigmas = 0.3 if name == "los_scale" else 0.05
+        # What comes in other portions is linearised elsewhere, by .06 sigma at most; .1 would add .5 % to an error.
+        sigmas = 0.3 if name == "los_scale" else 0.1
         assert calibration.parameters[name].value == pytest.approx(p.value, abs=sigmas * p.sigma), name
 
 
