@@ -286,7 +286,7 @@ def follow(
     from alidade.pipelines.applications.follow.sources import source_of
 
     earlier = None if prior is None else Path(prior)
-    settings = Following(method, _override(config), window, patience, prior=earlier)
+    settings = Following(method, _override(config), window, patience, check=True, prior=earlier)
     with source_of(str(path), say=lambda _: None) as source:
         return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
 

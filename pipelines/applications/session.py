@@ -78,8 +78,8 @@ _HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY, _HALVES, _HELD_OUT = (
     "the split-half test",
     "the prediction of held-out measurements",
 )
-# What an online run ends with where noise levels maximise the marginal likelihood.
-_CONCLUDED = "at the end all measurements were solved together, at the noise levels of their marginal likelihood"
+# What an online run ends with.
+_CONCLUDED = "at the end all measurements were solved together"
 # Difference between incremental and batch that is worth a note, in sigmas.
 _NOTABLE_DIFFERENCE = 1.0
 
@@ -277,11 +277,12 @@ class Session:
         return self.origin.facts(self.config)
 
     def calibrate(
-        self, solver: str = "batch", window: float | None = 1.0, check: bool = False, report: bool = True
+        self, solver: str = "batch", window: float | None = 1.0, check: bool = True, report: bool = True
     ) -> Calibration:
         """The calibration by one of SOLVERS; `window` in s is the incremental one's, None keeps the whole history.
 
-        With `check` the incremental one is compared with batch. Without `report` there are values, sigmas and verdicts,
+        With `check` an incremental run ends with the solution of all measurements together, as the command's does:
+        that alone finds a change of any size. Without `report` there are values, sigmas and verdicts,
         the same to the last digit, and nothing of what else a report explains: where the variances come from, which
         measurements move a number most, the effect of fixed inputs on it, the method's own findings.
 
@@ -338,7 +339,7 @@ class Session:
         Args:
             solved: as above.
             seconds: what reading took.
-            check: hold incremental estimates against batch.
+            check: end incremental runs with batch's solution.
             report: with the method's findings.
 
         Raises:
@@ -354,7 +355,7 @@ class Session:
             estimate = replace(estimate, covariance=finite_covariance(quantities, estimate.covariance))
             difference = None
             if check and estimate.solver == "incremental" and not deadline.passed(_COMPARISON):
-                estimate, difference = self._compared(problem, estimate, quantities)
+                estimate, difference = self._with_conclusion(estimate, quantities, report)
             if estimate.solver == "published":
                 published = estimate
             elif report and estimate.solver == "incremental" and published is None:
@@ -472,23 +473,18 @@ class Session:
                 )
         return stable, change_finding(stable, parts, quantities, ratio)
 
-    def _compared(
-        self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity]
+    def _with_conclusion(
+        self, estimate: Estimate, quantities: Sequence[Quantity], report: bool
     ) -> tuple[Estimate, SolverDifference | None]:
-        """An incremental estimate, and its difference from batch's, which has nothing of what a report needs.
+        """The batch solution at the end of an incremental run, and the run's difference from it.
 
-        Where noise levels maximise the marginal likelihood, the estimate is that of all rows, by batch; the posterior
-        over time stays that of the run.
+        Where batch does not converge, the run's own estimate, and None.
         """
-        from alidade.pipelines.solvers.batch import solve_batch
-
-        with progress.doing("solving"):
-            batch = solve_batch(self.problem())
-        difference = solver_difference(estimate, batch)
-        if not problem.marginal_likelihood or not batch.converged:
-            return estimate, difference
+        batch, _ = self._solve("batch", None, report=report)
+        if not batch.converged:
+            return estimate, None
         batch = replace(batch, covariance=finite_covariance(quantities, batch.covariance))
-        return _concluded(estimate, batch), difference
+        return _concluded(estimate, batch), solver_difference(estimate, batch)
 
     def _solve(
         self,
@@ -698,10 +694,8 @@ def _check_figures(method: Method, config: Config) -> None:
 
 
 def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference | None) -> Iterator[Finding]:
-    """Findings beside those on the estimate: a difference from batch, and the premises of the method."""
-    # What was concluded is batch's own result.
-    notable = difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE and not estimate.concluded
-    if difference is not None and notable:
+    """Findings beside those on the estimate: how a run ended, and the premises of the method."""
+    if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
         yield Finding("solver_difference", Severity.NOTE, asdict(difference))
     if estimate.concluded:
         yield Finding("remark", Severity.NOTE, {"text": f"{_CONCLUDED}; estimates over time are the run's"})

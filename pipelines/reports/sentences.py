@@ -322,7 +322,7 @@ def _ambiguous_solution(e: Mapping[str, Any], _: Severity, quantities: Quantitie
 
 
 def _solver_difference(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    return f"Batch on the same recording differs by up to {abs(e['z']):.1f} sigma ({e['parameter']}): use its result."
+    return f"The run's own last estimate differed by up to {abs(e['z']):.1f} sigma ({e['parameter']})."
 
 
 def _recording(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:

@@ -167,7 +167,7 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "solver_difference",
         NOTE,
         {"parameter": "helmet_mount_z", "z": -1.52, "sigma_ratio": 0.9},
-        "Batch on the same recording differs by up to 1.5 sigma (helmet_mount_z): use its result.",
+        "The run's own last estimate differed by up to 1.5 sigma (helmet_mount_z).",
     ),
     (
         "recording",

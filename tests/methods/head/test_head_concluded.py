@@ -35,7 +35,7 @@ def session() -> Session:
 
 @pytest.fixture(scope="module")
 def online(session: Session) -> Calibration:
-    return session.calibrate("incremental", report=False)
+    return session.calibrate("incremental", check=False, report=False)
 
 
 @pytest.fixture(scope="module")
