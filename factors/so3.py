@@ -332,10 +332,13 @@ def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
 
 
 def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
-    """gtsam rotations -> quaternions with w >= 0, shape (n, 4)."""
+    """gtsam rotations -> unit quaternions with w >= 0, shape (n, 4).
+
+    gtsam normalises neither the product of matrices nor the quaternion of one: rounding would grow from state to state.
+    """
     numbers: Any = [r.toQuaternion() for r in rotations]
     q = np.array([q.coeffs() for q in numbers]).reshape(-1, 4)[:, [3, 0, 1, 2]]
-    return np.where(q[:, :1] < 0.0, -q, q)
+    return q / np.copysign(np.linalg.norm(q, axis=1, keepdims=True), q[:, :1])
 
 
 def to_gtsam(q: ArrayLike) -> gtsam.Rot3:

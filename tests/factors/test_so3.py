@@ -40,6 +40,15 @@ def test_agrees_with_gtsam(phi: np.ndarray) -> None:
     np.testing.assert_allclose(so3.to_gtsam(so3.exp(phi)[0]).matrix(), expected[0], atol=1e-9)
 
 
+def test_rounding_of_gtsam_rotations_does_not_grow() -> None:
+    """gtsam's matrices stay orthogonal through a thousand predictions of a filter, one from the other."""
+    attitude = gtsam.Rot3()
+    for turn in 0.2 * np.random.default_rng(0).normal(size=(1000, 3)):
+        predicted = so3.multiply(so3.from_gtsam([attitude]), so3.exp(turn))[0]
+        attitude = so3.to_gtsam(predicted).retract(np.full(3, 1e-3))
+    np.testing.assert_allclose(attitude.matrix() @ attitude.matrix().T, np.eye(3), atol=1e-14)
+
+
 @each_kind
 def test_matrix_round_trip(phi: np.ndarray) -> None:
     r = so3.matrix(so3.exp(phi))

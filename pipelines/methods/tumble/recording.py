@@ -84,7 +84,7 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
     if wanted(recording, config, IMU):
         imu = recording.imu(name)
         if is_there("accel", imu.accel, imu.accel_cov):
-            accel = reader.samples(name, imu, "accel")
+            accel = reader.samples(name, imu, "accel", may_be_held=True)
             _check_gravity(name, accel.series.accel)
             accel_density = reader.density(name, "accel", accel)
             spans[name] = accel.t
@@ -135,7 +135,7 @@ def _gyro(reader: StreamReader, topic: str, imu: series.ImuSeries) -> Samples[se
     if too_fast(topic, t, imu.gyro[keep]):
         reader.count(topic, NO_RATE, len(t))
         return None
-    return reader.samples(topic, imu, "gyro", may_be_constant=True)
+    return reader.samples(topic, imu, "gyro", may_be_constant=True, may_be_held=True)
 
 
 def tumble_topics(data: TumbleData, _pictures: None = None) -> dict[str, series.Topic]:

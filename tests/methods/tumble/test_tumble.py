@@ -29,7 +29,7 @@ from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.methods.triads import triad_names, triad_of
 from alidade.pipelines.methods.tumble.formulas import formulas
 from alidade.pipelines.methods.tumble.model import prepare
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData, read_tumble
+from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData, read_tumble, tumble_topics
 from alidade.pipelines.methods.tumble.scenario import (
     TumbledAccelerometer,
     TumbledGyro,
@@ -389,6 +389,16 @@ def test_a_recording_gives_the_data_back(tmp_path: Path) -> None:
     for name in ("mag_t", "mag", "accel", "latitude", "longitude"):
         np.testing.assert_allclose(getattr(data, name), getattr(simulated.data, name), rtol=1e-12, atol=1e-15)
     assert data.mag_density == pytest.approx(simulated.data.mag_density, rel=1e-6)
+
+
+def test_readings_that_a_logger_repeats_are_used_once(tmp_path: Path) -> None:
+    data = _simulated(replace_scenario(TURNING, attitudes=3), 5).data
+    repeated = replace(data, **{name: np.repeat(getattr(data, name), 3, axis=0) for name in ("gyro", "accel")})
+    t = data.accel_t[:, None] + np.linspace(0.0, 0.02, 3, endpoint=False)
+    write_session(tmp_path / "s.mcap", tumble_topics(replace(repeated, accel_t=t.ravel(), gyro_t=t.ravel())), {})
+    back = read_tumble(open_recording(tmp_path / "s.mcap"), Config())
+    for name in ("gyro", "gyro_t", "accel", "accel_t"):
+        np.testing.assert_allclose(getattr(back, name), getattr(data, name), rtol=1e-12, atol=1e-9)
 
 
 def test_left_handed_axes_are_told() -> None:
