@@ -104,8 +104,7 @@ class StrengthFactor(Model):
     def __call__(self, triads: Array, strength: Array, *drift: Array) -> Residuals:
         """Residual ((|v| - s) / |K' v / |v|| - excess) / sigma, (n, 1), v = K raw + b - drift."""
         triads = drifted(triads, self.drivers, drift)
-        length, direction, by_triad = _polar(self.raw, triads, self.symmetric)
-        K = (triads @ entries(self.symmetric).T)[:, :9].reshape(-1, 3, 3)
+        K, length, direction = _polar(self.raw, triads, self.symmetric)
         gradient = np.einsum("nij,ni->nj", K, direction)
         slope = np.maximum(np.linalg.norm(gradient, axis=1), _LEAST)
         distance = (length - strength[:, 0]) / slope
@@ -116,12 +115,11 @@ class StrengthFactor(Model):
             unit = gradient / slope[:, None]
             ahead = np.einsum("nij,nj->ni", K, unit)
             across = (ahead - (ahead * direction).sum(axis=1)[:, None] * direction) / length[:, None]
-            by_K = np.einsum("ni,nj->nij", direction, unit).reshape(-1, 9)
-            of_slope = np.concatenate([by_K, np.zeros((len(by_K), 3))], axis=1) @ entries(self.symmetric)
-            of_slope += np.einsum("ni,nid->nd", across, by_triad)
-            of_length = np.einsum("ni,nid->nd", direction, by_triad)
+            of_length = _by_triad(direction - distance[:, None] * across, self.raw, self.symmetric)
+            by_K = np.einsum("ni,nj->nij", distance[:, None] * direction, unit).reshape(-1, 9)
+            of_slope = (by_K @ entries(self.symmetric)[:9])[:, None]
             scale = (weight / slope)[:, None]
-            by_numbers = ((of_length - distance[:, None] * of_slope) * scale)[:, None]
+            by_numbers = (of_length - of_slope) * scale[..., None]
             return by_numbers, -scale[..., None], *by_slope(by_numbers, self.drivers)
 
         return ((distance - self.excess) * weight)[:, None], jacobians
@@ -162,18 +160,18 @@ class DipFactor(Model):
     def __call__(self, accel: Array, mag: Array, dip: Array, *drift: Array) -> Residuals:
         """Residual (u . f + sin dip) / sigma, (n, 1)."""
         accel = drifted(accel, self.drivers, drift)
-        up_length, up, by_accel = _polar(self.accel, accel, self.symmetric[0])
-        field_length, field, by_mag = _polar(self.mag, mag, self.symmetric[1])
+        _, up_length, up = _polar(self.accel, accel, self.symmetric[0])
+        _, field_length, field = _polar(self.mag, mag, self.symmetric[1])
         cosine = (up * field).sum(axis=1)
         weight = 1.0 / self.sigma[:, None]
 
         def jacobians() -> tuple[Array, ...]:
             across_up = (field - cosine[:, None] * up) / up_length[:, None] * weight
             across_field = (up - cosine[:, None] * field) / field_length[:, None] * weight
-            by_up = np.einsum("ni,nid->nd", across_up, by_accel)[:, None]
+            by_up = _by_triad(across_up, self.accel, self.symmetric[0])
             return (
                 by_up,
-                np.einsum("ni,nid->nd", across_field, by_mag)[:, None],
+                _by_triad(across_field, self.mag, self.symmetric[1]),
                 (np.cos(dip) * weight)[..., None],
                 *by_slope(by_up, self.drivers),
             )
@@ -201,12 +199,14 @@ def by_slope(by_triad: Array, drivers: Array | None) -> tuple[Array, ...]:
 
 
 def _polar(raw: Array, triads: Array, symmetric: bool) -> tuple[Array, Array, Array]:
-    """Length (n,) and direction (n, 3) of K raw + b, and the Jacobian (n, 3, d) of K raw + b by the variable."""
-    spread = entries(symmetric)
-    vectors = nominal_of(raw, triads @ spread.T)
+    """K (n, 3, 3), length (n,) and direction (n, 3) of K raw + b."""
+    numbers = triads @ entries(symmetric).T
+    vectors = nominal_of(raw, numbers)
     length = np.maximum(np.linalg.norm(vectors, axis=1), _LEAST)
-    by_all = np.zeros((len(raw), 3, 12))
-    for i in range(3):
-        by_all[:, i, 3 * i : 3 * i + 3] = raw
-        by_all[:, i, 9 + i] = 1.0
-    return length, vectors / length[:, None], by_all @ spread
+    return numbers[:, :9].reshape(-1, 3, 3), length, vectors / length[:, None]
+
+
+def _by_triad(along: Array, raw: Array, symmetric: bool) -> Array:
+    """Jacobian (n, 1, d) of the component of K raw + b along vectors (n, 3) by the variable."""
+    by_rows = np.concatenate([np.einsum("ni,nj->nij", along, raw).reshape(-1, 9), along], axis=1)
+    return (by_rows @ entries(symmetric))[:, None]

@@ -217,7 +217,7 @@ class Session:
         try:
             data = chosen.read(recording, config)
         except InputError as error:
-            missing = lacking(chosen.requirements, recording, config)
+            missing = missing_for(chosen.name, recording, config.model_copy(update={"method": chosen.name}))
             if not missing:
                 raise
             nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))

@@ -34,6 +34,8 @@ Index = NDArray[np.intp]
 
 # Chains of at most so many states are eliminated in time order.
 SEQUENTIAL_STATES = 96
+# Rows of a block of a tall matrix, of which a cache holds some thousands of columns' worth.
+_ROWS = 256
 # A pivot below this share of its column's norm counts as zero: the state is not determined.
 RANK_TOLERANCE = 1e-13
 
@@ -477,7 +479,16 @@ def _reduced(piles: list[Array], columns: int) -> Array:
 
 
 def _triangle(rows: Array) -> Array:
-    """R (..., r, columns) of rows (..., m, columns), without the copies that numpy's mode "r" makes."""
+    """R (..., r, columns) of rows (..., m, columns), without the copies that numpy's mode "r" makes.
+
+    Many rows go by blocks that fit the cache, then what these leave (Demmel et al., "Communication-optimal parallel and
+    sequential QR and LU factorizations", SIAM J. Sci. Comput. 2012).
+    """
+    columns, size = rows.shape[-1], max(_ROWS, 4 * rows.shape[-1])
+    if rows.ndim == 2 and len(rows) > 2 * size:
+        whole = len(rows) // size * size
+        blocks = _triangle(rows[:whole].reshape(-1, size, columns))
+        return _triangle(np.concatenate([blocks.reshape(-1, columns), rows[whole:]]))
     R: Array = np.swapaxes(np.linalg.qr(rows, mode="raw")[0], -1, -2)[..., : min(rows.shape[-2:]), :]
     return R * _upper(R.shape[-2], R.shape[-1])
 

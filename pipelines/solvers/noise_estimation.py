@@ -259,13 +259,18 @@ def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: f
 
 
 def _level(now: float, square: float, redundancy: float, known: float) -> float:
-    """The root u of square exp(2 (now - u)) - redundancy - u / known^2, by Newton's method."""
-    u, step = now, np.inf
+    """Logarithm of the root of the level's posterior mean square.
+
+    The mode is the root u of square exp(2 (now - u)) - redundancy - u / known^2, by Newton's method; its variance v
+    the mean square is exp(2 (u + v)): sigmas contain what few residuals leave unknown of their level.
+    """
+    u, step, curvature = now, np.inf, np.inf
     while abs(step) > 1e-6:
         expected = square * np.exp(2.0 * (now - u))
-        step = (expected - redundancy - u / known**2) / (2.0 * expected + known**-2)
+        curvature = 2.0 * expected + known**-2
+        step = (expected - redundancy - u / known**2) / curvature
         u += float(np.clip(step, -1.0, 1.0))
-    return u
+    return u + 1.0 / curvature
 
 
 def _rows(noise: Noise, rows: int) -> list[int]:

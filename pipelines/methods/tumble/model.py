@@ -33,8 +33,8 @@ from alidade.pipelines.settings import Config
 _PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
 # Standard gravity, and what it is off by where the latitude is unknown, m/s^2.
 _GRAVITY, _GRAVITY_SIGMA = 9.80665, 0.02
-# Fewer rests than this and every sample of an accelerometer counts as one at rest.
-_FEWEST_RESTS = 9
+# Means over this time, s, show what a mean over a rest scatters by, slow tremor of a hand included.
+_BLOCK = 0.25
 # No sensor resolves a smaller share of what it measures; numbers without noise leave rounding.
 _RESOLUTION = 1e-9
 # Samples this many sigmas from the ellipsoid are left out of the first guess.
@@ -74,6 +74,7 @@ class Sensor:
         time, raw: (n,) s and (n, 3), as recorded, of the samples or means that are used.
         sigma, excess: (n,) of these over the radius; see StrengthFactor.
         sample_scatter: sigma of a sample over the radius, as stated or else from the residuals of the first guess.
+        level: of that over the one stated.
         symmetric: whether K is so by definition: the sensor defines the body's axes.
         is_si: whether it is recorded in SI; else in counts.
         radius: of the ellipsoid, in the unit recorded.
@@ -92,6 +93,7 @@ class Sensor:
     sigma: Array
     excess: Array
     sample_scatter: float
+    level: float
     symmetric: bool
     is_si: bool
     radius: float
@@ -209,7 +211,7 @@ def prepare(data: TumbleData, config: Config) -> Model:
     premises += more
     if sensors[0].name == "accel" and not sensors[0].rested:
         done = _AT_REST if gyro is None else _SWUNG
-        premises.append(f"The accelerometer has fewer than {_FEWEST_RESTS} rests: {done}.")
+        premises.append(f"The accelerometer has fewer than {FEWEST} rests: {done}.")
     dip = moments = None
     modelled = None if field is None else _modelled(config, field)
     if gyro is not None:
@@ -349,7 +351,7 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
         found = quiet_intervals(t, streams, FEWEST)
     except InputError:
         return None
-    return found if len(found) >= _FEWEST_RESTS else None
+    return found if len(found) >= FEWEST else None
 
 
 def _at(time: Array, stamps: Array, values: Array) -> Array:
@@ -362,15 +364,9 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sen
     assert data.accel_t is not None
     known = data.latitude is not None
     strength = float(gravity(data.latitude, data.height)) if data.latitude is not None else _GRAVITY
-    time, raw, number = _means(data.accel_t, data.accel, rests)
-    found = _sensor(
-        "accel",
-        (data.accel_t, data.accel_density),
-        (time, raw, number),
-        config,
-        (strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"),
-    )
-    causes = {ACCEL_SQUARE: found.nominal(raw) ** 2}
+    of = strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"
+    found = _sensor("accel", (data.accel_t, data.accel, data.accel_density), rests, config, of)
+    causes = {ACCEL_SQUARE: found.nominal(found.raw) ** 2}
     if data.temperature is not None:
         temperature = data.temperature.above(data.temperature.first, data.accel_t)
         causes[ACCEL_SLOPE] = np.repeat(_means(data.accel_t, temperature[:, None], rests)[1], 3, axis=1)
@@ -388,15 +384,14 @@ def _magnetometer(data: TumbleData, config: Config, field: Array | None, alone: 
     else:
         across = sheet(config, FIELD)
         known = float(np.linalg.norm(field)), STRENGTH_SIGMA if across <= FIELD.prior else across, "T"
-    samples = data.mag_t, data.mag, np.ones(len(data.mag))
-    found = _sensor("mag", (data.mag_t, data.mag_density), samples, config, known)
+    found = _sensor("mag", (data.mag_t, data.mag, data.mag_density), None, config, known)
     return found if alone else replace(found, symmetric=False, start=found.start @ entries(True).T)
 
 
 def _sensor(
     name: str,
-    stream: tuple[Array, float | None],
-    used: tuple[Array, Array, Array],
+    stream: tuple[Array, Array, float | None],
+    rests: Array | None,
     config: Config,
     known: tuple[float, float, str],
 ) -> Sensor:
@@ -404,12 +399,12 @@ def _sensor(
 
     Args:
         name: accel or mag.
-        stream: stamps of all samples, and the density that their messages state.
-        used: times, raw numbers, and of how many samples each is the mean.
+        stream: stamps of all samples, raw numbers, and the density that their messages state.
+        rests: over which means are used; None: all samples are.
         config: in force.
         known: strength, its sigma, and its unit.
     """
-    time, raw, number = used
+    time, raw, number = _means(*stream[:2], rests)
     if len(raw) < FEWEST:
         raise InputError(f"{name}: {len(raw)} readings, at least {FEWEST} in different attitudes are needed")
     is_si = _is_si(name, raw)
@@ -419,13 +414,15 @@ def _sensor(
     numbers, root_number = start @ entries(True).T, np.sqrt(number)
     apart = StrengthFactor(time, raw / radius, np.ones(len(raw)), np.zeros(len(raw)), symmetric=True)
     distances = apart(np.tile(start, (len(raw), 1)), np.ones((len(raw), 1)))[0][:, 0]
-    seen = radius * max(robust_sigma(distances * root_number), _RESOLUTION)
     interval = float(np.median(np.diff(stream[0])))
-    noise = _noise(name, config, stream[1], is_si, seen * interval**0.5)
+    at_rest = 0.0 if rests is None else _scatter_at_rest(*stream[:2], rests, centre)
+    seen = max(radius * robust_sigma(distances * root_number), _RESOLUTION * radius, at_rest * interval**-0.5)
+    noise = _noise(name, config, stream[2], is_si, seen * interval**0.5, at_rest)
     if noise.stated > 0.0:
         noise = replace(noise, least=_RESOLUTION * radius * interval**0.5 / noise.stated)
     stated_sigma = noise.stated * interval**-0.5
-    sample_scatter = (stated_sigma if noise.source != "default" or noise.known == 0.0 else seen) / radius
+    level = seen / stated_sigma if noise.source == "default" and noise.estimated else 1.0
+    sample_scatter = level * stated_sigma / radius
     return Sensor(
         name=name,
         time=time,
@@ -433,6 +430,7 @@ def _sensor(
         sigma=stated_sigma / radius / root_number,
         excess=excess(raw / radius, sample_scatter / root_number, numbers),
         sample_scatter=sample_scatter,
+        level=level,
         symmetric=True,
         is_si=is_si,
         radius=radius,
@@ -446,12 +444,31 @@ def _sensor(
     )
 
 
-def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float) -> Noise:
-    """What is stated, in the unit recorded; of counts that nobody states, what the first guess leaves."""
+def _scatter_at_rest(t: Array, raw: Array, rests: Array, centre: Array) -> float:
+    """Density, per sqrt(Hz), of what lengths scatter by within rests; 0 where that is not seen.
+
+    Few rests determine the ellipsoid with hardly a residual, whose size says nothing of their noise.
+    """
+    interval = float(np.median(np.diff(t)))
+    size = max(1, round(_BLOCK / interval))
+    variances = []
+    for first, last in np.searchsorted(t, rests):
+        values = raw[first : last - (last - first) % size] - centre
+        if len(values) > size:
+            along = values @ (values.mean(axis=0) / np.linalg.norm(values.mean(axis=0)))
+            means = along.reshape(-1, size).mean(axis=1)
+            variances.append([along.var(ddof=1), size * means.var(ddof=1)])
+    # Samples say best how large white noise is, means how much more a slow one leaves.
+    return float(np.sqrt(np.mean(variances, axis=0).max() * interval)) if variances else 0.0
+
+
+def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float, at_rest: float) -> Noise:
+    """What is stated, in the unit recorded; by nobody, what rests show; of counts without any, what was seen."""
     family = {"accel": "accelerometer", "mag": "magnetometer"}[name]
     if is_si:
-        return stated(f"{name}_density", config, message, (family,))
-    figure = seen if message is None else message
+        noise = stated(f"{name}_density", config, message, (family,))
+        return replace(noise, stated=at_rest) if at_rest and noise.source == "default" and noise.estimated else noise
+    figure = (at_rest or seen) if message is None else message
     return Noise(f"{name}_counts", figure, "default" if message is None else "message", ROUGHLY, (family,))
 
 

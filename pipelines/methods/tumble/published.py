@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# Nine coefficients.
-FEWEST = 12
+# Nine coefficients and a residual.
+FEWEST = 10
 _STEP = 1e-5
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
@@ -128,6 +129,13 @@ def test_a_gyro_that_gravity_shifts_is_at_rest_in_all_poses(session: CubeData) -
 def test_bad_sensors_are_named(tmp_path: Path, session: CubeData, change: Any, message: str) -> None:
     with pytest.raises(InputError, match=message):
         _read_back(tmp_path / "s.mcap", replace(session, **change(session)))
+
+
+def test_counts_are_named_where_the_method_is_asked_for_by_option(tmp_path: Path, session: CubeData) -> None:
+    counts = replace(session, accel=1671.0 * session.accel, camera=None, sightings=None)
+    method("cube").write_data(tmp_path / "s.mcap", counts, {"accel_k11": 1.0}, cube_config(SCENARIO))
+    with pytest.raises(InputError, match="is it in raw counts"):
+        Session.read(open_recording(tmp_path / "s.mcap"), "cube", Config())
 
 
 def test_camera_info_zero(tmp_path: Path, session: CubeData) -> None:
