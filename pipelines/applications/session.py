@@ -35,7 +35,7 @@ from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segm
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
-from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses
+from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
 from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
@@ -422,12 +422,17 @@ class Session:
         """The findings on an estimate; hypotheses are tested where it is suspect."""
         contradicted = self._contradictions(estimate, quantities)
         findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted)
-        if not is_suspect(estimate, findings) or deadline.passed(_HYPOTHESES):
+        if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
+            return findings
+        hypotheses = misstatements(self.method.graph, self.faults, self.data, self.config)
+        if not hypotheses and not is_suspect(estimate, findings):
             return findings
         severe = any(each.severity > Severity.NOTE for each in contradicted)
         freed = self._freed[0] if severe and self._freed is not None else None
         with progress.doing("testing hypotheses"):
-            hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate, freed)
+            hypotheses = hypotheses or find_hypotheses(
+                self.method.graph, self.faults, self.data, self.config, estimate, freed
+            )
         deadline.passed(_HYPOTHESES)
         # A fault that explains more than freeing what is fixed is what these contradictions come from.
         return diagnose(estimate, quantities, problem.advice, change, hypotheses, () if hypotheses else contradicted)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -51,12 +51,13 @@ class DataFault:
     Attributes:
         label: in words.
         corrected: data and config -> both without it; None where it cannot be.
-        fallback: whether its correction would fit much else, so that it is tested only where nothing else fits.
+        role: `fallback`: its correction would fit much else, so that it is tested only where nothing else fits;
+            `stated`: it undoes what the config states, and counts wherever that leads nearer to the priors.
     """
 
     label: str
     corrected: Callable[[Any, Config], tuple[Any, Config] | None]
-    fallback: bool = False
+    role: Literal["usual", "fallback", "stated"] = "usual"
 
 
 @dataclass(frozen=True)

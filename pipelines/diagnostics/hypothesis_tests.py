@@ -83,13 +83,26 @@ def find_hypotheses(
     if any(after.fits for after, _ in found):
         found = [each for each in found if each[0].fits]
     if not found:
-        fallback = _explaining(build, data_faults(model, data, config, fallback=True), before, concurrent)
+        fallback = _explaining(build, data_faults(model, data, config, "fallback"), before, concurrent)
         found = [each for each in fallback if each[0].fits]
     if not found and known:
         found = _noise(build, data, config)
     if without is not None:
         found = [each for each in found if each[0].cost < without.cost]
     return _findings(before, found[:_MAX_REPORTED])
+
+
+def misstatements(build: Build, model: FaultModel, data: Any, config: Config) -> tuple[Finding, ...]:
+    """What the config states, and without which the recording fits as well, by parameters much nearer to their priors.
+
+    Arguments as of `find_hypotheses`. Faults without such a statement cost nothing.
+    """
+    if not (cases := list(data_faults(model, data, config, "stated"))):
+        return ()
+    before, *found = _solved(build, [TrialCase("", data, config), *cases], max_concurrent(model.times(data)))
+    limit = before[0].cost_with_priors - _SIGNIFICANT**2
+    nearer = [each for each in found if each[0].cost_with_priors < limit]
+    return _findings(before[0], sorted(nearer, key=lambda each: each[0].cost_with_priors))
 
 
 def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]:
@@ -118,13 +131,17 @@ def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]
 
 def _explaining(build: Build, cases: Iterable[TrialCase], before: TrialFit, concurrent: int) -> list[_Tested]:
     """The cases that explain the misfit, the best fit first."""
-    cases, found = list(cases), []
-    works = [partial(solve_trial, build, case.data, case.config, case.label) for case in cases]
-    for case, after in zip(cases, parallel.done(works, _WHAT, concurrent), strict=True):
-        if after is not None and _explains(before, after):
-            found.append((after, case.label))
+    found = [each for each in _solved(build, cases, concurrent) if _explains(before, each[0])]
     # Corrections that fit alike are weighed by their priors: a mount that is likely before one that is not.
     return sorted(found, key=lambda each: each[0].cost_with_priors / max(each[0].dof, 1.0))
+
+
+def _solved(build: Build, cases: Iterable[TrialCase], concurrent: int) -> list[_Tested]:
+    """The cases that have a solution."""
+    cases = list(cases)
+    works = [partial(solve_trial, build, case.data, case.config, case.label) for case in cases]
+    fits = parallel.done(works, _WHAT, concurrent)
+    return [(after, case.label) for case, after in zip(cases, fits, strict=True) if after is not None]
 
 
 def _promising(build: Build, model: FaultModel, data: Any, config: Config, before: TrialFit) -> list[TrialCase]:

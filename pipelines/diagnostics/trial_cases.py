@@ -38,10 +38,10 @@ def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> I
     yield from scale_factors(build, model, data, config)
 
 
-def data_faults(model: FaultModel, data: Any, config: Config, fallback: bool = False) -> Iterator[TrialCase]:
-    """The method's own faults, those that are a fallback or the others."""
+def data_faults(model: FaultModel, data: Any, config: Config, role: str = "usual") -> Iterator[TrialCase]:
+    """The method's own faults of a role."""
     for fault in model.faults:
-        if fault.fallback is fallback and (corrected := fault.corrected(data, config)) is not None:
+        if fault.role == role and (corrected := fault.corrected(data, config)) is not None:
             yield TrialCase(fault.label, *corrected)
 
 

@@ -20,7 +20,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics import hypothesis_tests, trial_fit
 from alidade.pipelines.diagnostics.cross_validation import split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose
-from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses
+from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
 from alidade.pipelines.diagnostics.trial_cases import TrialCase, trial_cases
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals, solve_trial
 from alidade.pipelines.estimation.finding import Finding, Severity
@@ -33,6 +33,7 @@ from alidade.pipelines.methods.head.guidance import FAULTS
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.support.builders import IDEAL
@@ -159,7 +160,7 @@ def test_sign_of_the_platform_gyro(head: Case) -> None:
 def test_faults_of_the_head_are_mended(head: Case) -> None:
     """What each trial changes, changed back by the same."""
     find, data, config = head
-    inverted, reordered, reordered_back, swapped, moving = find.faults.faults
+    inverted, reordered, reordered_back, *_, swapped, moving = find.faults.faults
     once = inverted.corrected(data, config)
     assert once is not None
     np.testing.assert_allclose(once[0].vision_wxyz, so3.inverse(data.vision_wxyz))
@@ -181,7 +182,20 @@ def test_faults_of_the_head_are_mended(head: Case) -> None:
     assert swapped.corrected(alone, config) is None
     assert moving.corrected(data, config) is None
     assert moving.corrected(alone, config) is not None
-    assert moving.fallback
+    assert moving.role == "fallback"
+
+
+def test_inversion_that_the_config_states_of_misordered_quaternions_is_named() -> None:
+    """As inverses they fit with another mount; where the inversion is right there is nothing to name."""
+    find, data, config = head_of(5.0, moving=False)
+    config = config.model_copy(update={"priors": {}})
+    stated = config.model_copy(update={"topics": {"vision_attitude": TopicSource(topic="/tracker", invert=True)}})
+    misordered = replace(data, vision_wxyz=so3.inverse(data.vision_wxyz[:, [1, 2, 3, 0]]), vision_cov=None)
+    (found,) = misstatements(find.graph, find.faults, misordered, stated)
+    assert found.severity == Severity.INCONSISTENT
+    assert "not inverted as the config states: its quaternions are x, y, z, w" in found.evidence["label"]
+    assert not misstatements(find.graph, find.faults, data, stated)
+    assert not misstatements(find.graph, find.faults, misordered, config)
 
 
 @pytest.mark.slow

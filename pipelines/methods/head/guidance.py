@@ -12,7 +12,7 @@ from alidade.factors import so3
 from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
 from alidade.pipelines.diagnostics.fault_models import AXES, DataFault, FaultModel
 from alidade.pipelines.methods import Guidance, Scenario
-from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.head.recording import VISION_ATTITUDE, HeadData
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.scenario import sways
 
@@ -57,6 +57,12 @@ def _inverted(data: HeadData, config: Config) -> tuple[HeadData, Config]:
 def _reordered(data: HeadData, config: Config, order: tuple[int, ...]) -> tuple[HeadData, Config]:
     """The components of vision's quaternions in another order; what was said of their errors is none of these."""
     return replace(data, vision_wxyz=data.vision_wxyz[:, order], vision_cov=None), config
+
+
+def _misordered(data: HeadData, config: Config, order: tuple[int, ...]) -> tuple[HeadData, Config] | None:
+    """What the config has inverted, as recorded but for the order of its components: the same up to the mounts."""
+    source = config.topics.get(VISION_ATTITUDE.key)
+    return _reordered(*_inverted(data, config), order) if source is not None and source.invert else None
 
 
 def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
@@ -105,8 +111,20 @@ FAULTS = FaultModel(
             "the quaternions of vision are given as w, x, y, z where x, y, z, w is meant",
             partial(_reordered, order=(1, 2, 3, 0)),
         ),
+        *(
+            DataFault(
+                f"vision is not inverted as the config states: its quaternions are {one} where {other} is meant, which "
+                "fits as well and has the mount nearer to its prior",
+                partial(_misordered, order=order),
+                role="stated",
+            )
+            for one, other, order in (
+                ("x, y, z, w", "w, x, y, z", (3, 0, 1, 2)),
+                ("w, x, y, z", "x, y, z, w", (1, 2, 3, 0)),
+            )
+        ),
         DataFault("the topics of helmet and platform IMU are swapped", _swapped),
-        DataFault("the platform moves, and no topic measures it: record /platform/imu", _moving, fallback=True),
+        DataFault("the platform moves, and no topic measures it: record /platform/imu", _moving, role="fallback"),
     ),
 )
 
