@@ -33,7 +33,7 @@ from alidade.pipelines.solvers.weak_directions import WeakDirections
 
 # Fewer measurements show no autocorrelation.
 MIN_MEASUREMENTS = 100
-# Sigmas of zero below which an autocorrelation has died out, and above which the first one has to be.
+# Sigmas of zero below which a mean of autocorrelations has died out, and above which one shows that there are any.
 DIED_OUT, CORRELATED = 2.0, 4.0
 # Longest lag, share of the recording.
 MAX_LAG = 0.25
@@ -190,18 +190,30 @@ def most_influential(
 
 
 def autocorrelation(whitened: Array) -> Array:
-    """Autocorrelation (K,) of residuals (n, r) at the lags 1 ... K, until it has died out; empty if they are white."""
+    """Autocorrelation (K,) of residuals (n, r) at the lags 1 ... K, until it has died out; empty if they are white.
+
+    Its means over the lags 1, 2 to 3, 4 to 7 and so on: what is faint and long shows in none by itself, and widens most.
+    """
     n, r = whitened.shape
     if n < MIN_MEASUREMENTS:
         return np.empty(0)
     sums = _lagged(whitened[..., None], int(MAX_LAG * n))[:, 0]
     if not sums[0] > 0.0:
         return np.empty(0)
-    correlation, sigma = sums[1:] / sums[0], float((n * r) ** -0.5)
-    if not len(correlation) or correlation[0] < CORRELATED * sigma:
-        return np.empty(0)
-    small = np.flatnonzero(correlation < DIED_OUT * sigma)
-    return np.asarray(correlation[: small[0] if len(small) else None])
+    correlation = sums[1:] / sums[0]
+    begins = 2 ** np.arange(len(correlation).bit_length()) - 1
+    count = np.diff(np.append(begins, len(correlation)))
+    means = np.add.reduceat(correlation, begins) / count
+    length, end = 1.0, 0
+    for j, mean in enumerate(means.tolist()):
+        # Estimates of neighbouring lags are correlated as the residuals are (Bartlett, J. Roy. Stat. Soc. Suppl. 1946).
+        size = mean * float(n * r * count[j]) ** 0.5 / length
+        if size > (DIED_OUT if end else CORRELATED):
+            end = j + 1
+            length = max(1.0, 1.0 + 2.0 * float(means[:end] @ count[:end]))
+        elif end:
+            break
+    return np.repeat(means[:end], count[:end])
 
 
 def autocorrelations(engine: Engine, values: Values) -> dict[str, Array]:

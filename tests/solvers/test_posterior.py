@@ -8,6 +8,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from alidade.pipelines.estimation.problem import Array, Factor, Problem
 from alidade.pipelines.solvers.chain import ChainFactorization
@@ -288,6 +289,9 @@ def test_autocorrelation_is_that_of_the_noise() -> None:
         walk[i] = 0.9 * walk[i - 1] + rng.standard_normal()
     assert len(autocorrelation(white)) == 0
     assert 10.0 < 1.0 + 2.0 * float(autocorrelation(walk).sum()) < 30.0  # 19 for the process
+    # A fifth of white noise that lasts for a hundred measurements: 4.8 of them count as one, and no lag shows it alone.
+    faint = 0.2 * lfilter([0.2], [1.0, -0.98], rng.normal(size=20_000))[:, None] + rng.normal(size=(20_000, 1))
+    assert 3.0 < 1.0 + 2.0 * float(autocorrelation(faint).sum()) < 7.0
 
 
 def test_correlated_residuals_of_one_family_leave_what_another_determines() -> None:

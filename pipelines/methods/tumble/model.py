@@ -33,6 +33,9 @@ from alidade.pipelines.settings import Config
 _PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
 # Standard gravity, and what it is off by where the latitude is unknown, m/s^2.
 _GRAVITY, _GRAVITY_SIGMA = 9.80665, 0.02
+# Fewer rests do where the device is at rest for more than this share of the time: what lies between is handling, at
+# several m/s^2, and no slow turn. Turns by hand without rests pause for up to a quarter of it.
+_MOSTLY = 1.0 / 3.0
 # Means over this time, s, show what a mean over a rest scatters by, slow tremor of a hand included.
 _BLOCK = 0.25
 # No sensor resolves a smaller share of what it measures; numbers without noise leave rounding.
@@ -333,7 +336,7 @@ def _turned(sensor: Sensor, rotation: Array) -> Sensor:
 
 
 def _rests(data: TumbleData, config: Config) -> Array | None:
-    """Beginnings and ends (P, 2), s, of when all sensors were quiet; None where that is too few."""
+    """Beginnings and ends (P, 2), s, of when all sensors were quiet; None where what lies between tells more."""
     assert data.accel is not None
     assert data.accel_t is not None
     t = data.accel_t
@@ -351,7 +354,8 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
         found = quiet_intervals(t, streams, FEWEST)
     except InputError:
         return None
-    return found if len(found) >= FEWEST else None
+    alone = data.gyro is None and np.diff(found).sum() > _MOSTLY * (t[-1] - t[0])
+    return found if len(found) >= FEWEST or alone else None
 
 
 def _at(time: Array, stamps: Array, values: Array) -> Array:
@@ -405,7 +409,7 @@ def _sensor(
         known: strength, its sigma, and its unit.
     """
     time, raw, number = _means(*stream[:2], rests)
-    if len(raw) < FEWEST:
+    if rests is None and len(raw) < FEWEST:
         raise InputError(f"{name}: {len(raw)} readings, at least {FEWEST} in different attitudes are needed")
     is_si = _is_si(name, raw)
     S, centre = _first_guess(raw)
@@ -439,7 +443,7 @@ def _sensor(
         unit=known[2],
         start=start,
         turned=np.eye(3),
-        rested=bool(number.max() > 1.0),
+        rested=rests is not None,
         noise=noise,
     )
 

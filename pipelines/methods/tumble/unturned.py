@@ -62,7 +62,8 @@ def check_turned(sensor: Sensor, config: Config) -> None:
     """Raise InputError if readings, or the means of `unturned`, show too few attitudes for any of the numbers."""
     scatter = float(np.sqrt(sensor.raw.var(axis=0).sum()))
     size = float(np.median(np.linalg.norm(sensor.raw, axis=1)))
-    if len(sensor.raw) < FEWEST or (sensor.is_si and scatter < _SAME * size):
+    few = not sensor.rested and len(sensor.raw) < FEWEST
+    if few or (sensor.is_si and scatter < _SAME * size):
         raise InputError(
             f"topic {config.topic(_TOPICS[sensor.name])}: the device did not turn, or hardly, beyond the noise of its "
             f"readings; turn it slowly through all attitudes, {FEWEST} at the very least, and record again"

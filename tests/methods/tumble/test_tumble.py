@@ -753,6 +753,17 @@ def test_ten_real_rests_by_hand_in_counts(shared_data: Path) -> None:
     assert sigmas["accel_k12"] > 0.02 * values["accel_k11"]
 
 
+def test_fewer_real_rests_by_hand_determine_little(shared_data: Path) -> None:
+    """Half the recording has seven rests: what lies between is handling, in which |a| is not g, and no data."""
+    session = Session.read(open_recording(shared_data / "suarez_mpu6050" / "cal.mcap"), "tumble", None)
+    late = session.data.accel_t > session.data.accel_t.mean()
+    half = replace(session.data, accel_t=session.data.accel_t[late], accel=session.data.accel[late])
+    whole, part = (Session.of(TUMBLE, Simulated(data, {}, "")).calibrate() for data in (session.data, half))
+    assert part.status == "unobservable"
+    for name, each in part.parameters.items():
+        assert abs(each.value - whole.parameters[name].value) <= 3.0 * each.sigma
+
+
 @pytest.mark.parametrize("beside", ["", "accel", pytest.param("accel gyro", marks=pytest.mark.slow)])
 def test_a_cube_recording_without_all_the_rest(beside: str, tmp_path: Path) -> None:
     """K of the cube's truth up to the rotation that nothing tells here: K'K and the offset of the raw numbers."""
