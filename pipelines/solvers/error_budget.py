@@ -192,7 +192,7 @@ def most_influential(
 def autocorrelation(whitened: Array) -> Array:
     """Autocorrelation (K,) of residuals (n, r) at the lags 1 ... K, until it has died out; empty if they are white.
 
-    Its means over the lags 1, 2 to 3, 4 to 7 and so on: what is faint and long shows in none by itself, and widens most.
+    Its means over the lags 1, 2 to 3, 4 to 7 and so on: what is faint and long shows in no lag alone, and widens most.
     """
     n, r = whitened.shape
     if n < MIN_MEASUREMENTS:
