@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from alidade.pipelines.applications.api import (
         Config,
+        apply,
         calibrate,
         certificate,
         compare,
@@ -51,6 +52,7 @@ __all__ = [
     "Session",
     "Simulated",
     "__version__",
+    "apply",
     "calibrate",
     "certificate",
     "compare",

@@ -361,6 +361,11 @@ class Config(Section):
         source = self.topics.get(topic.key)
         return topic.name if source is None else source.name
 
+    def base(self, topic: Topic) -> str:
+        """Name of the recorded topic whose stamps a topic has."""
+        source = self.topics.get(topic.key)
+        return topic.name if source is None else source.parts[0]
+
     def section(self, kind: type[_Own]) -> _Own:
         """What it says for one method, by the model of that section; as by default where it says nothing."""
         found = getattr(self, kind.key, None)

@@ -38,6 +38,7 @@ from alidade.pipelines.settings import Config as _BaseConfig
 from alidade.pipelines.simulation.simulated import Simulated
 
 if TYPE_CHECKING:
+    from alidade.pipelines.applications.apply import Applied
     from alidade.pipelines.applications.comparison import Comparison
     from alidade.pipelines.applications.fleet.write import FleetResult
     from alidade.pipelines.applications.follow.guidance import View
@@ -367,13 +368,38 @@ def export(calibration: str | Path | Calibration | SavedCalibration, form: str) 
     Raises:
         InputError: the calibration cannot be used, or has no such format.
     """
-    from alidade.pipelines.reports.calibration import saved
     from alidade.pipelines.reports.export_formats import exported
+
+    return exported(load(calibration) if isinstance(calibration, str | Path) else _saved(calibration), form)
+
+
+def _saved(calibration: Calibration | SavedCalibration) -> SavedCalibration:
+    from alidade.pipelines.reports.calibration import saved
     from alidade.pipelines.reports.result import Calibration as Made
 
-    if isinstance(calibration, str | Path):
-        calibration = load(calibration)
-    return exported(saved(calibration) if isinstance(calibration, Made) else calibration, form)
+    return saved(calibration) if isinstance(calibration, Made) else calibration
+
+
+def apply(
+    recording: str | Path | Sequence[str | Path],
+    calibration: str | Path | Calibration | SavedCalibration,
+    out: str | Path,
+    *,
+    config: Settings = None,
+    suffix: str = "_calibrated",
+    strict: bool = False,
+    auto_columns: bool = False,
+) -> Applied:
+    """Copy a recording to an MCAP file with corrected topics beside the recorded ones: `.topics`, `.notes`.
+
+    Raises:
+        InputError: recording, config or calibration cannot be used, or the calibration corrects nothing in the
+            recording.
+    """
+    from alidade.pipelines.applications.apply import apply_calibration
+
+    given = Path(calibration) if isinstance(calibration, str | Path) else _saved(calibration)
+    return apply_calibration(_files(recording), given, Path(out), _override(config), suffix, strict, auto_columns)
 
 
 def certificate(

@@ -687,6 +687,38 @@ def export(
 
 
 @app.command()
+def apply(
+    recording: RecordingPath,
+    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
+    out: Annotated[Path, typer.Option(help="MCAP file to write.")],
+    suffix: Annotated[
+        str, typer.Option(help="Added to a topic's name for that of the corrected topic.")
+    ] = "_calibrated",
+    config: ConfigFile = None,
+    strict: _Strict = False,
+    auto_columns: _AutoColumns = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Copy a recording with corrected topics added.
+
+    Gyro, accelerometer, magnetometer: /imu/data becomes /imu/data_calibrated beside it.
+    """
+    from alidade.pipelines import progress
+    from alidade.pipelines.applications.apply import apply_calibration
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import applied_json
+
+    with progress.shown(quiet or as_json):
+        applied = apply_calibration(recording, calibration, out, config, suffix, strict, auto_columns)
+    if as_json:
+        print(applied_json(applied))
+        return
+    for line in (f"Wrote {out}", *(topic.text for topic in applied.topics), *applied.notes):
+        terminal.say(line)
+
+
+@app.command()
 def certificate(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a calibration, or its result.json.")],
     fields: Annotated[

@@ -226,6 +226,27 @@ class Guidance:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Correction:
+    """Results of formulas that are what an IMU or a magnetometer would have measured.
+
+    Attributes:
+        topic: of the sensors.
+        inputs: gyro, accel or field, as the messages have it -> the name that formulas have for it.
+        results: gyro, accel or field -> name of the formula that corrects it.
+        formulas: more of them, after the method's own.
+        frame: frame of the results where it is not that of the messages.
+        frame_of: topic whose corrected messages have the results' frame, if these are there.
+    """
+
+    topic: Topic
+    inputs: Mapping[str, str]
+    results: Mapping[str, str]
+    formulas: tuple[Formula, ...] = ()
+    frame: str = ""
+    frame_of: Topic | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class Report:
     """Results beside the parameters.
 
@@ -237,6 +258,7 @@ class Report:
         validate: data, config, parameter values -> errors before and after compensation. Raises InputError when there
             are none.
         uses: estimate, config, noise used by name (SI) -> uses of a result, with the error that it leaves.
+        corrections: topics whose sensors the formulas correct.
         cards: of the report's results: title -> groups of numbers, each with its title, the unit (empty: the usual one)
             and the parameters; parameters of no card stand in a last one.
         residual_names: family of measurements -> names of its residuals that are not x, y, z.
@@ -248,6 +270,7 @@ class Report:
     figures: Callable[[Any, Calibration], Sequence[Plot | Table]] = lambda data, calibration: ()  # noqa: ARG005
     validate: Callable[[Any, Config, Mapping[str, float]], Sequence[Validation]] = _not_offered
     uses: Callable[[Truth, Config, Mapping[str, float]], Sequence[Use]] = lambda true, config, noise: ()  # noqa: ARG005
+    corrections: tuple[Correction, ...] = ()
     cards: Mapping[str, tuple[tuple[str, str, tuple[str, ...]], ...]] = field(default_factory=dict)
     residual_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 

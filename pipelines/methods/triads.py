@@ -15,7 +15,9 @@ from alidade.factors import so3
 from alidade.factors.gyro import symmetric
 from alidade.pipelines.estimation.parameters import SENSORS, ParameterSpec
 from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.methods import Correction
 from alidade.pipelines.methods.formula import Formula
+from alidade.pipelines.recording.topics import IMU, MAG
 
 TRIADS = ("accel", "gyro", "mag")
 # Of S of a gyro, in the order that `symmetric` takes.
@@ -27,6 +29,11 @@ _DESCRIPTIONS = {
     "gyro": ("rate along the {body} axes, {unit}", "rad/s"),
     "mag": ("field along the {body} axes, {unit}", "T"),
 }
+# Topics of the sensors, and the results that correct them.
+CORRECTIONS = (
+    Correction(topic=IMU, inputs={"gyro": "gyro", "accel": "accel"}, results={"gyro": "w_b", "accel": "f_b"}),
+    Correction(topic=MAG, inputs={"field": "mag"}, results={"field": "m_b"}, frame_of=IMU),
+)
 # Of K's entries, for the derivatives of its parts.
 _STEP = 1e-6
 

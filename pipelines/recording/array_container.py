@@ -49,6 +49,13 @@ class SeriesEncoder(ABC):
         self.taken = which.stop
         return self._encode(which)
 
+    def block(self, channel: int, count: int) -> MessageBlock:
+        """The next messages as a block."""
+        log_ns, rows = self.log_ns[self.taken : self.taken + count], self.take(count)
+        if self.varies:
+            return MessageBlock.pack(channel, rows, log_ns)
+        return MessageBlock(channel, rows.ravel(), self.size * np.arange(count), np.full(count, self.size), log_ns)
+
     @abstractmethod
     def _encode(self, which: slice) -> Any: ...
 
@@ -143,7 +150,7 @@ class ArrayContainer(Container):
         self._topics = dict(enumerate(topics.values(), start=1))
         for number, (name, topic) in enumerate(topics.items(), start=1):
             kind = encode_series(topic).definition.name
-            self.schemas[number] = Schema(number, kind, "ros2msg", definition_text(kind).encode())
+            self.schemas[number] = ros2_schema(kind)._replace(id=number)
             self.channels[number] = Channel(number, name, "cdr", number)
             self.counts[number] = 1 if isinstance(topic, series.CameraInfo) else len(topic)
 
@@ -153,13 +160,12 @@ class ArrayContainer(Container):
             encoder = encode_series(self._topics[number])
             step = _VARYING_BLOCK if encoder.varies else _UNIFORM_BLOCK
             for start in range(0, self.counts[number], step):
-                log_ns = encoder.log_ns[start : start + step]
-                rows = encoder.take(len(log_ns))
-                if encoder.varies:
-                    yield MessageBlock.pack(number, rows, log_ns)
-                else:
-                    at = encoder.size * np.arange(len(log_ns))
-                    yield MessageBlock(number, rows.ravel(), at, np.full(len(log_ns), encoder.size), log_ns)
+                yield encoder.block(number, min(step, self.counts[number] - start))
+
+
+def ros2_schema(name: str) -> Schema:
+    """Schema of a ROS 2 type, its number 0. Raises MessageError for one that is not known."""
+    return Schema(0, name, "ros2msg", definition_text(name).encode())
 
 
 def _header(definition: Definition, t_ns: int, frame_id: str) -> Any:

@@ -1,7 +1,7 @@
-"""Sessions into MCAP files, from arrays.
+"""MCAP files, from series and from blocks of messages.
 
-The mcap package's own writer takes messages one at a time. Here the CDR bytes of all messages of a topic are one array,
-and whole chunks are put together from them; the records around the chunks are the package's.
+The mcap package's own writer takes messages one at a time. Here those of a block are one array, and whole chunks are
+put together from blocks; the records around the chunks are the package's.
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import zstandard
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
-    Channel,
     Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
     Header,
     McapRecord,
-    Schema,
     Statistics,
 )
 from numpy.typing import NDArray
@@ -36,10 +36,9 @@ from numpy.typing import NDArray
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.array_container import SeriesEncoder, encode_series
-from alidade.pipelines.recording.container import byte_windows
+from alidade.pipelines.recording.array_container import encode_series, ros2_schema
+from alidade.pipelines.recording.container import MessageBlock, Schema, byte_windows
 from alidade.pipelines.recording.mcap_records import AFTER_LENGTH, MAGIC, MESSAGE_HEAD
-from alidade.pipelines.recording.messages import definition_text
 from alidade.pipelines.settings import ATTACHMENT, TRUTH
 
 # Bytes of a chunk before compression.
@@ -67,14 +66,37 @@ def write_session(
     Messages are logged at their stamps and written in that order. The file appears under its name when it is whole, or
     not at all. Raises InputError when it cannot be written.
     """
-    path = Path(path)
+    encoders = {name: encode_series(topic) for name, topic in topics.items()}
+    log_ns = np.concatenate([np.empty(0, np.int64), *(encoder.log_ns for encoder in encoders.values())])
+    owner = np.repeat(np.arange(len(encoders)), [len(encoder.log_ns) for encoder in encoders.values()])
+    order = np.argsort(log_ns, kind="stable")
+    owner = owner[order]
+    widths = np.array([MESSAGE_HEAD.itemsize + encoder.size for encoder in encoders.values()], dtype=np.int64)
+    cuts = np.flatnonzero(np.diff(np.cumsum(widths[owner]) // CHUNK_BYTES)) + 1
+    pieces = list(zip([0, *cuts], [*cuts, len(order)], strict=True))
+    with replacing(Path(path)) as stream:
+        out = McapOutput(stream, attachments or {}, int(log_ns[order[0]]) if len(log_ns) else 0)
+        numbers = [out.channel(name, "cdr", ros2_schema(encoder.definition.name)) for name, encoder in encoders.items()]
+        # Pictures are drawn as they are written.
+        for start, end in progress.track(pieces, "writing", len(pieces)):
+            counts = np.bincount(owner[start:end], minlength=len(encoders)).tolist()
+            for number, encoder, count in zip(numbers, encoders.values(), counts, strict=True):
+                if count:
+                    out.put(encoder.block(number, count))
+            out.flush()
+        out.finish()
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file that takes its place when the block ends without an error; InputError when it cannot be written."""
     if not path.name or (path.exists() and not path.is_file()):
         raise InputError(f"{path}: there is no file to be written, it is something else")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         try:
             with part.open("wb") as stream:
-                _File(stream).write(topics, attachments or {})
+                yield stream
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
@@ -82,47 +104,107 @@ def write_session(
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
-class _File:
-    """An MCAP file being written: header, attachments, definitions, chunks with their message indexes, summary."""
+class McapOutput:
+    """An MCAP file being written: header, attachments, definitions, chunks with their message indexes, summary.
 
-    def __init__(self, stream: BinaryIO) -> None:
+    Args:
+        stream: of the file.
+        attachments: name -> content.
+        time_ns: of the attachments, Unix ns.
+    """
+
+    def __init__(self, stream: BinaryIO, attachments: Mapping[str, bytes], time_ns: int = 0) -> None:
         self._stream = stream
+        self._schemas: dict[Schema, records.Schema] = {}
+        self._channels: dict[tuple[str, str, int], records.Channel] = {}
+        self._counts: dict[int, int] = {}
         self._chunks: list[ChunkIndex] = []
         self._attachments: list[AttachmentIndex] = []
-        self._encoders: list[SeriesEncoder] = []
-
-    def write(self, topics: Mapping[str, series.Topic], attachments: Mapping[str, bytes]) -> None:
-        self._encoders = encoders = [encode_series(topic) for topic in topics.values()]
-        texts = {encoder.definition.name: definition_text(encoder.definition.name) for encoder in encoders}
-        schemas = [Schema(i, text.encode(), "ros2msg", name) for i, (name, text) in enumerate(texts.items(), start=1)]
-        ids = {schema.name: schema.id for schema in schemas}
-        channels = [
-            Channel(i, name, "cdr", {}, ids[encoder.definition.name])
-            for i, (name, encoder) in enumerate(zip(topics, encoders, strict=True), start=1)
-        ]
-        start = min((int(encoder.log_ns[0]) for encoder in encoders if len(encoder.log_ns)), default=0)
-        end = max((int(encoder.log_ns[-1]) for encoder in encoders if len(encoder.log_ns)), default=0)
-
-        self._stream.write(MAGIC)
+        self._waiting: list[MessageBlock] = []
+        stream.write(MAGIC)
         self._put(Header("ros2", "alidade"))
         for name, data in attachments.items():
-            self._attach(name, data, start)
-        self._put(*schemas, *channels)
-        self._write_chunks()
+            self._attach(name, data, max(time_ns, 0))
+
+    def channel(self, topic: str, encoding: str, schema: Schema | None) -> int:
+        """Number of a topic with messages of an encoding and a schema, whatever the schema's own number."""
+        number = 0
+        if schema is not None:
+            schema = schema._replace(id=0)
+            if schema not in self._schemas:
+                self._schemas[schema] = records.Schema(
+                    len(self._schemas) + 1, schema.data, schema.encoding, schema.name
+                )
+                self._put(self._schemas[schema])
+            number = self._schemas[schema].id
+        key = topic, encoding, number
+        if key not in self._channels:
+            self._channels[key] = records.Channel(len(self._channels) + 1, topic, encoding, {}, number)
+            self._counts[self._channels[key].id] = 0
+            self._put(self._channels[key])
+        return self._channels[key].id
+
+    def put(self, block: MessageBlock) -> None:
+        """Write messages of a channel; they wait until a chunk is full."""
+        if len(block.start):
+            self._waiting.append(block)
+        if sum(int(each.size.sum()) for each in self._waiting) >= CHUNK_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the messages that wait as a chunk, in the order of their log times."""
+        if not self._waiting:
+            return
+        blocks, self._waiting = self._waiting, []
+        log_ns = np.maximum(np.concatenate([block.log_ns for block in blocks]), 0)
+        size = np.concatenate([block.size for block in blocks])
+        heads = np.zeros(len(log_ns), MESSAGE_HEAD)
+        heads["opcode"], heads["length"] = Opcode.MESSAGE, AFTER_LENGTH + size
+        heads["log_ns"] = heads["publish_ns"] = log_ns
+        heads["channel"] = np.repeat([block.channel for block in blocks], [len(block.start) for block in blocks])
+        for channel in np.unique(heads["channel"]).tolist():
+            rows = np.flatnonzero(heads["channel"] == channel)
+            heads["sequence"][rows] = self._counts[channel] + np.arange(len(rows))
+            self._counts[channel] += len(rows)
+        order = np.argsort(log_ns, kind="stable")
+        end = np.empty_like(size)
+        end[order] = np.cumsum(size[order] + heads.itemsize)
+        at = end - size
+        out = np.empty(end.max(), np.uint8)
+        byte_windows(out, heads.itemsize)[at - heads.itemsize] = heads.view(f"V{heads.itemsize}")
+        first = 0
+        for block in blocks:
+            _copy(block, out, at[first : first + len(block.start)])
+            first += len(block.start)
+        entries = np.stack([log_ns, at - heads.itemsize], axis=1)[order]
+        owner = heads["channel"][order]
+        index = {channel: entries[owner == channel] for channel in np.unique(owner).tolist()}
+        self._put_chunk(out.tobytes(), int(log_ns.min()), int(log_ns.max()), index)
+
+    def finish(self) -> None:
+        """Write what waits, and the summary."""
+        self.flush()
         self._put(DataEnd(0))
-        counts = {i: len(encoder.log_ns) for i, encoder in enumerate(encoders, start=1)}
         statistics = Statistics(
-            attachment_count=len(attachments),
-            channel_count=len(channels),
-            channel_message_counts=counts,
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
             chunk_count=len(self._chunks),
-            message_count=sum(counts.values()),
-            message_end_time=end,
-            message_start_time=start,
+            message_count=sum(self._counts.values()),
+            message_end_time=max((chunk.message_end_time for chunk in self._chunks), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in self._chunks), default=0),
             metadata_count=0,
-            schema_count=len(schemas),
+            schema_count=len(self._schemas),
         )
-        self._finish(*schemas, *channels, statistics, *self._chunks, *self._attachments)
+        start = self._stream.tell()
+        summary = _bytes(
+            *self._schemas.values(), *self._channels.values(), statistics, *self._chunks, *self._attachments
+        )
+        # The checksum takes in the footer up to itself.
+        crc = zlib.crc32(summary + struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0))
+        self._stream.write(summary)
+        self._put(Footer(start, 0, crc))
+        self._stream.write(MAGIC)
 
     def _put(self, *records: McapRecord) -> int:
         """Write records; returns their size."""
@@ -133,48 +215,6 @@ class _File:
         offset = self._stream.tell()
         length = self._put(Attachment(time_ns, time_ns, name, media, data))
         self._attachments.append(AttachmentIndex(offset, length, time_ns, time_ns, len(data), name, media))
-
-    def _write_chunks(self) -> None:
-        """Cut the messages of all topics, in time order, into chunks of about the same size."""
-        log_ns = np.concatenate([np.empty(0, np.int64), *(encoder.log_ns for encoder in self._encoders)])
-        owner = np.repeat(np.arange(len(self._encoders)), [len(encoder.log_ns) for encoder in self._encoders])
-        order = np.argsort(log_ns, kind="stable")
-        log_ns, owner = log_ns[order], owner[order]
-        widths = np.array([MESSAGE_HEAD.itemsize + encoder.size for encoder in self._encoders], dtype=np.int64)
-        filled = np.cumsum(widths[owner])
-        cuts = np.flatnonzero(np.diff(filled // CHUNK_BYTES)) + 1
-        pieces = list(zip([0, *cuts], [*cuts, len(order)], strict=True))
-        # Pictures are drawn as they are written.
-        for start, end in progress.track(pieces, "writing", len(pieces)):
-            if end > start:
-                self._write_chunk(owner[start:end], log_ns[start:end])
-
-    def _write_chunk(self, owner: NDArray[np.int64], log_ns: NDArray[np.int64]) -> None:
-        """Write the next messages: their topics' numbers and log times, (n,) each."""
-        heads = np.zeros(len(owner), MESSAGE_HEAD)
-        size = np.empty(len(owner), dtype=np.int64)
-        found = {}
-        for i in np.unique(owner).tolist():
-            encoder, rows = self._encoders[i], np.flatnonzero(owner == i)
-            heads["sequence"][rows] = encoder.taken + np.arange(len(rows))
-            messages = encoder.take(len(rows))
-            size[rows] = [len(message) for message in messages] if encoder.varies else encoder.size
-            found[i] = rows, messages
-        heads["opcode"], heads["channel"], heads["length"] = Opcode.MESSAGE, owner + 1, AFTER_LENGTH + size
-        heads["log_ns"] = heads["publish_ns"] = log_ns
-        end = np.cumsum(size + heads.itemsize)
-        at = end - size
-        records = np.empty(end[-1], np.uint8)
-        byte_windows(records, heads.itemsize)[at - heads.itemsize] = heads.view(f"V{heads.itemsize}")
-        for rows, messages in found.values():
-            if isinstance(messages, list):
-                for start, message in zip(at[rows], messages, strict=True):
-                    records[start : start + len(message)] = np.frombuffer(message, np.uint8)
-            else:
-                byte_windows(records, messages.shape[1])[at[rows]] = messages.view(f"V{messages.shape[1]}")[:, 0]
-        start = at - heads.itemsize
-        index = {i + 1: np.stack([log_ns[rows], start[rows]], axis=1) for i, (rows, _) in found.items()}
-        self._put_chunk(records.tobytes(), int(log_ns[0]), int(log_ns[-1]), index)
 
     def _put_chunk(self, records: bytes, start_ns: int, end_ns: int, index: dict[int, NDArray[np.int64]]) -> None:
         packed = zstandard.compress(records, _LEVEL)
@@ -188,14 +228,12 @@ class _File:
         after = self._stream.tell() - at - length
         self._chunks.append(ChunkIndex(length, at, "zstd", len(packed), end_ns, after, offsets, start_ns, len(records)))
 
-    def _finish(self, *summary: McapRecord) -> None:
-        start = self._stream.tell()
-        records = _bytes(*summary)
-        # The checksum takes in the footer up to itself.
-        crc = zlib.crc32(records + struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0))
-        self._stream.write(records)
-        self._put(Footer(start, 0, crc))
-        self._stream.write(MAGIC)
+
+def _copy(block: MessageBlock, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
+    """Copy messages to the places `at`, those of one size at once."""
+    for size in np.unique(block.size).tolist():
+        rows = np.flatnonzero(block.size == size)
+        byte_windows(out, size)[at[rows]] = byte_windows(block.buffer, size)[block.start[rows]]
 
 
 def _bytes(*records: McapRecord) -> bytes:

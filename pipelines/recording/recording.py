@@ -42,6 +42,7 @@ from alidade.pipelines.recording.decoding import (
     DecodedMessage,
     MessageFormat,
     Times,
+    is_unstamped,
     with_log_times,
 )
 from alidade.pipelines.recording.messages import MessageError
@@ -213,6 +214,11 @@ class Recording:
         self._all_stamp_facts()
         self._times.clear()
 
+    def stamps(self, block: MessageBlock) -> NDArray[np.int64]:
+        """Stamps of the container's messages, Unix ns; log times where there are none."""
+        stamps = self._formats[block.channel].stamps(block)
+        return np.where(is_unstamped(stamps, block.log_ns), block.log_ns, stamps)
+
     def there(self) -> str:
         """A phrase that lists the recorded topics, and what is lost."""
         named = [
@@ -253,7 +259,9 @@ class Recording:
         if self._require(topic, *messages.RATES).type == messages.IMU:
             return self._series(series.ImuSeries, topic, frame)
         rate = self._series(series.VectorSeries, topic, frame)
-        return series.ImuSeries(rate.t_ns, rate.vector, np.full(3, np.nan), stamped_by_log=rate.stamped_by_log)
+        return series.ImuSeries(
+            rate.t_ns, rate.vector, np.full(3, np.nan), stamped_by_log=rate.stamped_by_log, frame_id=rate.frame_id
+        )
 
     def magnetic(self, topic: str) -> series.MagneticSeries:
         """A sensor_msgs/MagneticField topic."""
@@ -372,7 +380,9 @@ class Recording:
         if info.type != messages.IMU:
             return self._series(series.VectorSeries, topic)
         imu = self._series(series.ImuSeries, topic)
-        return series.VectorSeries(imu.t_ns, getattr(imu, which), stamped_by_log=imu.stamped_by_log)
+        return series.VectorSeries(
+            imu.t_ns, getattr(imu, which), stamped_by_log=imu.stamped_by_log, frame_id=imu.frame_id
+        )
 
     def _between(self, topic: str, frames: tuple[str, str]) -> series.PoseSeries:
         """The transforms of a pair of frames, parent and child."""
@@ -518,7 +528,7 @@ class Recording:
                     f"topic {topic}: {name} jumps by {1 << bits}: counts of a signed {bits} bit sensor that were "
                     "written as unsigned, read as signed"
                 )
-        return kind(t_ns, stamped_by_log=from_log, **columns)
+        return kind(t_ns, stamped_by_log=from_log, frame_id=next(iter(table.frames()), ""), **columns)
 
     def _choose_frame(self, topic: str, table: ColumnTable, frame: str | None) -> None:
         """Keep the messages of a frame. Raises InputError where it has none, and where none is given of several.

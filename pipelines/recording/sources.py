@@ -137,4 +137,4 @@ def joined(gyro: series.VectorSeries, accel: series.VectorSeries | None) -> seri
         columns = [np.interp(at, t, column, np.nan, np.nan) for column in accel.vector[order].T]
         values = np.stack(columns, axis=1)
     by_log = gyro.stamped_by_log + (0 if accel is None else accel.stamped_by_log)
-    return series.ImuSeries(gyro.t_ns, gyro.vector, values, stamped_by_log=by_log)
+    return series.ImuSeries(gyro.t_ns, gyro.vector, values, stamped_by_log=by_log, frame_id=gyro.frame_id)

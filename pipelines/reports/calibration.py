@@ -144,7 +144,8 @@ class SavedCalibration(_Record, SensorValues):
             raise InputError(f"the calibration has no parameter {name}; it has {', '.join(self.parameters)}")
         return self.parameters[name].value
 
-    def _application(self) -> Application:
+    def application(self) -> Application:
+        """How it is applied, with its config."""
         from alidade.pipelines.methods import method
 
         text = "\n".join(self.formulas)
@@ -203,7 +204,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         )
         for p in calibration.parameters.values()
     }
-    return SavedCalibration(
+    content = SavedCalibration(
         method=method,
         solver=calibration.estimate.solver,
         status=calibration.status,
@@ -215,6 +216,8 @@ def saved(calibration: Calibration) -> SavedCalibration:
         formulas=[formula.text for formula in calibration.formulas],
         constants=dict(calibration.problem.constants),
     )
+    content._config = calibration.config
+    return content
 
 
 def load_calibration(path: Path, config: Config | None = None) -> SavedCalibration:

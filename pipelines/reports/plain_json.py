@@ -10,6 +10,7 @@ from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.reports.sentences import label
 
 if TYPE_CHECKING:
+    from alidade.pipelines.applications.apply import Applied
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.fleet.analysis import Population
     from alidade.pipelines.applications.fleet.fleet import Outcome
@@ -55,6 +56,21 @@ def validation_json(validated: Validated) -> str:
             "notes": validated.notes,
         },
     )
+
+
+def applied_json(applied: Applied) -> str:
+    """Of `apply`: the file, its corrected topics, notes."""
+    topics = [
+        {
+            "name": topic.name,
+            "recorded": topic.recorded,
+            "sensors": topic.sensors,
+            "messages": len(topic.messages),
+            "frame_id": topic.messages.frame_id,
+        }
+        for topic in applied.topics
+    ]
+    return plain_json("applied", {"file": str(applied.path), "topics": topics, "notes": applied.notes})
 
 
 def plan_json(plan: Plan) -> str:

@@ -139,7 +139,8 @@ class Calibration(SensorValues):
     def _joint(self) -> tuple[Sequence[str], Array]:
         return self.estimate.names, self.covariance
 
-    def _application(self) -> Application:
+    def application(self) -> Application:
+        """How it is applied, with the recording's config."""
         unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
         whole = self.method.report.formulas(list(unknown), self.config)
         return Application(self.formulas, whole, self.applied_values, {**self.problem.constants, **unknown})

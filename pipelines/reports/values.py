@@ -58,7 +58,7 @@ class SensorValues:
         """Names and joint covariance (n, n). Raises InputError when there is none."""
 
     @abstractmethod
-    def _application(self) -> Application:
+    def application(self) -> Application:
         """How it is applied. Raises InputError when that is not known."""
 
     @overload
@@ -87,7 +87,7 @@ class SensorValues:
                 file are not those of its parameters and config, as it was made with another config or by the published
                 solver, which does not know all of them; or, for sigmas, result.json is not beside it.
         """
-        known = self._application()
+        known = self.application()
         needed, possible = ({n for f in each for n in f.inputs} for each in (known.formulas, known.whole))
         given = {name: value for name, value in measured.items() if name in needed or name not in possible}
         found = apply(known.formulas, {**known.constants, **known.values}, given)

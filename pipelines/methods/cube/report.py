@@ -6,6 +6,7 @@ Frames: b cube's body, B reference, C camera, n level. Methods page, section 4.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,15 @@ from alidade.pipelines.methods.formula import (
 )
 from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.methods.temperature import FIRST
-from alidade.pipelines.methods.triads import RESULTS, TRIADS, parts_row, parts_with_sigmas, triad_formula, triad_names
+from alidade.pipelines.methods.triads import (
+    CORRECTIONS,
+    RESULTS,
+    TRIADS,
+    parts_row,
+    parts_with_sigmas,
+    triad_formula,
+    triad_names,
+)
 from alidade.pipelines.recording.topics import IMU, MAG
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
@@ -614,6 +623,7 @@ REPORT = Report(
     uses=uses,
     cards=CARDS,
     formulas=formulas,
+    corrections=tuple(replace(each, frame="cube") for each in CORRECTIONS),
     findings=findings,
     fixed_rotations=stated,
     figures=cube_plots,

@@ -19,7 +19,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.methods import Report, temperature
+from alidade.pipelines.methods import Correction, Report, temperature
 from alidade.pipelines.methods.formula import Formula, apply, gyro_rate, picture_time, symmetric_text, vector_text
 from alidade.pipelines.methods.head.parameters import (
     CAMERA,
@@ -30,7 +30,7 @@ from alidade.pipelines.methods.head.parameters import (
     SCALE,
     SENSITIVITY,
 )
-from alidade.pipelines.methods.head.recording import HEAD_IMU, HeadData
+from alidade.pipelines.methods.head.recording import HEAD_IMU, PLATFORM_IMU, HeadData
 from alidade.pipelines.methods.head.uses import uses
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.reports.result import Calibration
@@ -313,6 +313,10 @@ REPORT = Report(
     uses=uses,
     cards=CARDS,
     formulas=formulas,
+    corrections=(
+        Correction(topic=HEAD_IMU, inputs={"gyro": "gyro", "accel": "accel"}, results={"gyro": "w_iv"}),
+        Correction(topic=PLATFORM_IMU, inputs={"gyro": "platform_gyro"}, results={"gyro": "w_ib"}),
+    ),
     findings=findings,
     figures=head_plots,
     validate=validate,

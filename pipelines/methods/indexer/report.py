@@ -18,7 +18,7 @@ from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods import Report
+from alidade.pipelines.methods import Correction, Report
 from alidade.pipelines.methods.formula import Formula, axis_angles, gyro_rate
 from alidade.pipelines.methods.indexer.model import carrier
 from alidade.pipelines.methods.indexer.parameters import (
@@ -36,6 +36,7 @@ from alidade.pipelines.methods.indexer.recording import IndexerConfig, IndexerDa
 from alidade.pipelines.methods.indexer.uses import uses
 from alidade.pipelines.methods.indexer.windows import AxisMotion, Group, axis_motion, groups_of
 from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
+from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -248,6 +249,17 @@ REPORT = Report(
     uses=uses,
     cards=CARDS,
     formulas=formulas,
+    corrections=(
+        Correction(
+            topic=IMU,
+            inputs={"gyro": "gyro", "accel": "accel"},
+            results={"gyro": "w_it", "accel": "force"},
+            formulas=(
+                Formula("specific force along the platform's axes, m/s^2", "force", "inverse(mRt) * accel", ("accel",)),
+            ),
+            frame="platform",
+        ),
+    ),
     figures=indexer_plots,
     validate=validate,
 )

@@ -19,7 +19,7 @@ from alidade.pipelines.display.units import rounded
 from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.methods import Report
+from alidade.pipelines.methods import Correction, Report
 from alidade.pipelines.methods.formula import Formula, apply, axis_angles, gyro_rate, picture_time
 from alidade.pipelines.methods.los.initial_values import (
     camera,
@@ -326,6 +326,15 @@ REPORT = Report(
     uses=uses,
     cards=CARDS,
     formulas=formulas,
+    corrections=(
+        Correction(
+            topic=IMU,
+            inputs={"gyro": "gyro", "accel": "accel"},
+            results={"gyro": "w_b", "accel": "force"},
+            formulas=(Formula("specific force along the carrier's axes, m/s^2", "force", "M * accel", ("accel",)),),
+            frame="carrier",
+        ),
+    ),
     findings=findings,
     figures=los_plots,
     validate=validate,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from alidade.pipelines.estimation.parameters import ParameterSpec, gyro_bias, scalar
 from alidade.pipelines.methods import Guidance, Method, Report, deferred
-from alidade.pipelines.methods.triads import triad_specs
+from alidade.pipelines.methods.triads import CORRECTIONS, triad_specs
 from alidade.pipelines.methods.tumble import turning
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES, TumbleData, read_tumble, tumble_topics
 from alidade.pipelines.methods.tumble.topics import REQUIREMENTS, TOPICS
@@ -62,6 +62,7 @@ METHOD = Method(
         uses=deferred("alidade.pipelines.methods.tumble.uses:uses"),
         cards=CARDS,
         formulas=deferred("alidade.pipelines.methods.tumble.formulas:formulas"),
+        corrections=CORRECTIONS,
         findings=deferred("alidade.pipelines.methods.tumble.findings:findings"),
         figures=deferred("alidade.pipelines.methods.tumble.figures:figures"),
         validate=deferred("alidade.pipelines.methods.tumble.validation:validate"),
