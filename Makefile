@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test slow lint types bench docs words dist clean
+.PHONY: demo test slow lint types bench docs words dist wheels clean
 
 demo: $(VENV)/run
 	$(BIN)/alidade demo
@@ -40,6 +40,10 @@ dist: $(VENV)/dev
 	  cp tests/install/smoke.py tests/install/walk.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
 	done
 	cd build/smoke && bin/python walk.py $(CURDIR)/README.md $(CURDIR)/docs/quickstart.md $(CURDIR)/docs/methods/*.md
+
+# A wheel of every pinned run-time dependency for Linux x86-64 and aarch64 and macOS arm64, Python 3.11 to 3.14.
+wheels: $(VENV)/dev
+	$(BIN)/python tests/install/wheels.py
 
 # The site; tests/applications/test_docs.py runs what its pages show.
 docs: $(VENV)/dev

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +23,8 @@ Array = NDArray[np.float64]
 SQUARE = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 # OpenCV's IPPE_SQUARE wants top left, top right, bottom right, bottom left.
 _IPPE_ORDER = [3, 2, 1, 0]
+# Refinement of a pose: first damping, relative; most steps; a step that moves the corners by less (norm, px) is the last.
+_DAMPING, _MAX_STEPS, _SETTLED_PX = 1e-3, 50, 1e-6
 # Odds of the flipped pose above which a pose is called ambiguous.
 _AMBIGUOUS = 1e-3
 # Two refined poses closer than this (rad) are one.
@@ -123,7 +124,7 @@ def estimate_pose(
 ) -> BodyPose | None:
     """The body's pose from the corners of its tags; None when none is seen well (or only ids that are seen twice).
 
-    Reprojection errors are minimised by pycolmap, with the camera's distortion; each tag's two planar solutions
+    Reprojection errors are minimised with the camera's distortion; each tag's two planar solutions
     (T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", 2014; OpenCV's IPPE_SQUARE) are the starts.
 
     Args:
@@ -281,46 +282,33 @@ def _miss(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: A
     return np.asarray(camera.project(position + so3.rotate(cRb, corners)) - pixels)
 
 
-@lru_cache(maxsize=8)
-def _colmap_camera(camera: Camera) -> Any:
-    """The same camera for pycolmap (its place of a pixel's centre does not matter: points and K agree)."""
-    import pycolmap
-
-    k = np.concatenate([camera.focal, camera.centre, camera.coefficients])
-    if camera.distortion_model == "equidistant":
-        return pycolmap.Camera(model="OPENCV_FISHEYE", width=camera.width, height=camera.height, params=k)
-    k = np.pad(k, (0, 12 - len(k)))
-    return pycolmap.Camera(model="FULL_OPENCV", width=camera.width, height=camera.height, params=k)
-
-
 def _refine(camera: Camera, tags: TagBody, pixels: Array, cRb: Array, position: Array) -> _Fit | None:
-    import pycolmap
+    """The pose of least squares near another (Levenberg and Marquardt); None where there is none."""
+    corners, damping = tags.corners.reshape(-1, 3), _DAMPING
+    miss, J = _linearized(camera, corners, pixels, cRb, position)
+    if not np.isfinite(J).all():
+        return None
+    try:
+        for _ in range(_MAX_STEPS):
+            H, gradient = J.T @ J, J.T @ miss
+            step = -np.linalg.solve(H + np.diag(damping * np.diag(H)), gradient)
+            trial = so3.multiply(cRb, so3.exp(step[:3])), position + step[3:]
+            tried, by_pose = _linearized(camera, corners, pixels, *trial)
+            if tried @ tried <= miss @ miss and np.isfinite(by_pose).all():
+                (cRb, position), miss, J, damping = trial, tried, by_pose, 0.1 * damping
+            else:
+                damping *= 10.0
+            if step @ H @ step < _SETTLED_PX**2:
+                break
+        covariance: Array = np.asarray(np.linalg.inv(J.T @ J), dtype=float)
+    except np.linalg.LinAlgError:
+        return None
+    return _Fit(cRb, position, covariance, miss.reshape(pixels.shape), float(miss @ miss))
 
-    # A pose that the corners leave open is no fault; its covariance has it.
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR
-    options = pycolmap.AbsolutePoseRefinementOptions()
-    options.gradient_tolerance = 1e-5
-    # Its loss is Cauchy's. This wide (px) it is least squares; much wider, its log(1 + r^2 / scale^2) loses the digits.
-    options.loss_function_scale = 100.0
-    corners = tags.corners
-    start = pycolmap.Rigid3d(pycolmap.Rotation3d(so3.matrix(cRb)), position)
-    found = pycolmap.refine_absolute_pose(
-        start,
-        pixels.reshape(-1, 2),
-        corners.reshape(-1, 3),
-        np.ones(pixels.size // 2, dtype=bool),
-        _colmap_camera(camera),
-        options,
-        return_covariance=True,
-    )
-    if found is None:
-        return None
-    pose = found["cam_from_world"]
-    cRb, position = so3.from_matrix(pose.rotation.matrix()), np.array(pose.translation)
-    miss = _miss(camera, corners, pixels, cRb, position)
-    if not np.isfinite(miss).all():
-        return None
-    # pycolmap turns from the left, Exp(2 h) cRb, with h half an angle in c; here cRb Exp(delta): delta = 2 cRb^T h.
-    T = np.eye(6)
-    T[:3, :3] = 2.0 * so3.matrix(cRb).T
-    return _Fit(cRb, position, T @ found["covariance"] @ T.T, miss, float((miss**2).sum()))
+
+def _linearized(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> tuple[Array, Array]:
+    """Misses (2 n,) of corners (n, 3), px, and their Jacobian (2 n, 6) by delta of cRb Exp(delta) and the position."""
+    R = so3.matrix(cRb)
+    seen, by_point = camera.project_with_jacobian(position + corners @ R.T)
+    by_turn = np.cross(corners[:, None, :], by_point @ R)  # d(R Exp(delta) x) = R (delta x x)
+    return (seen - pixels.reshape(-1, 2)).ravel(), np.concatenate([by_turn, by_point], axis=-1).reshape(-1, 6)

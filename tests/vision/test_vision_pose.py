@@ -168,3 +168,51 @@ def test_bodies_from_the_config() -> None:
     tag.size = 0.0
     with pytest.raises(InputError, match="tag 17"):
         TagBody.from_board(SimpleNamespace(tag_family="36h11", tags={17: tag}))  # type: ignore[arg-type]
+
+
+RATIONAL = Camera(1280, 960, K, "rational_polynomial", np.array([-0.2, 0.1, 1e-3, -5e-4, 0.02, 0.02, 0.01, 1e-3]))
+
+
+@pytest.mark.parametrize("camera", [PINHOLE, RATIONAL, FISHEYE], ids=lambda camera: camera.distortion_model)
+@pytest.mark.parametrize("body", [BOARD, CUBE], ids=["board", "cube"])
+def test_poses_and_covariances_are_those_of_pycolmap(camera: Camera, body: TagBody) -> None:
+    """pycolmap (Ceres) begins 3 deg and 1 cm off; its convergence is the coarser one."""
+    pycolmap = pytest.importorskip("pycolmap")
+    fisheye = camera.distortion_model == "equidistant"
+    parameters = np.concatenate([camera.focal, camera.centre, camera.coefficients])
+    parameters = parameters if fisheye else np.pad(parameters, (0, 12 - len(parameters)))
+    kind = "OPENCV_FISHEYE" if fisheye else "FULL_OPENCV"
+    other = pycolmap.Camera(model=kind, width=1280, height=960, params=parameters)
+    options = pycolmap.AbsolutePoseRefinementOptions()
+    options.gradient_tolerance, options.loss_function_scale = 1e-5, 100.0
+    rng, compared = np.random.default_rng(3), 0
+    for _ in range(10):
+        cRb, position = _random_pose(rng, body, 0.7)
+        seen = _seen(camera, body, cRb, position, 0.1, rng)
+        found = estimate_pose(camera, body, seen, sigma_px=1.0)
+        if found is None or found.ambiguous or len(found.ids) < 2:
+            continue
+        corners = body.corners[np.isin(body.ids, found.ids)].reshape(-1, 3)
+        start = so3.multiply(so3.exp([0.03, -0.04, 0.02]), found.cRb)
+        reference = pycolmap.refine_absolute_pose(
+            pycolmap.Rigid3d(pycolmap.Rotation3d(so3.matrix(start)), found.position + 0.01),
+            seen.corners[np.isin(seen.ids, found.ids)].reshape(-1, 2),
+            corners,
+            np.ones(len(corners), dtype=bool),
+            other,
+            options,
+            return_covariance=True,
+        )
+        pose = reference["cam_from_world"]
+        T = np.eye(6)  # of Exp(2 h) cRb, h half an angle in c, into cRb Exp(delta)
+        T[:3, :3] = 2.0 * so3.matrix(found.cRb).T
+        scale = np.sqrt(np.diag(found.covariance))
+        np.testing.assert_allclose(
+            T @ reference["covariance"] @ T.T / np.outer(scale, scale),
+            found.covariance / np.outer(scale, scale),
+            atol=5e-3,
+        )
+        moved = _error(found, so3.from_matrix(pose.rotation.matrix()), np.array(pose.translation))
+        assert (np.abs(moved) < 5e-3 * scale).all()  # of what a pixel of noise makes
+        compared += 1
+    assert compared >= 5
