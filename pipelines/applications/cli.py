@@ -124,7 +124,9 @@ _OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes [
 _Strict = Annotated[bool, typer.Option("--strict", help="Fail if any part of the recording is damaged or missing.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Use the topics that `info` proposes.")]
 _AutoColumns = Annotated[bool, typer.Option("--auto-columns", help="Use the columns of tables that `info` proposes.")]
-_NoCheck = Annotated[bool, typer.Option("--no-check", help="End with the incremental estimate, without a final batch solution.")]
+_NoCheck = Annotated[
+    bool, typer.Option("--no-check", help="End with the incremental estimate, without a final batch solution.")
+]
 _Prior = Annotated[
     Path | None, typer.Option(help="Earlier calibration (result.json or calibration.yaml) used as prior.")
 ]

@@ -9,11 +9,13 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
-from alidade.pipelines.recording.pairing import MAX_MOUNT, Pairing, pair
+from alidade.pipelines.recording.pairing import INTERVAL, MAX_MOUNT, Pairing, pair
 from alidade.pipelines.recording.plausibility import is_there
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
@@ -23,6 +25,8 @@ from alidade.pipelines.settings import Config
 
 # Rates and attitudes belong together above this correlation of their norms.
 _BELONGS = 0.7
+# Correlations are compared up to this one.
+_HIGHEST = 1.0 - 1e-9
 # Names are alike above this ratio of difflib.
 _ALIKE = 0.6
 # ... and one is meant rather than another by a ratio so much larger.
@@ -167,8 +171,7 @@ def _suggestion(
     for attitude in attitudes:
         for gyro in gyros:
             free = [_candidates(recording, config, topic, taken) for topic in (attitude, gyro)]
-            if not _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons):
-                doubtful.add(attitude.key)
+            doubtful |= _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons)
     for topic in dict.fromkeys([*needed, *chosen.topics]):
         if topic.key in topics or config.topic(topic) in recording.topics or topic.key in config.topics:
             continue
@@ -184,9 +187,18 @@ def _suggestion(
             continue
         named = _by_name(recording, topic, used, is_needed=topic in needed)
         if named is None and topic in needed and len(several := _of_type(recording, topic, used)) > 1:
-            reasons.append(
-                f"{' and '.join(several)} could be the {topic.key}: choose, `topics: {{{topic.key}: {several[0]}}}`"
-            )
+            reasons.append(_to_choose(topic, several))
+        if named is not None and topic not in needed and messages.IMU in topic.types and not _is_attitude(topic):
+            sources = {each.key: TopicSource(topic=each.name) for each in (*gyros, *attitudes)} | config.topics | topics
+            twins = [
+                sources[gyro.key].name
+                for gyro in gyros
+                for attitude in attitudes
+                if _turns_as(recording, named, sources[gyro.key].name, sources[attitude.key], pairings)
+            ]
+            if twins:
+                reasons.append(f"{named} turns as {twins[0]} does: not proposed as {topic.key}")
+                continue
         if named is not None:
             topics[topic.key] = TopicSource(topic=named)
             reasons.append(f"{named} ({_short(recording, named)}) proposed as {topic.key}")
@@ -207,40 +219,66 @@ def _pair_up(
     pairings: dict[tuple[str, str], Pairing | None],
     topics: dict[str, TopicSource],
     reasons: list[str],
-) -> bool:
+) -> set[str]:
     """The gyro and the attitude that turn together most alike, of those that may serve.
 
-    Returns False where the best attitude fits only in a way that is not taken without being asked for.
+    Returns the keys that people have to choose a topic for: several turn alike, or an attitude fits in a way only that
+    is not taken without being asked for.
     """
     attitude, gyro = pair_of
-    best: tuple[float, TopicSource, TopicSource, Pairing] | None = None
-    for a in free[0]:
-        for g in free[1]:
-            if a.name == g.name:
-                continue
-            if (g.name, a.name) not in pairings:
-                pairings[g.name, a.name] = _paired(recording, g.name, a)
-            found = pairings[g.name, a.name]
-            if found is not None and found.correlation > _BELONGS and (best is None or found.correlation > best[0]):
-                best = found.correlation, g, a, found
-    if best is None:
-        return True
-    _, g, a, found = best
+    fitting = [
+        (found, g, a)
+        for a in free[0]
+        for g in free[1]
+        if a.name != g.name
+        if (found := _pairing(recording, g.name, a, pairings)) is not None and found.correlation > _BELONGS
+    ]
+    if not fitting:
+        return set()
+    found, g, a = max(fitting, key=lambda one: one[0].correlation)
+    least = _as_high(recording, found.correlation)
+    alike = [one for one in fitting if one[0].correlation >= least]
+    named = {
+        gyro: list(dict.fromkeys(g.name for _, g, _ in alike)),
+        attitude: list(dict.fromkeys(a.name for _, _, a in alike)),
+    }
+    to_choose = {topic.key for topic, names in named.items() if len(names) > 1}
+    reasons.extend(f"{_to_choose(topic, names)}; they turn alike" for topic, names in named.items() if len(names) > 1)
     if found.order != (0, 1, 2, 3) or (found.inverted and found.angle > MAX_MOUNT):
         fits = "inverted, far from its mount" if found.inverted else "in another order of its components"
         reasons.append(
             f"{a.name} turns with {g.name}, but {fits}: are they x, y, z, w where w, x, y, z is meant? Not taken by "
             "itself: mend the order, or say invert in the config"
         )
-        return False
-    if config.topic(gyro) != g.name:
+        return {attitude.key, *to_choose}
+    if config.topic(gyro) != g.name and gyro.key not in to_choose:
         topics[gyro.key] = g
-    if config.topic(attitude) != a.name or found.inverted:
+    if (config.topic(attitude) != a.name or found.inverted) and attitude.key not in to_choose:
         topics[attitude.key] = a.model_copy(update={"invert": a.invert != found.inverted})
+    if to_choose:
+        return to_choose
     way = ", inverted" if found.inverted else ""
     offset = f", time offset {1e3 * found.offset_s:+.0f} ms" if abs(found.offset_s) > _DELAY else ""
     reasons.append(f"{a.name} matches {g.name}: rate correlation {found.correlation:.2f}{offset}{way}")
-    return True
+    return set()
+
+
+def _turns_as(
+    recording: Recording, gyro: str, other: str, attitude: TopicSource, known: dict[tuple[str, str], Pairing | None]
+) -> bool:
+    """Whether a gyro turns with an attitude as another one does, which is then on the same body."""
+    own, theirs = (_pairing(recording, name, attitude, known) for name in (gyro, other))
+    return own is not None and theirs is not None and own.correlation >= _as_high(recording, theirs.correlation)
+
+
+def _as_high(recording: Recording, correlation: float) -> float:
+    """The least correlation not lower by more than chance: three sigmas of Fisher's z of independent samples."""
+    sigma = np.sqrt(2.0 * INTERVAL / max(recording.duration_s, INTERVAL))
+    return float(np.tanh(np.arctanh(min(correlation, _HIGHEST)) - 3.0 * sigma))
+
+
+def _to_choose(topic: Topic, names: Sequence[str]) -> str:
+    return f"{' and '.join(names)} could be the {topic.key}: choose, `topics: {{{topic.key}: {names[0]}}}`"
 
 
 def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[str]) -> list[TopicSource]:
@@ -266,6 +304,14 @@ def _moving_pairs(recording: Recording, topic: str) -> list[tuple[str, str]]:
     except InputError:
         return []
     return sorted((pair for pair, n in counts.items() if n >= _FEWEST), key=lambda pair: -counts[pair])[:_MOST_PAIRS]
+
+
+def _pairing(
+    recording: Recording, gyro: str, attitude: TopicSource, known: dict[tuple[str, str], Pairing | None]
+) -> Pairing | None:
+    if (gyro, attitude.name) not in known:
+        known[gyro, attitude.name] = _paired(recording, gyro, attitude)
+    return known[gyro, attitude.name]
 
 
 def _paired(recording: Recording, gyro: str, attitude: TopicSource) -> Pairing | None:
@@ -295,7 +341,7 @@ def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool
     words = topic.key.replace("_", " ")
     alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
     best = max(there, key=lambda name: alike[name], default=None)
-    if is_needed and best is not None and _is_ambiguous(alike):
+    if best is not None and (is_needed or alike[best] > _ALIKE) and _is_ambiguous(alike):
         return None
     return best if best is not None and (is_needed or alike[best] > _ALIKE or _is_other_gyro(topic, there)) else None
 
@@ -340,7 +386,7 @@ def _of_type(recording: Recording, topic: Topic, used: set[str]) -> list[str]:
 def _is_ambiguous(alike: dict[str, float]) -> bool:
     """Whether several topics could be meant, none of them by its name: which is not for chance to say."""
     ranked = sorted(alike.values(), reverse=True)
-    return len(ranked) > 1 and ranked[0] < _ALIKE and ranked[0] - ranked[1] < _CLEARLY
+    return len(ranked) > 1 and ranked[0] - ranked[1] < _CLEARLY
 
 
 def _is_other_gyro(topic: Topic, there: list[str]) -> bool:

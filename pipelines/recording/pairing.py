@@ -22,7 +22,7 @@ Stamps = NDArray[np.int64]
 # Delays looked for, s; steps and length of the grid they are looked for on.
 _LARGEST_DELAY, _FINEST, _MOST = 2.0, 0.002, 1 << 17
 # Interval over which attitudes are differenced, s.
-_INTERVAL = 0.1
+INTERVAL = 0.1
 # Search of a delay: half range, s; half ranges of the successive refinements, s; least number of rates.
 _WITHIN, _REACHES, _FEWEST = 0.1, (0.05, 0.02, 0.02), 30
 # Least variation of rates, rad/s, and shortest duration, s, from which a pairing is estimated.
@@ -99,7 +99,7 @@ def pair(
     if len(ours.t) < 10 or len(at) < 10 or min(ours.t[-1], at[-1]) - max(ours.t[0], at[0]) < _SHORTEST:
         return None
     # Over several samples, for the noise of an attitude weighs by one over the interval.
-    stride = max(1, round(_INTERVAL / float(np.median(np.diff(at)))))
+    stride = max(1, round(INTERVAL / float(np.median(np.diff(at)))))
     if len(at) < 10 * stride:
         return None
     steps = at[stride:] - at[:-stride]

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 SQUARE = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 # OpenCV's IPPE_SQUARE wants top left, top right, bottom right, bottom left.
 _IPPE_ORDER = [3, 2, 1, 0]
-# Refinement of a pose: first damping, relative; most steps; a step that moves the corners by less (norm, px) is the last.
+# Refinement of a pose: first damping, relative; most steps; the last one moves corners by less than this (norm, px).
 _DAMPING, _MAX_STEPS, _SETTLED_PX = 1e-3, 50, 1e-6
 # Odds of the flipped pose above which a pose is called ambiguous.
 _AMBIGUOUS = 1e-3

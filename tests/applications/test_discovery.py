@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -270,3 +271,48 @@ def test_another_order_of_a_quaternions_components_is_no_inverse(simulated: Path
     assert "vision_attitude" not in found.topics
     assert "another order of its components" in found.reasons[0]
     assert found.missing
+
+
+def twins(simulated: Path, path: Path, poses: bool = False) -> Recording:
+    """Two IMUs on one helmet, at rest on its platform, and, if wanted, two trackers that see it."""
+    whole, rng = open_recording(simulated), np.random.default_rng(4)
+    one, pose = whole.imu("/head/imu"), whole.poses("/vision/attitude")
+    other = dataclasses.replace(one, gyro=one.gyro[:, [1, 2, 0]] + 1e-3 * rng.normal(size=one.gyro.shape))
+    topics = {"/imu_left": one, "/imu_right": other, "/pose": pose}
+    write_session(path, topics | ({"/other/pose": pose} if poses else {}))
+    return open_recording(path)
+
+
+def test_of_two_gyros_on_one_body_people_choose(simulated: Path, tmp_path: Path, alidade: Command) -> None:
+    recording = twins(simulated, tmp_path / "s.mcap")
+    (head,) = (found for found in suggestions(recording, NONE) if found.method == "head")
+    assert "/imu_left and /imu_right could be the head_imu: choose, `topics: {head_imu: /imu_left}`" in head.reasons[0]
+    assert set(head.topics) == {"vision_attitude"}
+    run = alidade("calibrate", tmp_path / "s.mcap", "--method", "head", "--auto-topics", "--out", tmp_path / "out")
+    assert (run.code, run.out) == (2, "")
+    assert "/imu_left and /imu_right could be the head_imu" in run.err
+    config = load_config(b"topics: {head_imu: /imu_right}")
+    (head,) = (found for found in suggestions(recording, config) if found.method == "head")
+    assert head.missing == ()
+    assert set(head.topics) == {"vision_attitude"}
+    assert "/imu_left turns as /imu_right does: not proposed as platform_imu" in head.reasons
+
+
+def test_of_two_attitudes_of_one_body_people_choose(simulated: Path, tmp_path: Path) -> None:
+    recording = twins(simulated, tmp_path / "s.mcap", poses=True)
+    config = load_config(b"topics: {head_imu: /imu_right}")
+    (head,) = (found for found in suggestions(recording, config) if found.method == "head")
+    assert head.topics == {}
+    assert "/other/pose and /pose could be the vision_attitude" in head.reasons[0]
+
+
+@pytest.mark.parametrize("names", [("/mag0", "/mag1"), ("/x", "/y"), ("/left/mag", "/right/mag")])
+def test_of_two_magnetometers_people_choose(names: tuple[str, str], tmp_path: Path, alidade: Command) -> None:
+    t_ns = 1_700_000_000_000_000_000 + 20_000_000 * np.arange(200)
+    field = 5e-5 * np.random.default_rng(2).normal(size=(200, 3))
+    write_session(tmp_path / "s.mcap", {name: series.MagneticSeries(t_ns, field) for name in names})
+    run = alidade("info", tmp_path / "s.mcap")
+    assert f"tumble: {names[0]} and {names[1]} could be the mag: choose, `topics: {{mag: {names[0]}}}`" in run.out
+    run = alidade("calibrate", tmp_path / "s.mcap", "--method", "tumble", "--auto-topics", "--out", tmp_path / "out")
+    assert (run.code, run.out) == (2, "")
+    assert "could be the mag: choose" in run.err
