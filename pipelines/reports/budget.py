@@ -33,7 +33,7 @@ class Limit:
     def sentence(self) -> str:
         """The largest source and what to do about it."""
         source, share = self.parts[0]
-        return f"{100.0 * share:.0f} % of {self.name}'s variance is {source}: {self.advice}"
+        return f"{100.0 * share:.0f} % of the variance of {self.name}: {source}; {self.advice}"
 
 
 def limits(budget: Mapping[str, Mapping[str, float]], quantities: Sequence[Quantity]) -> list[Limit]:
@@ -67,7 +67,7 @@ def _described(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
     of = source.removeprefix(_PRIOR)
     kinds = ", ".join(dict.fromkeys(map(kind, of.split(", "))))
     if assumed.issuperset(of.split(", ")):
-        return f"assumed {kinds}", "state its data sheet if yours is better, or move so that it shows"
+        return f"prior of {kinds}", "state its data sheet if yours is better, or move so that it shows"
     if of == name:
         return "its own prior", "the recording adds little to what was known"
-    return f"the prior of {kinds}", "know it better, or move so that it shows"
+    return f"prior of {kinds}", "know it better, or move so that it shows"

@@ -278,7 +278,8 @@ def _coefficients(found: UseBands) -> tuple[Block, ...]:
         for name, numbers in zip(use.coefficients.names, band.coefficients, strict=True)
     ]
     columns: Columns = ("coefficient", Column("", "text"), f"before, {use.unit}", "σ", f"after, {use.unit}", "σ")
-    return (Table("", use.coefficients.formula, columns, tuple(rows), "", "dense"),)
+    table = Table("", use.coefficients.formula, columns, tuple(rows), "", "small", None)
+    return (Details("Coefficients of the deviation", (table,), "screen"),)
 
 
 def _diagnostics(c: Calibration) -> tuple[Block, ...]:

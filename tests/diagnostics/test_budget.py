@@ -47,9 +47,9 @@ def test_sources_are_told_in_words_the_small_ones_together() -> None:
         Quantity("mount", "rad", 0.1, 0.1, 1e-3)
     ]
     (limit,) = limits(budget, quantities)
-    assert [source for source, _ in limit.parts] == ["assumed gyro_g", "vision noise", REST]
+    assert [source for source, _ in limit.parts] == ["prior of gyro_g", "vision noise", REST]
     assert [share for _, share in limit.parts] == pytest.approx([0.7, 0.295, 0.005])
-    assert limit.sentence.startswith("70 % of mount's variance is assumed gyro_g: state its data sheet")
+    assert limit.sentence.startswith("70 % of the variance of mount: prior of gyro_g; state its data sheet")
     (alone,) = limits({"mount": {"prior of mount": 1.0}}, quantities)
     assert alone.parts == (("its own prior", 1.0),)
 
@@ -74,4 +74,4 @@ def test_a_prior_of_a_few_numbers_together_is_named_after_them() -> None:
     assert cube.budget["mag_k22"]["prior of field_e, field_n, field_u"] > 0.8
     assert cube.budget["mag_k22"].get("prior", 0.0) < 0.01
     (limit,) = limits({"mag_k22": cube.budget["mag_k22"]}, cube.problem.quantities)
-    assert limit.parts[0][0] == "assumed field"
+    assert limit.parts[0][0] == "prior of field"
