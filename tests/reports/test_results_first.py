@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from alidade.pipelines.methods.triads import parts_of, sensor_model
 from alidade.pipelines.reports.calibration_report import calibration_report, report_html
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.results_table import result_cards
-from tests.support.browser import DESKTOP, PHONE, needs_browser, running
+from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_browser, running
 from tests.support.pages import Page
 
 # Open content, px, that a report may have at both widths.
@@ -46,6 +47,18 @@ def test_open_content_is_short_and_does_not_scroll_sideways(name: str, tmp_path:
         assert not tab.complaints
         first = "document.querySelector('#results').getBoundingClientRect().top + scrollY"
         assert tab.value(first) < (500 if width == DESKTOP else 900)
+
+
+@needs_browser
+def test_print_to_pdf_has_the_plots_that_are_collapsed_on_the_screen(tmp_path: Path) -> None:
+    """A headless browser prints as soon as the page is loaded."""
+    text = report_html(calibrated("tumble"))
+    (tmp_path / "page.html").write_text(text, encoding="utf-8")
+    pdf, page = tmp_path / "page.pdf", (tmp_path / "page.html").as_uri()
+    options = ("--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}")
+    subprocess.run([str(CHROMIUM), *options, f"--print-to-pdf={pdf}", page], check=True, capture_output=True)
+    # An image a canvas; frames, grids and lines are of Bokeh's canvas.
+    assert pdf.read_bytes().count(b"/Subtype /Image") >= text.count('class="plot"') > 4
 
 
 def test_sections_come_in_the_order_in_which_they_are_asked_for() -> None:

@@ -53,6 +53,8 @@ class Tab:
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Log"):
             self._call(f"{domain}.enable")
+        # As a person's browser: for a headless one, which is to print, pages draw everything at once.
+        self._call("Emulation.setUserAgentOverride", userAgent="Mozilla/5.0 Chrome")
         return self
 
     def __exit__(self, *_: object) -> None:

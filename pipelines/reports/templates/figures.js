@@ -168,6 +168,14 @@
     for (const fold of document.querySelectorAll("details")) fold.open = true;
     places.forEach(draw);
   });
+  // --print-to-pdf prints once the page is loaded: a frame that is being written delays that until all is drawn.
+  if (navigator.userAgent.includes("Headless")) {
+    const frame = document.body.appendChild(document.createElement("iframe"));
+    frame.hidden = true;
+    frame.contentDocument.open();
+    for (const fold of document.querySelectorAll("details")) fold.open = true;
+    Promise.all(places.map(draw)).finally(() => frame.contentDocument.close());
+  }
   dark.addEventListener("change", () => {
     // Not for a print in light colours, which the style sheet turns round.
     if (matchMedia("print").matches) return;
