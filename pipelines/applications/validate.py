@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from alidade.pipelines import deadline, progress
 from alidade.pipelines.applications.session import Recorded, Session, resolve_method
@@ -13,12 +15,16 @@ from alidade.pipelines.config import configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
+from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
 from alidade.pipelines.reports.known import Known, known_of, load_known, saved_of, with_covariance
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
+
+# Eigenvalues of a correlation matrix below this share of the largest are rounding.
+_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,7 +38,7 @@ class Validated:
         same_recording: it was calibrated on the very recording.
         lost: sentences about what of the recording cannot be used.
         held: whether the calibration holds; None where the recording cannot say.
-        device: what the method says of the calibration's device with the recording's own numbers, bias and the like.
+        device: what the method says of the calibration's device, bias and the like of this recording re-estimated.
         best: the same of the recording's own calibration: errors that are to be expected of one that holds.
     """
 
@@ -48,6 +54,11 @@ class Validated:
     def __repr__(self) -> str:
         """One line."""
         return f"<Validated {self.calibration.method} on {self.recording}: {self.verdict}>"
+
+    @property
+    def applied(self) -> Sequence[Validation]:
+        """Errors with the calibration, the turn-on bias and the like re-estimated from this recording where it can."""
+        return self.device or self.validations
 
     @property
     def verdict(self) -> Verdict:
@@ -88,7 +99,7 @@ class Validated:
     @property
     def notes(self) -> list[str]:
         """What a reader has to know beside the numbers."""
-        out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note)]
+        out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note and not self.device)]
         if self.same_recording:
             out.append("this is the recording it was calibrated on; another one says more")
         if self.calibration.status != "calibrated":
@@ -131,23 +142,34 @@ def validate(
         return Validated(calibration, path.name, validations, True, recording.notes)
     session = Session(chosen, data, config, Recorded(recording))
     with session.usual_time():
-        held, own = _held(session, known)
+        held, estimate, own = _held(session, known)
         lost = (*recording.notes, *filter(None, [deadline.stopped()]))
-    if held is None:
+    if held is None or estimate is None:
         return Validated(calibration, path.name, validations, False, lost)
     of_device = walks(chosen, config, [name for name in own if name in calibration.parameters])
-    mixed = {**own, **{name: value for name, value in values.items() if name in of_device}}
-    device, best = (chosen.report.validate(data, config, each) for each in (mixed, own))
+    fixed = {name: values[name] for name in of_device if name in values}
+    device = chosen.report.validate(data, config, own | _conditioned(estimate, fixed))
+    best = chosen.report.validate(data, config, own)
     return Validated(calibration, path.name, validations, False, lost, held, device, best)
 
 
-def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict[str, float]]:
-    """What the recording says of the calibration, and its own parameters; neither where it cannot be solved."""
+def _conditioned(estimate: Estimate, fixed: Mapping[str, float]) -> dict[str, float]:
+    """Values with some parameters fixed elsewhere, x + P_f P_ff^+ (fixed - x_f): the conditional mean, linearised."""
+    given = [i for i, name in enumerate(estimate.names) if estimate.sigmas[i] > 0.0 and name in fixed]
+    scale = np.where(estimate.sigmas > 0.0, estimate.sigmas, 1.0)
+    correlation = estimate.covariance[:, given] / np.outer(scale, scale[given])
+    moved = np.array([fixed[estimate.names[i]] - estimate.values[i] for i in given]) / scale[given]
+    weights = np.linalg.lstsq(correlation[given], moved, rcond=_RANK)[0]
+    return dict(zip(estimate.names, (estimate.values + scale * (correlation @ weights)).tolist(), strict=True)) | fixed
+
+
+def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, Estimate | None, dict[str, float]]:
+    """What the recording says of the calibration, and its own estimate; neither where it cannot be solved."""
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError
 
     if known.solver == "published":
-        return None, {}
+        return None, None, {}
     problem = session.problem().near(
         dict(zip(known.gaussian_prior.names, known.gaussian_prior.mean.tolist(), strict=True))
     )
@@ -159,10 +181,10 @@ def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict
         with progress.doing("solving"):
             estimate = solve_batch(problem, device=device)
     except IndeterminateError:
-        return None, {}
+        return None, None, {}
     own = problem.numbers(estimate)
     if not estimate.converged or estimate.sqrt_info is None:
         deadline.passed("the solution of this recording")
-        return None, {}
+        return None, None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
-    return check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, inflations), own
+    return check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, inflations), estimate, own

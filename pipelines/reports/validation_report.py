@@ -57,7 +57,7 @@ def validation_report(validated: Validated) -> Report:
         sections=(
             Section("Change since the calibration", _changes(validated)),
             Section("Errors before and after compensation", (_error_table(validated),)),
-            Section("Plots", (Plots(tuple(_plot(v) for v in validated.validations)),)),
+            Section("Errors over time", (Plots(tuple(map(_plot, validated.applied))),)),
         ),
     )
 
@@ -76,7 +76,7 @@ def _changes(validated: Validated) -> tuple[Block, ...]:
         unit, factor = human_unit(validated.held.quantities[step.name])
         numbers = (step.size, step.sigma, validated.held.changes.limit * step.sigma)
         change, sigma, threshold = (to_digits_of(factor * x, factor * step.sigma) for x in numbers)
-        name = Cell(step.name, method(validated.calibration.method).describe(step.name))
+        name = Cell(step.name, hint=method(validated.calibration.method).describe(step.name))
         beyond = abs(step.size) > validated.held.changes.limit * step.sigma
         drawn = Interval(step.sigma, 0.5 * validated.held.changes.limit * step.sigma, offset=step.size)
         bar = Cell("", interval=drawn, tone="bad" if beyond else "good")
@@ -91,20 +91,22 @@ def _changes(validated: Validated) -> tuple[Block, ...]:
 
 def _error_table(validated: Validated) -> Table:
     """RMS and peak of each kind of error, before and after compensation."""
-    others = [{v.name: rms(v.after) for v in each} for each in (validated.device, validated.best)]
+    others = [{v.name: rms(v.after) for v in each} for each in (validated.best, validated.validations)]
     rows = []
-    for v in validated.validations:
+    for v in validated.applied:
         unit, factor = _unit(v)
-        after = (each.get(v.name) for each in others)
-        sizes = (rms(v.before), rms(v.after), *after, peak(v.before), peak(v.after))
+        more = (each.get(v.name) for each in (others if validated.device else others[:0]))
+        sizes = (rms(v.before), rms(v.after), peak(v.before), peak(v.after), *more)
         rows.append((v.name, *("" if size is None else _three_digits(factor * size) for size in sizes), unit))
-    caption = (
-        "RMS is the root mean square. After is with the calibration as it is; device with its device parameters and "
-        "this recording's own bias, time offset and the like; expected with this recording's own calibration, which is "
-        "what one that holds would leave."
-    )
-    heads = ("RMS before", "RMS after", "RMS, device", "RMS expected", "peak before", "peak after")
-    columns = (Column(head, group=head[:3]) for head in heads)
+    heads = ["RMS before", "RMS after", "peak before", "peak after"]
+    caption = "RMS is the root mean square. Before: nothing compensated. After: with the calibration."
+    if validated.device:
+        heads += ["RMS expected", "RMS as stored"]
+        caption = (
+            f"{caption.removesuffix('.')}, its turn-on bias and the like re-estimated from this recording. "
+            "Expected: with this recording's own calibration. As stored: with the bias of the calibration too."
+        )
+    columns = (Column(head, group=head[:4]) for head in heads)
     return Table("", caption, ("error", *columns, Column("unit", "text")), tuple(rows), "errors", most_rows=None)
 
 
@@ -117,8 +119,7 @@ def _plot(validation: Validation) -> Plot:
     out = Figure(f"error, {unit}")
     for name, errors, color in (("before", validation.before, BEFORE), ("after", validation.after, COLORS[0])):
         out.points(validation.time, factor * np.linalg.norm(errors, axis=1), name, color, 3)
-    note = f" {validation.note[:1].upper()}{validation.note[1:]}." if validation.note else ""
-    caption = f"Length of the error over time, before and after compensation.{note}"
+    caption = "Length of the error over time, before and after compensation."
     return Plot(f"{validation.name[:1].upper()}{validation.name[1:]}", caption, out)
 
 

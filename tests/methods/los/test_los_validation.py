@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import alidade
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import peak, rms
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.methods.los.report import validate
 from alidade.pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
@@ -59,3 +62,16 @@ def test_outliers_are_left_out_and_counted() -> None:
     drifting, steady = validate(replace(data, error=error), Config(), {})
     assert peak(drifting.before) < 0.02
     assert "of 1000 LOS errors left out as outliers" in steady.note
+
+
+def test_turn_on_bias_is_reestimated_given_the_calibrated_device(tmp_path: Path) -> None:
+    """As stored, the error has the gyro bias of the other recording, which turns the line of sight away."""
+    short = LosScenario(duration_s=20.0, gyro_rate_hz=100.0, image_rate_hz=10.0)
+    first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    for seed, path in ((1, first), (2, second)):
+        method("los").write_data(path, *simulate_los(short, seed), los_config(short))
+    alidade.calibrate(first).write(tmp_path / "out")
+    held = alidade.validate(second, tmp_path / "out" / "calibration.yaml")
+    stored, applied, expected = (each[0] for each in (held.validations, held.device, held.best))
+    assert rms(applied.after) < 0.5 * min(rms(stored.after), rms(stored.before))
+    assert rms(applied.after) < 3.0 * rms(expected.after)
