@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines.applications.follow.guidance import View, Watch, view_of
+from alidade.pipelines.applications.follow.guidance import WAITING, View, Watch, view_of
 from alidade.pipelines.applications.follow.sources import Source
 from alidade.pipelines.applications.session import Recorded, Session
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
@@ -222,10 +222,11 @@ class Follower:
 
     def _wait(self, reason: str) -> None:
         """Say once why the recording cannot be read yet."""
-        reason = reason.removeprefix(f"{self.source.path}: ")
+        for path in (self.source.path, *self.source.parts):
+            reason = reason.removeprefix(f"{path}: ")
         if reason != self._waiting:
             self._waiting = reason
-            self._say(f"not enough yet: {reason}")
+            self._say(f"{WAITING}{reason}")
 
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""

@@ -29,6 +29,8 @@ from alidade.pipelines.solvers.incremental import IncrementalSolver
 _MOST_NAMED = 6
 # Of many parameters so many are shown, the least accurate ones.
 _MOST_SHOWN = 14
+# How a sentence begins that says why there is no estimate yet.
+WAITING = "not enough yet: "
 _BEGIN_ANEW = Motion("look what moved, and begin anew")
 
 
@@ -87,10 +89,10 @@ class View:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What to do, the most urgent first, each sentence once."""
-        advice = tuple(finding.evidence["advice"] for finding in self._directions)
+        """What to collect and then what to do, in the order of `motion`, each sentence once."""
         wanted = tuple(f"{c.what}: {c.wanted}" for c in self.checklist if c.wanted)
-        return tuple(dict.fromkeys((*advice, *wanted)))
+        advice = tuple(finding.evidence["advice"] for finding in self._directions)
+        return tuple(dict.fromkeys((*wanted, *advice)))
 
     @property
     def motion(self) -> Motion | None:

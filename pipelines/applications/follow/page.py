@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, MAX_CONNECTIONS, Attempts, Gate
-from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.applications.follow.guidance import WAITING, View
 from alidade.pipelines.applications.follow.protocol import to_json
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError
@@ -148,6 +148,8 @@ class LivePage:
     def show(self, view: View) -> None:
         """What is known by now."""
         self._remember(view)
+        if view.covariance is not None:
+            self._noted = [note for note in self._noted if not note[1].startswith(WAITING)]
         motion = view.motion
         self._tell(
             view.summary,
