@@ -89,6 +89,15 @@ class Solver(StrEnum):
     published = "published"
 
 
+_Solver = Annotated[
+    Solver,
+    typer.Option(
+        help="batch: the whole recording at once; incremental: step by step, as live; published: the algorithm of the "
+        "publication that the method is from."
+    ),
+]
+
+
 class Engine(StrEnum):
     """Linear solvers of batch."""
 
@@ -104,7 +113,10 @@ class Rate(StrEnum):
     gyro = "gyro"
 
 
-_METHODS = "los, indexer, head, cube, tumble or an installed plug-in"
+_METHODS = (
+    "What is calibrated: los (gimballed camera), indexer (rotation table), head (tracked helmet), cube (AprilTags or "
+    "static poses), tumble (turned by hand), or a plug-in"
+)
 _MethodName = Annotated[
     str | None,
     typer.Option("--method", help=f"{_METHODS} [default: from the topics].", autocompletion=_complete_method),
@@ -131,7 +143,8 @@ _Prior = Annotated[
     Path | None, typer.Option(help="Earlier calibration (result.json or calibration.yaml) used as prior.")
 ]
 _Window = Annotated[
-    str, typer.Option(help="Smoothing window of the incremental solver: seconds, keyframes (50kf) or 'all'.")
+    str,
+    typer.Option(help="The past that the incremental solver re-estimates: seconds, keyframes (50kf) or 'all'."),
 ]
 
 
@@ -148,7 +161,8 @@ _TimeLimit = Annotated[
     typer.Option(
         "--time-limit",
         min=0.1,
-        help="Time limit of the solution, s [default: 60, or a tenth of the recording; online all of it].",
+        help="Time for solving, s; then the best so far counts [default: a tenth of the recording, at least 60; "
+        "incremental: its duration].",
     ),
 ]
 _Version = Annotated[
@@ -173,7 +187,7 @@ def calibrate(
     sessions: RecordingPaths,
     method: _MethodName = None,
     config: ConfigFile = None,
-    solver: Annotated[Solver, typer.Option(help="Solver.")] = Solver.batch,
+    solver: _Solver = Solver.batch,
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for the results [default: RECORDING-SOLVER].")] = None,
     strict: _Strict = False,
@@ -183,12 +197,15 @@ def calibrate(
     prior: _Prior = None,
     no_check: _NoCheck = False,
     engine: Annotated[
-        Engine, typer.Option(help="Linear solver of batch: by chain elimination, or gtsam.")
+        Engine, typer.Option(help="Linear algebra of batch: chain elimination, or the library gtsam.")
     ] = Engine.auto,
     attitude_rate: Annotated[
-        Rate, typer.Option(help="Attitudes in attitude.tum: at those of vision, or at each gyro sample.")
+        Rate, typer.Option(help="Times of the attitudes in attitude.tum: of the pictures, or of all gyro samples.")
     ] = Rate.vision,
     time_limit: _TimeLimit = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Print all tables of the report: parameters by name, findings, diagnostics.")
+    ] = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -238,7 +255,7 @@ def calibrate(
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
             written = write_results(folder, calibration)
-    _tell(calibration, folder, written, as_json)
+    _tell(calibration, folder, written, as_json, everything)
 
 
 @app.command()
@@ -248,7 +265,7 @@ def compare(
     config: ConfigFile = None,
     window: _Window = "1",
     prior: _Prior = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for compare.html, with the split-half test.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for compare.html; compares both halves too.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     jobs: _OwnJobs = None,
@@ -258,14 +275,14 @@ def compare(
 ) -> None:
     """Compare the published, batch and incremental solver.
 
-    With errors where the truth is known, and a split-half test with --out. Exit code 0 they agree, 2 unusable input, 4
-    incremental and batch differ by more than a sigma, or the halves do.
+    Exit code 0 they agree, 2 unusable input, 4 they do not: incremental and batch differ by more than a sigma, or (with
+    --out) both halves of the recording by more than chance.
     """
     from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.comparison import compared
     from alidade.pipelines.applications.session import OpenOptions
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.comparison_report import comparison_summary
+    from alidade.pipelines.reports.comparison_report import comparison_report
     from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
@@ -277,8 +294,7 @@ def compare(
     if as_json:
         terminal.show_json(comparison.calibrations)
     else:
-        terminal.print_calibrations(comparison.calibrations)
-        terminal.say(comparison_summary(comparison).text)
+        terminal.print_report(comparison_report(comparison))
         if written is not None:
             terminal.say(f"Comparison in {written}")
     if comparison.answer == "no":
@@ -315,7 +331,7 @@ def follow(
     replay: Annotated[
         Path | None, typer.Option(help="In place of SOURCE: a finished MCAP file, played as if it were recorded now.")
     ] = None,
-    speed: Annotated[float, typer.Option(help="Of --replay, times real time.")] = 1.0,
+    speed: Annotated[float, typer.Option(help="Speed of --replay, times real time.")] = 1.0,
     record: Annotated[
         Path | None, typer.Option(help="Folder that keeps what arrives by ws:// or -; a later run appends.")
     ] = None,
@@ -325,7 +341,7 @@ def follow(
 ) -> None:
     """Calibrate while recording.
 
-    Shows the motion that is still needed. Ctrl-C finishes.
+    Shows the motion that is still needed. Ctrl-C finishes. To try it without a device: --replay RECORDING --speed 5.
     """
     from alidade.pipelines.applications.follow.follow import follow as run
     from alidade.pipelines.applications.follow.follower import Settings
@@ -558,9 +574,11 @@ def demo(
     With all three solvers; prints the path of the report.
     """
     from alidade.pipelines import progress
+    from alidade.pipelines.applications.comparison import Comparison
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.methods import simulate as simulated
     from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.comparison_report import comparison_report
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import write_results
 
@@ -573,7 +591,7 @@ def demo(
         calibrations = run(session, ["published", "batch", "incremental"])
         for calibration in progress.track(calibrations, "writing", len(calibrations)):
             write_results(out / calibration.estimate.solver, calibration)
-    terminal.print_calibrations(calibrations)
+    terminal.print_report(comparison_report(Comparison(tuple(calibrations))))
     terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
 
 
@@ -593,10 +611,12 @@ def montecarlo(
 ) -> None:
     """Monte Carlo study: are the sigmas consistent?
 
-    NEES and coverage of many simulated recordings. The same command resumes after an interruption.
+    Simulates and calibrates many recordings, and compares their errors with the sigmas (NEES, coverage). The same
+    command resumes after an interruption.
     """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study
+    from alidade.pipelines.applications.fleet.pages import study_report
     from alidade.pipelines.applications.fleet.write import write_study
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import study_json
@@ -607,11 +627,12 @@ def montecarlo(
     with progress.shown(quiet or as_json):
         study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, parse_window(window))
     written = write_study(folder, study)
-    for line in () if as_json else study.summary:
-        terminal.say(line)
     if as_json:
         print(study_json(study))
     else:
+        report = study_report(study)
+        terminal.say(report.about)
+        terminal.print_report(report)
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     if study.interrupted:
         raise typer.Exit(exit_codes.INTERRUPTED)
@@ -622,9 +643,9 @@ def fleet(
     recordings: Annotated[list[str], typer.Argument(metavar="FILES", help="Paths or patterns, 'recordings/*.mcap'.")],
     method: _MethodName = None,
     config: ConfigFile = None,
-    solver: Annotated[Solver, typer.Option(help="Solver.")] = Solver.batch,
+    solver: _Solver = Solver.batch,
     window: _Window = "1",
-    names: Annotated[str | None, typer.Option(help="Pattern of file names, '{unit}_{date}*'.")] = None,
+    names: Annotated[str | None, typer.Option(help="Unit and date in the file names, '{unit}_{date}*'.")] = None,
     prior: Annotated[
         str | None, typer.Option(help="Earlier calibrations used as priors: 'last/{unit}/result.json'.")
     ] = None,
@@ -761,14 +782,17 @@ def _file_name(source: str) -> str:
     return re.sub(r"\W+", "-", source.partition("://")[2]).strip("-") if "://" in source else source
 
 
-def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool = False) -> NoReturn:
+def _tell(
+    calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool, everything: bool = False
+) -> NoReturn:
     """Show a calibration and where its results are; its status is the exit code."""
     from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.calibration_report import calibration_report, short_report
 
     if as_json:
         terminal.show_json([calibration])
     else:
-        terminal.print_calibrations([calibration])
+        terminal.print_report((calibration_report if everything else short_report)(calibration), everything)
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     raise typer.Exit(exit_codes.OF_STATUS[calibration.status])
 

@@ -7,12 +7,11 @@ from typing import Annotated
 
 import typer
 
-RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, bag folder or quoted pattern.")]
+_WHAT = "File, bag folder, or pattern in quotes, 'run_*.mcap'."
+RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help=_WHAT)]
 RecordingPaths = Annotated[
     list[Path],
-    typer.Argument(
-        metavar="RECORDING...", help="File, bag folder or quoted pattern. Several: one device, solved jointly."
-    ),
+    typer.Argument(metavar="RECORDING...", help=f"{_WHAT} Several: one device, solved jointly."),
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML config; overrides the recording's own.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]

@@ -21,7 +21,7 @@ from alidade.pipelines.reports import sentences
 from alidade.pipelines.reports.budget import Limit, limits
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
 from alidade.pipelines.reports.export_formats import ros_parameters
-from alidade.pipelines.reports.html import Page, render_fragment, render_html
+from alidade.pipelines.reports.html import Page, render_html
 from alidade.pipelines.reports.plots import common_plots
 from alidade.pipelines.reports.report import (
     Badge,
@@ -79,15 +79,27 @@ def report_html(calibration: Calibration) -> str:
     return render_html(calibration_report(calibration))
 
 
-def notebook_html(calibration: Calibration) -> str:
-    """The verdict and the parameters as a fragment of HTML, for notebooks."""
-    verdict = f"{calibration.status}. {calibration.headline}"
-    return render_fragment(Text(verdict), _parameter_table(calibration))
+def short_report(calibration: Calibration) -> Report:
+    """What a terminal and a notebook show of a calibration: verdict, uses and results."""
+    return _report(calibration, ())
 
 
 def calibration_report(calibration: Calibration) -> Report:
     """The report of a calibration: verdict, results, use; how to apply it; diagnostics; collapsed details."""
     c, file = calibration, saved(calibration)
+    return _report(
+        c,
+        (
+            Section("Uncertainty in use", tuple(_use_card(found) for found in c.uses), printed="never"),
+            Section("Frames", _frames(c, file), printed="never"),
+            Section("Apply", _application(c, file), printed="never", narrow_collapsed=True),
+            Section("Diagnostics", _diagnostics(c), printed="on request", narrow_collapsed=True),
+            Section("Details", _details(c), printed="on request"),
+        ),
+    )
+
+
+def _report(c: Calibration, more: Sequence[Section]) -> Report:
     start = datetime.datetime.fromtimestamp(c.facts.epoch_ns // 1_000_000_000, datetime.UTC)
     about = [
         c.recording,
@@ -101,15 +113,11 @@ def calibration_report(calibration: Calibration) -> Report:
         title=f"{c.problem.method}: {c.status} ({c.recording})",
         heading=f"{c.method.title} calibration",
         about=" · ".join(about),
-        summary=_summary(c, cards),
+        summary=summary_of(c, cards),
         sections=(
             Section("", (Tiles(tuple(map(_tile, c.uses))),) if c.uses else ()),
             Section("Results", _results(c, cards)),
-            Section("Uncertainty in use", tuple(_use_card(found) for found in c.uses)),
-            Section("Frames", _frames(c, file)),
-            Section("Apply", _application(c, file), narrow_collapsed=True),
-            Section("Diagnostics", _diagnostics(c), narrow_collapsed=True),
-            Section("Details", _details(c)),
+            *more,
         ),
     )
 
@@ -135,12 +143,13 @@ def _plots(c: Calibration) -> list[Plot]:
     return [*(each for each in own if isinstance(each, Plot)), *common_plots(c)]
 
 
-def _summary(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
+def summary_of(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
     """The verdict in one sentence, what to do in another, and badges."""
     rows = [(card, group, row) for card in cards for group, row in card.rows if row.require and row.sigma > 0.0]
     worst = max(rows, key=lambda found: found[2].ratio, default=None)
     text, action = sentences.short_verdict(c.findings, c.quantities, c.verdicts, worst and _named(*worst))
-    return Summary("", c.status, _TONES[c.status], text, next_steps=(action,) if action else (), badges=_badges(c))
+    steps = (action,) if action else ()
+    return Summary("", c.status, _TONES[c.status], text, c.notes, steps, _badges(c))
 
 
 def _named(card: ResultCard, group: ResultGroup, row: ResultRow) -> sentences.Worst:
@@ -302,13 +311,10 @@ def _titled(title: str, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
 
 def _details(c: Calibration) -> tuple[Block, ...]:
     """Further details, collapsed."""
-    said = Bullets(
-        tuple(dict.fromkeys((c.headline, *(f"{note}." for note in c.notes), *sentences.next_steps(c.findings))))
-    )
     matrices = tuple(Code(text, copied=True) for text in matrix_texts(c))
     plots = tuple(_plots(c))
     parts: list[tuple[str, tuple[Block, ...]]] = [
-        ("All findings", (said,)),
+        ("All findings", (Text(c.headline, soft=False),)),
         ("Unobservable and weak directions", direction_blocks(c.findings)),
         ("Parameters", (_parameter_table(c),)),
         ("Nuisance parameters", _nuisance_parameters(c)),

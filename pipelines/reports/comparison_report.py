@@ -9,25 +9,25 @@ import numpy as np
 
 from alidade.pipelines.applications.comparison import MAX_DIFFERENCE, SIGNIFICANCE, Comparison
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
-from alidade.pipelines.display.figure import COLORS, Dash, Figure, Plot
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, signed, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
+from alidade.pipelines.reports.calibration_report import summary_of
 from alidade.pipelines.reports.html import render_html
-from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
+from alidade.pipelines.reports.plots import histories
+from alidade.pipelines.reports.report import Block, Bullets, Details, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.reports.result_json import TruthResult, truth_errors
+from alidade.pipelines.reports.result_json import truth_errors
+from alidade.pipelines.reports.results_table import result_cards
 from alidade.pipelines.reports.whole import write_page
 
 FILE = "compare.html"
+# Bars of z end here: a published solver may be hundreds of its sigmas off.
+_MAX_Z = 12.0
 # Difference of the published solver from batch that is counted, in sigmas of batch.
 _FAR = 3.0
-# Lines of the solvers, the exact ones over the published.
-_STYLES: dict[str, tuple[str, Dash]] = {
-    "published": (COLORS[1], "dotted"),
-    "batch": (COLORS[2], "dashed"),
-    "incremental": (COLORS[0], "solid"),
-}
+_COLORS = dict(zip(("incremental", "published", "batch", "halves"), COLORS, strict=False))
 
 
 def comparison_report(comparison: Comparison) -> Report:
@@ -35,18 +35,20 @@ def comparison_report(comparison: Comparison) -> Report:
     calibrations, halves = comparison.calibrations, comparison.halves
     first = calibrations[0]
     quantities = [q for q in first.problem.quantities if q.prior_sigma != 0.0]
-    plots = (*_differences(calibrations, quantities), *_convergence(calibrations, quantities))
+    online = comparison.of("incremental") or first
+    plots = tuple(histories(online))
+    over_time = (Details(f"Estimates of {online.estimate.solver} over time", (Plots(plots),), "fold"),)
     return Report(
         title=f"{first.method.title} comparison ({first.recording})",
         heading=f"{first.method.title}: solvers compared",
         about=f"{first.recording}: {', '.join(f'{c.estimate.solver} {c.status}' for c in calibrations)}",
         summary=comparison_summary(comparison),
         sections=(
-            Section("Solvers", (_comparison_table(calibrations, quantities),)),
-            Section("First and second half", _halves(first, quantities, halves)),
-            Section("Plots", (Plots(plots),)),
+            Section("Solvers", _solvers(calibrations, quantities)),
+            Section("Differences", (Plots((_differences(calibrations, quantities, halves),)),)),
+            Section("First and second half", _halves(first, quantities, halves), printed="never"),
+            Section("Over time", over_time if plots else ()),
         ),
-        style="wide",
     )
 
 
@@ -55,65 +57,57 @@ def write_compare(out_dir: Path, comparison: Comparison) -> Path:
     return write_page(out_dir, FILE, render_html(comparison_report(comparison)))
 
 
-def solver_table(calibrations: Sequence[Calibration]) -> Table:
-    """Required parameters: the truth where known, value and sigma of each solver, error over sigma."""
-    alone = len(calibrations) == 1
+def _solvers(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> tuple[Block, ...]:
+    """Verdict of each solver, the required parameters by all of them, and collapsed the nuisance parameters."""
+    verdicts = [(c, summary_of(c, result_cards(c))) for c in calibrations]
+    required = [q for q in quantities if q.judged]
+    others = [q for q in quantities if not q.judged]
+    z = "error over sigma" if _is_known(calibrations) else "difference from batch, in batch's sigmas"
+    caption = (
+        f"Value ± sigma; z: {z}. Batch solves the whole recording at once and is the one to go by; incremental as it "
+        "would live; published is the solver of the publication that the method is from."
+    )
+    blocks: list[Block] = [
+        Bullets(tuple(f"{c.estimate.solver}: {c.status}. {said.text}" for c, said in verdicts)),
+        _solver_table(calibrations, required, caption),
+    ]
+    if others:
+        blocks.append(Details("Nuisance parameters", (_solver_table(calibrations, others, ""),), "fold"))
+    return tuple(blocks)
+
+
+def _solver_table(calibrations: Sequence[Calibration], quantities: Sequence[Quantity], caption: str) -> Table:
+    """The truth where known, value and sigma of each solver, and z."""
     errors = [truth_errors(c) for c in calibrations]
-    known = any(errors)
+    known = _is_known(calibrations)
     columns: list[Column | str] = ["parameter", Column("unit", "text"), *(["truth"] if known else [])]
     for c in calibrations:
-        solver = c.estimate.solver
-        columns.append(Column("value ± sigma" if alone else solver, group=solver))
-        columns += [Column("z", group=solver)] if known else []
-    columns += [Column("verdict", "text")] if alone else []
+        columns += [Column(c.estimate.solver, group=c.estimate.solver), Column("z", group=c.estimate.solver)]
     rows: list[Row] = []
-    for q in calibrations[0].problem.quantities:
-        if not q.judged:
-            continue
+    for q in quantities:
         unit, factor = human_unit(q)
-        row: list[Cell | str] = [q.name, unit]
+        row: list[Cell | str] = [Cell(q.name, hint=calibrations[0].method.describe(q.name)), unit]
         if known:
             truth = next((found[q.name].value for found in errors if q.name in found), None)
             sigmas = [p.sigma for c in calibrations if (p := c.parameters.get(q.name)) and p.sigma > 0.0]
             row.append("" if truth is None else to_digits_of(truth * factor, min(sigmas, default=0.0) * factor))
-        for c, found in zip(calibrations, errors, strict=True):
-            row += [_estimate(c, q), *([_z(found.get(q.name))] if known else [])]
-        if alone:
-            verdict = calibrations[0].verdicts.get(q.name, "")
-            row.append(Cell(verdict, tone=verdict))
+        for c in calibrations:
+            z = _z(c, calibrations, q.name)
+            row += [_estimate(c, q), "" if z is None else signed(z)]
         rows.append(tuple(row))
-    return Table("", "z: error over sigma." if known else "", tuple(columns), tuple(rows))
+    return Table("", caption, tuple(columns), tuple(rows), style="small", most_rows=None)
 
 
-def _comparison_table(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> Table:
-    """All estimated parameters by solver: difference from batch, and error where the truth is known."""
-    batch = next((c for c in calibrations if c.estimate.solver == "batch"), None)
-    known = calibrations[0].truth is not None
-    columns: list[Column | str] = ["parameter", Column("unit", "text")]
-    rows: list[list[Cell | str]] = [
-        [Cell(q.name, hint=calibrations[0].method.describe(q.name)), human_unit(q)[0]] for q in quantities
-    ]
-    for c in calibrations:
-        solver, errors = c.estimate.solver, truth_errors(c)
-        compared = batch is not None and batch is not c
-        columns += [solver, *([f"{solver} from batch, σ"] if compared else [])]
-        columns += [f"error of {solver}, σ"] if known else []
-        for row, q in zip(rows, quantities, strict=True):
-            row.append(_estimate(c, q))
-            if compared:
-                far = _from_batch(c, calibrations, q.name)
-                row.append("" if far is None else signed(far))
-            if known:
-                row.append(_z(errors.get(q.name)))
-    caption = (
-        "Each value with its sigma, the standard deviation. Batch solves the whole recording at once and is the one to "
-        "go by; incremental as it would live; published is the solver of the publication that the method is from."
-    )
-    if len(calibrations) > 1 and batch is not None:
-        caption += ' "From batch" is the difference from batch, in batch\'s sigmas.'
-    if known:
-        caption += ' "Error" is against the truth that came with the recording, in the solver\'s own sigmas.'
-    return Table("", caption, tuple(columns), tuple(map(tuple, rows)), "solvers", "lines many", None)
+def _is_known(calibrations: Sequence[Calibration]) -> bool:
+    return any(truth_errors(c) for c in calibrations)
+
+
+def _z(c: Calibration, calibrations: Sequence[Calibration], name: str) -> float | None:
+    """Error over sigma where the truth is known, else the difference from batch in its sigmas."""
+    if not _is_known(calibrations):
+        return _from_batch(c, calibrations, name)
+    error = truth_errors(c).get(name)
+    return None if error is None else error.error_sigmas
 
 
 def _estimate(c: Calibration, q: Quantity) -> str:
@@ -122,10 +116,6 @@ def _estimate(c: Calibration, q: Quantity) -> str:
     if found is None:
         return "-"
     return _with_sigma(factor * found.value, factor * found.sigma)
-
-
-def _z(error: TruthResult | None) -> str:
-    return "" if error is None or error.error_sigmas is None else signed(error.error_sigmas)
 
 
 def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], name: str) -> float | None:
@@ -153,7 +143,8 @@ def comparison_summary(comparison: Comparison) -> Summary:
             else "Go by batch; give incremental a longer `--window`.",
         ),
     }[comparison.answer]
-    notes = (comparison.stopped.removesuffix("."),) if comparison.stopped else ()
+    stopped = (comparison.stopped.removesuffix("."),) if comparison.stopped else ()
+    notes = (*comparison.calibrations[0].facts.notes, *stopped)
     return Summary("Do the solvers and both halves agree?", comparison.answer, tone, text, notes, steps)
 
 
@@ -214,63 +205,25 @@ def _halves(c: Calibration, quantities: Sequence[Quantity], halves: Mapping[str,
         "Each half solved by itself, as if the other had not been recorded. A difference beyond three or four sigmas "
         "means that something changed, or that the model lacks something."
     )
-    return (Table("", caption, columns, tuple(rows), "halves", most_rows=None),) if rows else ()
+    return (Table("", caption, columns, tuple(rows), "halves", "small", None),) if rows else ()
 
 
-def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:
-    """Errors, or differences from batch, in sigmas."""
-    known = any(truth_errors(c) for c in calibrations)
-    y_title = "error, sigmas of each solver" if known else "difference from batch, sigmas of batch"
-    out = Figure(y_title, "", 380, x_labels=tuple(q.name for q in quantities))
-    for k, c in enumerate(calibrations):
-        errors = truth_errors(c)
-        numbers = [
-            (errors[q.name].error_sigmas if q.name in errors else None)
-            if known
-            else _from_batch(c, calibrations, q.name)
-            for q in quantities
-        ]
-        if any(number is not None for number in numbers):
-            heights = np.array([np.nan if number is None else number for number in numbers])
-            out.bars(heights, c.estimate.solver, _STYLES[c.estimate.solver][0], (k, len(calibrations)))
-    out.levels((-3.0, 3.0))
-    what = (
-        "Error of each solver in units of the sigma it states" if known else "Each solver less batch, sigmas of batch"
-    )
-    return [Plot("Differences", f"{what}; dotted are three.", out)]
-
-
-def _convergence(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:
-    """A figure a parameter: its estimate over time by every solver that has a history."""
-    plots = []
-    for q in quantities:
-        unit, factor = human_unit(q)
-        out = Figure(unit, height=260)
-        reach: list[float] = []
-        for c in calibrations:
-            history, names = c.estimate.history, c.estimate.names
-            color, dash = _STYLES[c.estimate.solver]
-            if q.name not in names:
-                continue
-            i = names.index(q.name)
-            if history is None:
-                value, sigma = (factor * float(x[i]) for x in (c.estimate.values, c.estimate.sigmas))
-                out.levels(value, color, dash, c.estimate.solver)
-                reach += [value - 4.0 * sigma, value + 4.0 * sigma]
-                continue
-            values, sigmas = factor * history.values[:, i], factor * history.sigmas[:, i]
-            if c.estimate.solver == "incremental":
-                out.band(history.time, values - sigmas, values + sigmas, color, c.estimate.solver)
-            out.line(history.time, values, c.estimate.solver, color, dash)
-            settled = history.time >= history.time[0] + 0.2 * np.ptp(history.time)
-            reach += [float(values[settled].min()), float(values[settled].max())]
-        truth = (calibrations[0].truth or {}).get(q.name)
-        if isinstance(truth, int | float):
-            out.levels(factor * truth, COLORS[6], "solid", "truth")
-            reach.append(factor * truth)
-        if reach and out.marks:
-            edge = 0.05 * (max(reach) - min(reach))
-            out.y_range = (min(reach) - edge, max(reach) + edge)
-            caption = calibrations[0].method.describe(q.name)
-            plots.append(Plot(f"{q.name} over time", f"{caption} The band is one sigma of incremental.".strip(), out))
-    return plots
+def _differences(
+    calibrations: Sequence[Calibration], quantities: Sequence[Quantity], halves: Mapping[str, SplitHalf]
+) -> Plot:
+    """z of each parameter by each solver, and of the halves."""
+    known = _is_known(calibrations)
+    bars = {c.estimate.solver: [_z(c, calibrations, q.name) for q in quantities] for c in calibrations}
+    shown = {name: heights for name, heights in bars.items() if any(z is not None for z in heights)}
+    if halves:
+        shown["halves"] = [halves[q.name].z if q.name in halves else None for q in quantities]
+    out = Figure("z", "", 420, x_labels=tuple(q.name for q in quantities))
+    for k, (name, heights) in enumerate(shown.items()):
+        out.bars(np.array([np.nan if z is None else z for z in heights]), name, _COLORS[name], (k, len(shown)))
+    out.levels((-4.0, -2.0, 2.0, 4.0))
+    largest = max((abs(z) for heights in shown.values() for z in heights if z is not None), default=0.0)
+    reach = max(4.5, min(1.1 * largest, _MAX_Z))
+    out.y_range = (-reach, reach)
+    what = "Error of each solver over its sigma" if known else "Each solver less batch, in batch's sigmas"
+    also = "; halves: second half less first, in sigmas of the difference" if halves else ""
+    return Plot("z of each parameter", f"{what}{also}. Dotted: 2 and 4; bars end at {_MAX_Z:g}.", out)

@@ -1,4 +1,4 @@
-"""A report as one HTML file that opens offline, and as a fragment for notebooks.
+"""A report as one HTML file that opens offline, and in a frame of a notebook.
 
 The page forbids itself any access to the network (Content-Security-Policy): a report seen anywhere shows what it shows
 here. Figures are drawn by BokehJS, which is in the page, compressed.
@@ -24,7 +24,7 @@ from alidade.pipelines.display.figure import PALETTE, Figure, Mark, Plot
 from alidade.pipelines.display.svg import interval_bar, svg
 from alidade.pipelines.display.table import Cell, Column, Table
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.reports.report import Block, Report, plots_of
+from alidade.pipelines.reports.report import Report, plots_of
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -65,12 +65,6 @@ class Page:
 
         write_file(Path(path), self.html)
         return Path(path)
-
-
-def render_fragment(*blocks: Block) -> str:
-    """Blocks without plots, as HTML without a style."""
-    macros = vars(environment().get_template("page.html").make_module({"report": None, "plots": ()}))
-    return "".join(macros["block"](block) for block in blocks)
 
 
 @cache

@@ -15,7 +15,7 @@ import numpy as np
 from alidade.pipelines.applications.noise import NoiseStudy, SensorNoise
 from alidade.pipelines.diagnostics.allan import allan_variance
 from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
-from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.display.figure import AXES, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
@@ -56,7 +56,12 @@ _UNITS: dict[str, dict[str, tuple[str, str, float]]] = {
 
 
 def title(sensor: SensorNoise) -> str:
-    """Topic and kind, rate and time at rest of a sensor, in a line."""
+    """Topic and kind of a sensor."""
+    return f"{sensor.topic} {_TITLES[sensor.kind]}"
+
+
+def _at_rest(sensor: SensorNoise) -> str:
+    """Rate and time at rest of a sensor, in a line."""
     count = len(sensor.rests)
     longest = float(np.ptp(sensor.rests, axis=1).max())
     rests = (
@@ -64,7 +69,7 @@ def title(sensor: SensorNoise) -> str:
         if count == 1
         else f"{count} static intervals, {length(sensor.length_s)} in all, the longest {length(longest)}"
     )
-    return f"{sensor.topic} {_TITLES[sensor.kind]}, {sensor.rate_hz:.4g} Hz, {rests}"
+    return f"{sensor.rate_hz:.4g} Hz, {rests}"
 
 
 def remarks(sensor: SensorNoise) -> list[str]:
@@ -138,7 +143,10 @@ def noise_report(study: NoiseStudy) -> Report:
     """The report of a noise analysis."""
     config = Section("For the config", (Code(section(study)[1], copied=True),))
     sensors = (
-        Section(title(sensor), (_sensor_table(sensor), Bullets(tuple(remarks(sensor))), Plots((_plot(sensor),))))
+        Section(
+            title(sensor),
+            (_sensor_table(sensor), Bullets((_at_rest(sensor), *remarks(sensor))), Plots((_plot(sensor),))),
+        )
         for sensor in study.sensors
     )
     return Report(
@@ -302,7 +310,7 @@ def _plot(sensor: SensorNoise) -> Plot:
     """Allan deviation of each axis with its interval, and the model that was fitted, dotted."""
     _, unit, factor = _UNITS[sensor.kind]["B"]
     out = Figure(f"Allan deviation, {unit}", "averaging time, s", 420, x_scale="log", y_scale="log")
-    for (axis, noise), color in zip(sensor.axes.items(), cycle(COLORS)):
+    for (axis, noise), color in zip(sensor.axes.items(), cycle(AXES)):
         tau = noise.curve.tau
         # On a logarithmic axis a bound at infinity has no place.
         high = np.where(np.isfinite(noise.high), noise.high, 10.0 * noise.curve.deviation)
@@ -311,4 +319,4 @@ def _plot(sensor: SensorNoise) -> Plot:
         out.points(tau, factor * noise.curve.deviation, axis, color)
         out.line(tau, factor * np.sqrt(allan_variance(tau, noise.fit.squares)), axis, color, "dotted", shown=False)
     caption = "Overlapping Allan deviation with its 95 % interval; dotted: as the coefficients have it."
-    return Plot(title(sensor), caption, out)
+    return Plot(f"Allan deviation of {title(sensor)}", caption, out)

@@ -31,7 +31,7 @@ def plan_report(plan: Plan) -> Report:
             Section("Parameters", (_parameter_table(plan),)),
             Section("Unobservable and weak directions", direction_blocks(plan.now.directions)),
             Section("Plots", (Plots((_plot(plan),)),)),
-            Section("The better motion" if plan.steps else "The motion", motion, page_only=True),
+            Section("The better motion", motion if plan.steps else (), printed="never"),
         ),
     )
 
@@ -50,7 +50,7 @@ def _parameter_table(plan: Plan) -> Table:
         verdict = plan.now.verdicts[q.name]
         cells: Row = (unit, *(rounded(factor * sigma) for sigma in sigmas), Cell(verdict, tone=verdict))
         largest = f"{source}, {100.0 * share:.0f} %" if source else ""
-        rows.append((Cell(q.name, method.describe(q.name)), *cells, largest))
+        rows.append((Cell(q.name, hint=method.describe(q.name)), *cells, largest))
     columns: Columns = (
         *("parameter", Column("unit", "text"), "required", "predicted"),
         *changed,
@@ -88,6 +88,8 @@ def _plot(plan: Plan) -> Plot:
         sigmas = prediction.sigmas
         out.bars([min(sigmas[q.name] / q.require, _MAX_RATIO) for q in shown], name, color, (i, len(sides)))
     out.levels(1.0)
+    largest = max((mark.columns["high"].max() for mark in out.marks if "high" in mark.columns), default=0.0)
+    out.y_range = (0.0, 1.05 * max(1.0, float(largest)))
     caption = (
         "Over those required: below the dotted line a parameter is as accurate as required. "
         f"Bars end at {_MAX_RATIO:g}."

@@ -30,7 +30,7 @@ def common_plots(calibration: Calibration) -> list[Plot]:
     """Estimates over time, residuals or innovations, correlations."""
     estimate = calibration.estimate
     history = estimate.history
-    plots = _histories(calibration, history) if history is not None and len(history.time) else []
+    plots = histories(calibration)
     if calibration.learning and history is not None:
         plots.append(_learning(calibration, history))
     for family, residuals in estimate.residuals.items():
@@ -114,8 +114,11 @@ def variables(calibration: Calibration) -> list[tuple[str, str, list[Quantity]]]
     return found
 
 
-def _histories(calibration: Calibration, history: History) -> list[Plot]:
-    """One figure per variable: its numbers over time with a band of one sigma."""
+def histories(calibration: Calibration) -> list[Plot]:
+    """One figure per variable: its numbers over time with a band of one sigma; none without a history."""
+    history = calibration.estimate.history
+    if history is None or not len(history.time):
+        return []
     column = {name: i for i, name in enumerate(calibration.estimate.names)}
     plots = []
     for title, _, members in variables(calibration):

@@ -166,11 +166,11 @@ Block = (
 
 @dataclass(frozen=True)
 class Section:
-    """Blocks under a heading; `page_only`: not in a terminal; `narrow_collapsed`: collapsed on a phone."""
+    """Blocks under a heading; `printed`: whether in a terminal, `narrow_collapsed`: collapsed on a phone."""
 
     title: str
     blocks: tuple[Block, ...]
-    page_only: bool = False
+    printed: Literal["always", "on request", "never"] = "always"
     narrow_collapsed: bool = False
 
 
@@ -184,7 +184,7 @@ class Report:
         about: the line below the heading.
         sections: in their order; those without blocks are left out.
         summary: what comes first.
-        style: of the page, "wide" for large tables.
+        style: of the page.
     """
 
     title: str
@@ -192,7 +192,7 @@ class Report:
     about: str
     sections: tuple[Section, ...]
     summary: Summary | None = None
-    style: Literal["", "wide", "certificate"] = ""
+    style: Literal["", "certificate"] = ""
 
 
 def plots_of(blocks: Sequence[Block]) -> list[Plot]:

@@ -303,16 +303,18 @@ class Calibration(SensorValues):
         return f"<Calibration {self.method.name}, {self.estimate.solver}, of {self.recording}: {self.status}>"
 
     def __str__(self) -> str:
-        """The table and the verdict, as the command prints them."""
+        """Verdict, uses and results, as the command prints them."""
+        from alidade.pipelines.reports.calibration_report import short_report
         from alidade.pipelines.reports.terminal import as_text
 
-        return as_text([self])
+        return as_text(short_report(self))
 
     def _repr_html_(self) -> str:
-        """The table for notebooks."""
-        from alidade.pipelines.reports.calibration_report import notebook_html
+        """Verdict, uses and results for notebooks, as the report has them."""
+        from alidade.pipelines.reports.calibration_report import short_report
+        from alidade.pipelines.reports.html import Page, render_html
 
-        return notebook_html(self)
+        return Page(render_html(short_report(self)))._repr_html_()
 
     @property
     def config_text(self) -> str:

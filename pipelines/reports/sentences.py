@@ -28,15 +28,10 @@ _MAX_NAMED = 3
 # Ratio of sandwich to nominal sigma from which on it is a warning.
 SLOW_ERROR_WARNING = 2.0
 _DIRECTIONS = {Severity.UNOBSERVABLE: "Not observable", Severity.WEAK: "Less accurate than required"}
-_NEXT = {
-    "calibrated": (
-        "Apply it: formulas, Python, C and ROS parameters are below, under Apply.",
-        "Later, `alidade validate RECORDING --calibration calibration.yaml` says whether it still holds.",
-    ),
-    "weak": ("Parameters that are observable can be applied as they are; for the others record again.",),
-    "unobservable": ("Record again with that; do not apply what is not observable.",),
-    "inconsistent": ("Do not apply it before the cause is found: see Goodness of fit below.",),
-}
+_APPLY = (
+    "Apply calibration.yaml; later, `alidade validate RECORDING --calibration calibration.yaml` says "
+    "whether it still holds."
+)
 _WALK = "Calibrate the recordings after the last change together, or let the parameter walk: `share` in the config."
 _CHECK = {
     "corner_px": "camera_info (lens, size and rectification of the pictures) and the layout of the tags",
@@ -96,13 +91,15 @@ def short_verdict(
     state = status(findings)
     if state == "inconsistent" or any(finding.kind == "not_converged" for finding in findings):
         first = next(f for f in findings if f.severity > Severity.NOTE)
+        if first.kind in ("device_change", "recordings_disagree"):
+            return sentence(first, quantities), _WALK
         what = [" ".join(cause(f, quantities) or ()) for f in findings if f.kind in _CAUSES and f is not first][:1]
         probable = f" {what[0]}." if what and first.kind not in _CAUSES else ""
         return sentence(first, quantities), f"Do not use the values before the cause is found.{probable}"
     if state == "calibrated":
         closest = f"; the closest is {worst.name}, at {100.0 * worst.ratio:.2g} % of the requirement" if worst else ""
         text = f"All {len(required)} required parameters are within their required accuracy{closest}."
-        return text, _NEXT["calibrated"][1].replace("Later, `", "Apply calibration.yaml; later, `")
+        return text, _APPLY
     directions = sum(f.kind == "direction" and f.severity == Severity.UNOBSERVABLE for f in findings)
     if state == "weak" or not directions:
         where = f", worst {worst.name}: ± {worst.sigma} {worst.unit} where {worst.require} is required" if worst else ""
@@ -120,13 +117,6 @@ def notes(findings: Sequence[Finding], quantities: Quantities) -> tuple[str, ...
     """What a reader must know beside the headline, sentences without full stops."""
     found = _sentences([finding for finding in findings if finding.severity == Severity.NOTE], quantities)
     return tuple(text.removesuffix(".") for text in found)
-
-
-def next_steps(findings: Sequence[Finding]) -> tuple[str, ...]:
-    """What to do now, sentences."""
-    advice = [f"{capital(what)} ({labels})." for labels, what in by_advice(findings)]
-    walk = [_WALK] if any(finding.kind in ("device_change", "recordings_disagree") for finding in findings) else []
-    return (*advice, *walk, *_NEXT[status(findings)])
 
 
 def sentence(finding: Finding, quantities: Quantities) -> str:

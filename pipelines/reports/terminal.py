@@ -15,14 +15,12 @@ from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
 from alidade.pipelines.display.table import Cell, Column, Table
-from alidade.pipelines.display.units import rounded
 from alidade.pipelines.errors import printable
-from alidade.pipelines.reports.report import Block, Bullets, Code, Report, Tables
+from alidade.pipelines.reports.report import Block, Bullets, Card, Code, Details, Heading, Report, Tables, Text, Tiles
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.table_discovery import Columns
-    from alidade.pipelines.estimation.finding import Finding
     from alidade.pipelines.recording.info import SessionFacts
     from alidade.pipelines.reports.result import Calibration
 
@@ -55,29 +53,56 @@ def say(text: str) -> None:
     console.print(escape(printable(text, _MAX_LINE)), soft_wrap=True)
 
 
-def print_report(report: Report) -> None:
-    """Print the tables and lists of a report, then its summary, then what is to be copied."""
-    sections = [section for section in report.sections if section.blocks and not section.page_only]
+def print_report(report: Report, everything: bool = False) -> None:
+    """Print the summary of a report, its tables and lists, and last what is to be copied.
+
+    Args:
+        report: to print.
+        everything: also what a page collapses, and sections that are printed on request.
+    """
+    summary = report.summary
+    if summary is not None:
+        answered = f"{summary.question} {summary.answer}. {summary.text}".lstrip()
+        _paragraph(answered, f"{summary.answer}.", f"bold {COLOURS[summary.tone]}")
+        for line in (*(f"note: {note}" for note in summary.notes), *summary.next_steps):
+            _paragraph(f"  {line}")
+        if summary.badges:
+            _paragraph(f"  {' · '.join(badge.text for badge in summary.badges)}")
+        console.print()
+    asked = ("always", "on request") if everything else ("always",)
+    sections = [section for section in report.sections if section.blocks and section.printed in asked]
     for section in sections:
-        _print_blocks(section.title, section.blocks)
-    if report.summary is not None:
-        say(report.summary.text.replace("`", ""))
-        for note in report.summary.notes:
-            say(f"  note: {note}")
-        for step in report.summary.next_steps:
-            say(f"  {step.replace('`', '')}")
+        _print_blocks(section.title, section.blocks, everything)
     for code in (block for section in sections for block in section.blocks if isinstance(block, Code)):
         for line in code.text.splitlines():
             say(line)
 
 
-def _print_blocks(title: str, blocks: Sequence[Block]) -> None:
-    """Print those that a terminal can show, under their heading."""
-    shown = [block for block in blocks if isinstance(block, (Table, Tables, Bullets))]
-    if title and shown:
+def _paragraph(text: str, marked: str = "", style: str = "") -> None:
+    """Print a sentence, broken at words where a person reads it; the words that are marked are in a style."""
+    text = printable(text.replace("`", ""), _MAX_LINE)
+    indent = " " * (len(text) - len(text.lstrip()) + 2)
+    width = min(console.width, _SENTENCE) if console.is_terminal else _MAX_LINE
+    lines = textwrap.wrap(text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    for i, line in enumerate(lines):
+        shown = RichText(line)
+        if marked and not i:
+            shown.highlight_words([marked], style)
+        console.print(shown, soft_wrap=True)
+
+
+def _print_blocks(title: str, blocks: Sequence[Block], everything: bool) -> None:
+    """Print those that a terminal can show, under their heading; what a page collapses only if everything is asked."""
+    kinds = (Heading, Text, Table, Tables, Bullets, Tiles, *((Card, Details) if everything else ()))
+    shown = [block for block in blocks if isinstance(block, kinds) and not (isinstance(block, Text) and block.soft)]
+    if title and shown and not all(isinstance(block, Tables) for block in shown):
         say(title)
     for block in shown:
         match block:
+            case Heading(text):
+                say(text)
+            case Text(text):
+                _paragraph(f"  {text}")
             case Table():
                 print_table(block)
             case Tables(tables):
@@ -85,59 +110,76 @@ def _print_blocks(title: str, blocks: Sequence[Block]) -> None:
                     print_table(table)
             case Bullets(items):
                 for item in items:
-                    say(f"  {item.replace('`', '')}")
+                    _paragraph(f"  {item}")
+            case Tiles(tiles):
+                rows = tuple((tile.label, f"{tile.figure} {tile.unit}", tile.note) for tile in tiles)
+                print_table(Table("", "", ("", "", Column("", "text")), rows))
+            case Card(inner, heading) | Details(heading, inner):
+                _print_blocks(heading, inner, everything)
 
 
 def print_table(table: Table) -> None:
     """Print a table; groups of columns that the terminal is too narrow for follow below, the other columns repeated."""
+    if table.title and table.style != "results":  # those have it above their first column
+        say(table.title)
     shown = [i for i, head in enumerate(table.heads) if head.kind != "drawing"]
     groups = {head.group: [i for i in shown if table.heads[i].group == head.group] for head in table.heads}
     shared = groups.pop("", [])
     parts: list[list[int]] = [[]]
     for group in groups.values():
-        if parts[-1] and _width(_rich(table, [*shared, *parts[-1], *group])) > console.width:
+        if parts[-1] and _width(rich_table(table, [*shared, *parts[-1], *group])) > console.width:
             parts.append([])
         parts[-1] += group
     for part in parts:
-        drawn = _rich(table, sorted([*shared, *part]))
+        drawn = rich_table(table, sorted([*shared, *part]))
         if not any(head.kind == "prose" for head in table.heads):
             drawn.width = _width(drawn)  # no number is broken or left out, however narrow the terminal
         console.print(drawn, soft_wrap=True)
+        for heading in (row[0] for row in table.cells if len(row) == 1 and row[0].small):
+            say(f"{heading.text}: {heading.small}")
         console.print()
     if groups and table.caption:
-        say(table.caption)
+        _paragraph(table.caption)
 
 
-def _rich(table: Table, columns: Sequence[int]) -> RichTable:
-    """The table with some of its columns, the names of the rows to the left."""
-    out = RichTable(box=SIMPLE_HEAD, header_style="bold", pad_edge=False, show_edge=False)
+def rich_table(table: Table, columns: Sequence[int] | None = None) -> RichTable:
+    """The table with some of its columns (None: all), the names of the rows to the left."""
+    columns = range(len(table.heads)) if columns is None else columns
+    named = any(head.head for head in table.heads)
+    out = RichTable(box=SIMPLE_HEAD, header_style="bold", pad_edge=False, show_edge=False, show_header=named)
     for i in columns:
         head = table.heads[i]
         justify: Literal["left", "right"] = "right" if i and head.kind == "number" else "left"
         out.add_column(head.head, justify=justify, no_wrap=head.kind != "prose", overflow="fold")
-    for row in table.cells:
-        row = row if len(row) > 1 else (*row, *(Cell(""),) * (len(table.heads) - 1))
-        out.add_row(*(RichText(printable(row[i].text, _MAX_LINE), COLOURS.get(row[i].tone, "")) for i in columns))
+    heading, alone = "", False
+    for k, row in enumerate(table.cells):
+        if len(row) == 1 < len(table.heads):
+            heading, alone = row[0].text, all(len(after) == 1 for after in table.cells[k + 2 : k + 3])
+            continue
+        texts = [heading if alone else _under(heading, row[0].text), *(_with_verdict(cell) for cell in row[1:])]
+        out.add_row(*(RichText(printable(texts[i], _MAX_LINE), COLOURS.get(row[i].tone, "")) for i in columns))
     return out
+
+
+def _under(heading: str, name: str) -> str:
+    """The name of a row with the heading above it: "x" under "Bias, mg" is "Bias x, mg"."""
+    what, comma, unit = heading.rpartition(", ")
+    return f"{what if comma else unit} {name}{comma}{unit if comma else ''}".strip()
+
+
+def _with_verdict(cell: Cell) -> str:
+    """The text of a cell; with its verdict, where that is a mark."""
+    return f"{cell.text} {cell.tone}" if cell.tone and cell.hint else cell.text
 
 
 def _width(table: RichTable) -> int:
     return Measurement.get(console, console.options.update(max_width=_MAX_LINE), table).maximum
 
 
-def print_calibrations(calibrations: Sequence[Calibration]) -> None:
-    """Print one table of all solvers, then the verdict of each."""
-    from alidade.pipelines.reports.comparison_report import solver_table
-
-    print_table(solver_table(calibrations))
-    for calibration in calibrations:
-        _print_verdict(calibration, name=len(calibrations) > 1)
-
-
-def as_text(calibrations: Sequence[Calibration]) -> str:
-    """The text that `print_calibrations` prints, without colours."""
+def as_text(report: Report) -> str:
+    """The text that `print_report` prints, without colours."""
     with console.capture() as capture:
-        print_calibrations(calibrations)
+        print_report(report)
     return RichText.from_ansi(capture.get()).plain.rstrip()
 
 
@@ -220,39 +262,3 @@ def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
     for method, missing in facts.missing.items():
         if missing and method not in whole:
             _say_wrapped(f"{method}: missing {_TYPE.sub('', '; '.join(missing))}")
-
-
-def _print_verdict(calibration: Calibration, name: bool) -> None:
-    published = calibration.estimate.solver == "published"
-    solver = f"{calibration.estimate.solver}: " if name else ""
-    headline, status = calibration.headline, calibration.status
-    if published and calibration.directions:
-        # The published solvers know their own model only, so they give no advice.
-        short = [p.name for p in calibration.parameters.values() if p.observability in ("weak", "unobservable")]
-        headline = f"By its own sigmas less accurate than required: {', '.join(short)}."
-    console.print(f"{solver}[bold {COLOURS[status]}]{status}.[/] {escape(headline)}", soft_wrap=True)
-    _print_directions(() if published else calibration.directions)
-    for note in calibration.notes:
-        say(f"  note: {note}")
-    for line in _uses(calibration) if not name else ():
-        say(f"  {line}")
-
-
-def _uses(calibration: Calibration) -> list[str]:
-    """Error before and after calibration, a line a use."""
-    uses = calibration.uses
-    width = max((len(found.use.label) for found in uses), default=0)
-    return [
-        f"{found.use.label:{width}}  {rounded(found.before, 3)} {found.use.unit} before, "
-        f"{'± ' if found.use.signed else ''}{rounded(found.after)} {found.use.unit} after (95 %)"
-        for found in uses
-    ]
-
-
-def _print_directions(directions: Sequence[Finding]) -> None:
-    """Print a line a direction: verdict, parameters, advice."""
-    from alidade.pipelines.reports.sentences import label
-
-    for direction in directions:
-        e = direction.evidence
-        say(f"  {direction.severity.name.lower()}: {label(e['weights'])}: {e['advice']}")

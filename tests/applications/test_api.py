@@ -82,9 +82,9 @@ def test_a_file_its_data_and_its_arrays_give_the_same_calibration(
 
 def test_a_calibration_shows_itself_and_writes_itself(calibration: alidade.Calibration, tmp_path: Path) -> None:
     assert repr(calibration) == "<Calibration head, batch, of arrays: calibrated>"
-    assert "time_offset" in str(calibration)
+    assert "Delay of the pictures, ms" in str(calibration)
     assert "calibrated." in str(calibration)
-    assert "<td>time_offset<small>" in calibration._repr_html_()
+    assert "Delay of the pictures" in calibration._repr_html_()
     assert calibration.status == "calibrated"
     assert calibration.headline == "7 of 7 parameters meet the required accuracy."
     assert calibration.covariance.shape == 2 * (len(calibration.parameters),)

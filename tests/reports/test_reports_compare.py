@@ -37,7 +37,7 @@ def test_differences_are_in_sigmas_of_batch() -> None:
     assert page.loaded == []
     estimated = [q for q in solvers()[0].problem.quantities if q.prior_sigma != 0.0]
     assert page.text.count("+2.0") == len(estimated)
-    assert "error of" not in page.text
+    assert "difference from batch" in page.text
     assert "no Batch and incremental differ by 2.0 sigma" in page.text
     assert "Neither half determines a parameter by itself." in page.text
 
@@ -57,7 +57,7 @@ def test_answer_is_no_where_incremental_is_more_than_a_sigma_from_batch_or_halve
 def test_truth_halves_and_held_out_measurements_are_told() -> None:
     halves = {"time_offset": SplitHalf(0.010, 0.003, 0.020, 0.004)}
     page = Page(page_of(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
-    assert "error of batch, σ" in page.text
+    assert "z: error over sigma" in page.text
     assert "Both halves agree in all 1 parameters: 2.0 sigma at most" in page.text
     assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
     assert "predicted to 1.06 (vision) of their sigmas" in page.text

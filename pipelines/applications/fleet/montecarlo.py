@@ -69,22 +69,6 @@ class Study:
     kept: int
     interrupted: bool
 
-    @property
-    def summary(self) -> list[str]:
-        """A line a solver: mean NEES with its interval, coverage; and what is missing."""
-        lines = [f"{len(self.results)} of {self.seeds} runs, {self.kept} from an earlier run"]
-        for solver in self.solvers:
-            if self.estimates(solver):
-                n = self.nees(solver)
-                shares = " ".join(f"{100.0 * share:.1f} %" for share in statistics.coverage(self.normalised(solver)))
-                verdict = "inside" if n.consistent else "outside"
-                lines.append(
-                    f"{solver}: mean NEES {n.mean:.3f} of {n.dof:g} parameters, {verdict} its 99 % interval "
-                    f"{n.low:.3f} to {n.high:.3f}; within 1, 2, 3 sigmas {shares}"
-                )
-            lines += [f"{solver}: seed {seed}: {reason}" for seed, reason in self.failures(solver).items()]
-        return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
-
     def estimates(self, solver: str) -> list[RunResult]:
         """The results of the runs in which this solver came to an estimate whose truth is known."""
         return [run[solver] for run in self.results.values() if solver in run and run[solver].get("dof")]

@@ -15,7 +15,7 @@ from alidade.pipelines.applications.fleet.analysis import Population, iso
 from alidade.pipelines.applications.fleet.attention import Unit, readable, sentence, units_of_interest
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component
-from alidade.pipelines.display.figure import COLORS, REJECTED, Figure, Plot, Shape, milliseconds, thin
+from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot, Shape, milliseconds, thin
 from alidade.pipelines.display.table import Cell, Column, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.problem import Array, Quantity
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _MOST_LISTED = 200
 _MONTH = 30.0
 _MOST_BARS = 60
+# Recordings of a plot in which lines join those of a unit; more would hide the points.
+_MOST_JOINED = 1000
 
 
 def fleet_report(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> Report:
@@ -53,7 +55,6 @@ def fleet_report(outcome: Outcome, fleet: Sequence[Population], found: Sequence[
             Section("Parameters", (_parameter_table(fleet),)),
             Section("Parameters over time", (Plots(tuple(map(_population_plot, fleet))),) if fleet else ()),
         ),
-        style="wide",
     )
 
 
@@ -61,7 +62,8 @@ def study_report(study: Study) -> Report:
     """The report of a Monte Carlo study."""
     solvers = [solver for solver in study.solvers if study.estimates(solver)]
     interrupted = " (interrupted: the same command continues)" if study.interrupted else ""
-    plots = tuple(plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver)))
+    own = [solver for solver in solvers if solver != "published"] or solvers
+    plots = tuple(plot for solver in own for plot in (_nees_plot(study, solver), _errors_plot(study, solver)))
     failures = (
         Section(
             f"{solver}: {len(seeds)} runs without an estimate",
@@ -73,12 +75,12 @@ def study_report(study: Study) -> Report:
     return Report(
         title=f"{study.method}: {study.scenario}",
         heading=f"{method(study.method).title}: {study.scenario}, simulated {len(study.results)} times",
-        about=f"{len(study.results)} of {study.seeds} runs{interrupted}",
-        summary=_consistency(study, solvers),
+        about=f"{len(study.results)} of {study.seeds} runs, {study.kept} from an earlier run{interrupted}",
+        summary=_consistency(study, own),
         sections=(
             Section("Consistency", (_consistency_table(study, solvers),)),
             *failures,
-            Section("Parameters", (_accuracy_table(study, solvers),)),
+            Section("Parameters", (_accuracy_table(study, solvers),), printed="never"),
             Section("Distributions", (Plots(plots),) if plots else ()),
         ),
     )
@@ -162,7 +164,7 @@ def _parameter_row(p: Population, several: bool) -> tuple[Cell | str, ...]:
         drift = f"{to_digits_of(slope, slope_sigma)} ± {rounded(slope_sigma)}"
     outlying, changed = int(p.outlying.sum()), len({p.units[i] for i in np.flatnonzero(p.changed)})
     return (
-        Cell(p.name, method(p.method).describe(p.name)),
+        Cell(p.name, hint=method(p.method).describe(p.name)),
         *((p.method,) if several else ()),
         *("device" if p.of_device else "recording", unit, str(len(p.values)), centre),
         *(_component(p.population, factor), _component(p.repeatability, factor), rounded(sigma), limits, beyond),
@@ -196,15 +198,29 @@ def _population_plot(p: Population) -> Plot:
     if p.spread and p.control:
         out.levels(factor * p.spread.centre, dash="solid")
         out.levels(factor * np.array(p.control), dash="dashed")
-    caption = f"{len(p.values)} recordings of {len(set(p.units))} units, with one sigma each"
+    if len(p.values) <= _MOST_JOINED:
+        out.line(*_joined(p, factor), color=PALE, width=1.0)
+    low, high = (factor * (p.values + k * p.sigmas) for k in (-2.0, 2.0))
+    reach = np.concatenate([low, high, factor * np.array((p.spread and p.control) or ())])
+    edge = 0.05 * np.ptp(reach)
+    out.y_range = (float(reach.min() - edge), float(reach.max() + edge))
+    caption = f"{len(p.values)} recordings of {len(set(p.units))} units, ± 2 sigmas, those of a unit joined"
     limits = "; dashed are the control limits, three standard deviations about the centre" if p.spread else ""
     return Plot(f"{p.name} ({p.method})", f"{caption}{limits}.", out, (counts,))
+
+
+def _joined(p: Population, factor: float) -> tuple[Array, Array]:
+    """Dates, ms, and values of the recordings, unit by unit in the order of time, a gap between units."""
+    order = sorted(range(len(p.values)), key=lambda i: (p.units[i], p.dates[i]))
+    dates, values = milliseconds(iso(p.dates[i]) for i in order), factor * p.values[order]
+    gaps = [k for k in range(1, len(order)) if p.units[order[k]] != p.units[order[k - 1]]]
+    return np.insert(dates, gaps, np.nan), np.insert(values, gaps, np.nan)
 
 
 def _add_recordings(out: Figure, p: Population, some: Any, factor: float, name: str, color: str) -> None:
     dates = milliseconds(iso(p.dates[i]) for i in some)
     values, sigmas = factor * p.values[some], factor * p.sigmas[some]
-    out.segments(dates, values - sigmas, dates, values + sigmas, color, name)
+    out.segments(dates, values - 2.0 * sigmas, dates, values + 2.0 * sigmas, color, name)
     shape: Shape = "x" if color == REJECTED else "circle"
     out.points(dates, values, name, color, 6, shape=shape, texts=[f"{p.units[i]}, {p.recordings[i]}" for i in some])
 
@@ -224,9 +240,7 @@ def _add_counts(
 def _consistency(study: Study, solvers: Sequence[str]) -> Summary:
     """Whether the sigmas are consistent; those of the published solver, which are not ours, count where it is alone."""
     question = "Are the sigmas consistent?"
-    judged = {solver: study.nees(solver) for solver in solvers if solver != "published"} or {
-        solver: study.nees(solver) for solver in solvers
-    }
+    judged = {solver: study.nees(solver) for solver in solvers}
     if not judged:
         steps = ("See below why the runs failed.",)
         return Summary(question, "cannot say", "fixed", "No run gave an estimate.", (), steps)
@@ -284,7 +298,7 @@ def _accuracy_table(study: Study, solvers: Sequence[str]) -> Table:
             bias = f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {rounded(factor * a.bias_sigma)}"
             rows.append(
                 (
-                    *(Cell(name, method(study.method).describe(name)), solver, unit),
+                    *(Cell(name, hint=method(study.method).describe(name)), solver, unit),
                     Cell(bias, tone="bad" if abs(a.bias) > 3.0 * a.bias_sigma else ""),
                     *(rounded(factor * a.rms, 3), rounded(factor * a.sigma, 3), f"{a.rms / a.sigma:.3g}"),
                     *_shares(a.coverage),

@@ -6,16 +6,15 @@ import time
 from types import TracebackType
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, Group
 from rich.live import Live
 from rich.markup import escape
-from rich.table import Table
 from rich.text import Text
 
 from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.display.table import Cell, Column, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
-from alidade.pipelines.reports.terminal import COLOURS
+from alidade.pipelines.reports.terminal import rich_table
 
 # Readers want four light modules around the code; the encoder leaves two.
 _QUIET = 2
@@ -61,48 +60,35 @@ class Screen:
         now = time.monotonic()
         if now - self._last >= _LINE or view.headline != self._headline:
             self._last, self._headline = now, view.headline
-            wanted = f"; next: {view.missing[0]}" if view.missing and not view.done else ""
+            wanted = f"; next: {view.motion.advice}" if view.motion else ""
             self.say(f"{view.time:.1f} s: {view.headline}{wanted}")
 
 
 def _page(view: View) -> Group:
     headline = Text(f"{view.time:.1f} s: {view.headline}", style="bold green" if view.done else "bold")
-    parts: list[RenderableType] = [headline, _parameters(view), _collected(view)]
-    if not view.done:
-        parts += [Text(f"- {sentence}") for sentence in view.missing]
-    return Group(*parts)
+    motion = [Text(f"next: {view.motion.advice}", style="bold")] if view.motion else []
+    return Group(headline, *motion, *map(rich_table, (_parameters(view), _collected(view))))
 
 
 def _parameters(view: View) -> Table:
-    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    table.add_column("parameter", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
-    for column in ("value", "sigma", "required"):
-        table.add_column(column, justify="right", no_wrap=True)
-    table.add_column("verdict", no_wrap=True)
+    rows: list[Row] = []
     for i in view.shown:
         q = view.quantities[i]
         unit, factor = human_unit(q)
-        required = rounded(factor * q.require)
-        if view.values is None or view.sigmas is None:
-            table.add_row(q.name, unit, "", "", required, "")
-            continue
-        sigma, verdict = float(view.sigmas[i]), view.verdicts[q.name]
-        value = to_digits_of(factor * float(view.values[i]), factor * sigma)
-        table.add_row(q.name, unit, value, rounded(factor * sigma), required, f"[{COLOURS[verdict]}]{verdict}[/]")
-    if len(view.shown) < len(view.estimated):
-        table.caption = f"the least accurate of {len(view.estimated)} parameters"
-    return table
+        known = ("", "")
+        if view.values is not None and view.sigmas is not None:
+            sigma = factor * float(view.sigmas[i])
+            known = to_digits_of(factor * float(view.values[i]), sigma), rounded(sigma)
+        verdict = view.verdicts.get(q.name, "")
+        rows.append((q.name, unit, *known, rounded(factor * q.require), Cell(verdict, tone=verdict)))
+    few = f", the least accurate of {len(view.estimated)}" if len(view.shown) < len(view.estimated) else ""
+    columns = (f"parameter{few}", Column("unit", "text"), "value", "sigma", "required", Column("verdict", "text"))
+    return Table("", "", columns, tuple(rows))
 
 
 def _collected(view: View) -> Table:
-    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    table.add_column("collected", no_wrap=True)
-    table.add_column("so far")
-    table.add_column("still wanted")
-    for c in view.checklist:
-        table.add_row(c.what, c.have, c.wanted or "[green]enough[/]")
-    return table
+    rows = tuple((c.what, c.have, c.wanted or Cell("enough", tone="good")) for c in view.checklist)
+    return Table("", "", ("collected", Column("so far", "text"), Column("still wanted", "text")), rows)
 
 
 def qr(address: str) -> Text:

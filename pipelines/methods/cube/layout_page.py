@@ -104,7 +104,7 @@ def layout_report(layout: Layout, recordings: Sequence[str]) -> Report:
         about=", ".join(recordings),
         summary=Summary("Are all tags located?", answer, tone, f"{headline(layout)}.", (), (*steps, apply)),
         sections=(
-            Section("Not placed", (Bullets(unplaced),) if unplaced else (), page_only=True),
+            Section("Not placed", (Bullets(unplaced),) if unplaced else (), printed="never"),
             Section("Plots", (Plots((_picture(layout), _bars(layout))),)),
             Section("Tag by tag", (_tag_table(layout),)),
             Section("Cameras", _cameras(layout)),

@@ -123,7 +123,7 @@ def test_study_goes_on_and_sums_up(
     assert alidade(monkeypatch, *common, "--runs", 6, "--out", out) == 0
     said = capsys.readouterr().out
     assert "6 of 6 runs, 4 from an earlier run" in said
-    assert "batch: mean NEES" in said
+    assert "batch has a mean NEES of" in said
     assert alidade(monkeypatch, *common, "--runs", 6, "--out", out, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.montecarlo/1", 6, False)
