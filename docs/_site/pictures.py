@@ -195,6 +195,8 @@ def _looks(tab: Tab, url: str, scratch: Path) -> list[Image.Image]:
     screens = [_screen(tab, url, look, scratch) for look in (_DESKTOP, _PHONE)]
     tab.size(_DESKTOP[0])
     tab.open(url)
+    tab.wait("document.readyState == 'complete'", 60.0)
+    tab.value("for (const fold of document.querySelectorAll('details')) fold.open = true")
     tab.wait(_DRAWN, 60.0)
     tab.pdf(scratch / "page.pdf")
     sheet = scratch / "sheet"
