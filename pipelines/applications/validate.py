@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -153,7 +153,7 @@ def validate(
     return Validated(calibration, path.name, validations, False, lost, held, device, best)
 
 
-def _conditioned(estimate: Estimate, fixed: Mapping[str, float]) -> dict[str, float]:
+def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float]:
     """Values with some parameters fixed elsewhere, x + P_f P_ff^+ (fixed - x_f): the conditional mean, linearised."""
     given = [i for i, name in enumerate(estimate.names) if estimate.sigmas[i] > 0.0 and name in fixed]
     scale = np.where(estimate.sigmas > 0.0, estimate.sigmas, 1.0)

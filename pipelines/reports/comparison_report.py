@@ -16,7 +16,7 @@ from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports.calibration_report import summary_of
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plots import histories
-from alidade.pipelines.reports.report import Block, Bullets, Details, Plots, Report, Section, Summary, Tone
+from alidade.pipelines.reports.report import Block, Bullets, Details, Plots, Report, Section, Summary, Text, Tone
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import truth_errors
 from alidade.pipelines.reports.results_table import result_cards
@@ -32,8 +32,8 @@ _COLORS = dict(zip(("incremental", "published", "batch", "halves"), COLORS, stri
 
 def comparison_report(comparison: Comparison) -> Report:
     """The report of a comparison of solvers on one recording."""
-    calibrations, halves = comparison.calibrations, comparison.halves
-    first = calibrations[0]
+    calibrations = sorted(comparison.calibrations, key=lambda c: c.estimate.solver == "published")
+    first, halves = calibrations[0], comparison.halves
     quantities = [q for q in first.problem.quantities if q.prior_sigma != 0.0]
     online = comparison.of("incremental") or first
     plots = tuple(histories(online))
@@ -45,7 +45,7 @@ def comparison_report(comparison: Comparison) -> Report:
         summary=comparison_summary(comparison),
         sections=(
             Section("Solvers", _solvers(calibrations, quantities)),
-            Section("Differences", (Plots((_differences(calibrations, quantities, halves),)),)),
+            Section("Differences", (Plots((_differences(calibrations, quantities, halves),)), *_held_out(comparison))),
             Section("First and second half", _halves(first, quantities, halves), printed="never"),
             Section("Over time", over_time if plots else ()),
         ),
@@ -181,9 +181,12 @@ def _halves_agree(comparison: Comparison) -> Iterator[str]:
         yield "The time limit ended the test of the halves."
     elif comparison.tested:
         yield "Neither half determines a parameter by itself."
-    if comparison.predicted:
-        held_out = ", ".join(f"{size:.2f} ({family})" for family, size in comparison.predicted.items())
-        yield f"Held-out measurements are predicted to {held_out} of their sigmas; 1 is expected."
+
+
+def _held_out(comparison: Comparison) -> tuple[Text, ...]:
+    sizes = ", ".join(f"{size:.2f} ({family})" for family, size in comparison.predicted.items())
+    said = f"Held-out measurements are predicted to {sizes} of their sigmas; 1 is expected."
+    return (Text(said, soft=False),) if sizes else ()
 
 
 def _with_sigma(value: float, sigma: float) -> str:

@@ -204,9 +204,9 @@ def print_facts(
     _print_methods(facts, found)
     proposed = {str(name) for each in found for source in each.topics.values() for _, name in source}
     if left := [name for name in unused if name not in proposed]:
-        _say_wrapped(f"not used: {', '.join(left)}")
+        _paragraph(f"not used: {', '.join(left)}")
     for note in facts.notes:
-        _say_wrapped(f"note: {note}")
+        _paragraph(f"note: {note}")
     rows = []
     for t in facts.topics:
         gap = "" if t.largest_gap_s is None or t.rate_hz is None else f"{t.largest_gap_s:.2g}"
@@ -221,13 +221,6 @@ def print_facts(
         say(f"attachments: {', '.join(facts.attachments)}")
 
 
-def _say_wrapped(text: str) -> None:
-    """Print lines that fit, those after the first indented; words are left whole."""
-    lines = textwrap.wrap(text, _SENTENCE, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
-    for line in [text[: len(text) - len(text.lstrip())] + lines[0].lstrip(), *lines[1:]] if lines else []:
-        say(line)
-
-
 def _print_columns(columns: Columns | None) -> None:
     """Print the proposed section `columns`, with reasons and doubts."""
     if columns is None:
@@ -237,7 +230,7 @@ def _print_columns(columns: Columns | None) -> None:
         for line in columns.yaml.split("\n"):
             say(f"  {line}")
     for sentence in (*columns.reasons, *(f"in doubt: {doubt}" for doubt in columns.doubts)):
-        _say_wrapped(f"  {sentence}")
+        _paragraph(f"  {sentence}")
 
 
 def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
@@ -246,19 +239,19 @@ def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
         if not missing:
             console.print(f"[green]{method}: yes[/]")
             for key in facts.proposed.get(method, ()):
-                _say_wrapped(f"  proposed for the config: {key}")
+                _paragraph(f"  proposed for the config: {key}")
     for suggestion in found:
         if not suggestion.missing:
             name = f"--method {suggestion.method} " if suggestion.has_to_be_asked_for else ""
             how = f"use `calibrate {name}--auto-topics` or paste them into the config"
             console.print(f"[yellow]{suggestion.method}: yes, with these topics ({how}):[/]")
             for reason in suggestion.reasons:
-                _say_wrapped(f"  {reason}")
+                _paragraph(f"  {reason}")
             for line in suggestion.yaml.split("\n"):
                 say(f"  {line}")
         elif not suggestion.topics:
-            _say_wrapped(f"{suggestion.method}: {'; '.join(suggestion.reasons)}")
+            _paragraph(f"{suggestion.method}: {'; '.join(suggestion.reasons)}")
     whole = {suggestion.method for suggestion in found if not suggestion.missing}
     for method, missing in facts.missing.items():
         if missing and method not in whole:
-            _say_wrapped(f"{method}: missing {_TYPE.sub('', '; '.join(missing))}")
+            _paragraph(f"{method}: missing {_TYPE.sub('', '; '.join(missing))}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from functools import cache
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,12 @@ import alidade
 from alidade.pipelines.display.figure import Figure
 from alidade.pipelines.display.svg import interval_bar, svg, ticks
 from alidade.pipelines.display.table import Interval
+from alidade.pipelines.display.units import rounded, to_digits_of
 from alidade.pipelines.methods.triads import parts_of, sensor_model
 from alidade.pipelines.reports.calibration_report import calibration_report, report_html
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.results_table import result_cards
+from alidade.pipelines.reports.terminal import console, print_report
 from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_browser, running
 from tests.support.pages import Page
 
@@ -71,6 +74,22 @@ def test_sections_come_in_the_order_in_which_they_are_asked_for() -> None:
     assert sorted(order, key=page.text.index) == order
     assert report.summary is not None
     assert len(report.summary.next_steps) == 1
+
+
+def test_a_terminal_and_a_notebook_show_what_the_page_begins_with() -> None:
+    c = calibrated("tumble")
+    text = str(c)
+    order = ["calibrated. All 9 required", "heading, any direction", "Scale error x, %", "Bias z, µT"]
+    assert sorted(order, key=text.index) == order
+    assert max(len(line) for line in text.splitlines() if "observable" in line) <= 80
+    assert "mag_k11" not in text
+    with console.capture() as capture:
+        print_report(calibration_report(c), everything=True)
+    assert "mag_k11" in capture.get()
+    page, notebook = Page(report_html(c)).text, Page(unescape(c._repr_html_())).text
+    for _, row in result_cards(c)[0].rows:
+        numbers = (to_digits_of(row.value, row.sigma), rounded(row.sigma))
+        assert all(number in shown for number in numbers for shown in (text, page, notebook))
 
 
 def test_the_verdict_is_one_sentence_whatever_fails() -> None:

@@ -16,7 +16,7 @@ from alidade.pipelines.applications.fleet.attention import Unit, readable, sente
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component
 from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot, Shape, milliseconds, thin
-from alidade.pipelines.display.table import Cell, Column, Row, Table
+from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.methods import method
@@ -53,7 +53,7 @@ def fleet_report(outcome: Outcome, fleet: Sequence[Population], found: Sequence[
         sections=(
             Section("Units outside the control limits", _attention_blocks(attention, len(found))),
             Section("Parameters", (_parameter_table(fleet),)),
-            Section("Parameters over time", (Plots(tuple(map(_population_plot, fleet))),) if fleet else ()),
+            Section("Parameters over time", (Plots(tuple(map(population_plot, fleet))),) if fleet else ()),
         ),
     )
 
@@ -183,7 +183,8 @@ def _component(component: Component | None, factor: float) -> str:
     return f"{value} ± {sigma}"
 
 
-def _population_plot(p: Population) -> Plot:
+def population_plot(p: Population) -> Plot:
+    """Values of a parameter over the dates, those of a unit joined, with the control limits; and their histogram."""
     unit, factor = readable(p)
     out = Figure(unit, "date", share=0.8, x_scale="datetime")
     counts = Figure("", "recordings", share=0.2, y_shared=True)
@@ -278,9 +279,10 @@ def _consistency_table(study: Study, solvers: Sequence[str]) -> Table:
                 ", ".join(f"{count} {status}" for status, count in study.statuses(solver).items()),
             )
         )
-    columns = (
+    columns: Columns = (
         *("solver", "runs", "parameters", "mean NEES", Column("99 % interval", wide=True), Column("inside", "text")),
-        *(*_WITHIN, "median time, s", Column("verdicts", "text", wide=True)),
+        *(Column(head, group="coverage") for head in (*_WITHIN, "median time, s")),
+        Column("verdicts", "text", wide=True, group="coverage"),
     )
     caption = (
         "NEES: squared estimation error in units of the joint covariance; its mean is the number of parameters if the "

@@ -10,6 +10,7 @@ from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.analysis import Population, counting, populations
 from alidade.pipelines.applications.fleet.attention import units_of_interest
 from alidade.pipelines.applications.fleet.histories import History, change_table, histories, packed
+from alidade.pipelines.applications.fleet.pages import population_plot
 from alidade.pipelines.applications.fleet.store import ParameterNumbers, UnitResult
 from alidade.pipelines.gaussian_prior import independent
 from alidade.pipelines.solvers.posterior import sqrt_information_of
@@ -231,6 +232,23 @@ def test_what_the_recording_did_not_determine_does_not_count() -> None:
     a, b = populations(results)
     assert len(a.values) == 87
     assert len(b.values) == 88
+
+
+def test_a_plot_joins_the_recordings_of_a_unit_and_shows_the_control_limits() -> None:
+    p, _ = populations(a_fleet(6, units=20))
+    figure = population_plot(p).figure
+    (line,) = [mark for mark in figure.marks if mark.kind == "line"]
+    dates, values = (line.columns[name] for name in "xy")
+    pieces = np.split(values, np.flatnonzero(np.isnan(values)))
+    assert sorted(len(piece[~np.isnan(piece)]) for piece in pieces) == [3] * 20
+    assert all(
+        np.diff(piece[~np.isnan(piece)]).min() > 0.0 for piece in np.split(dates, np.flatnonzero(np.isnan(dates)))
+    )
+    assert p.control is not None
+    assert figure.y_range is not None
+    low, high = figure.y_range
+    factor = np.nanmax(values) / p.values.max()
+    assert all(low < factor * limit < high for limit in p.control)
 
 
 def test_few_units_have_no_spread() -> None:
