@@ -157,7 +157,8 @@ def _write_figure(tab: Tab, name: str, report: Path, title: str) -> None:
     tab.value(f"document.body.replaceChildren({card})")
     path = FOLDER / f"{name}.png"
     tab.picture(path)
-    Image.open(path).convert("RGB").quantize(_COLOURS).save(path, optimize=True)
+    quantised = Image.open(path).convert("RGB").quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    quantised.save(path, optimize=True)
     print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
 
 

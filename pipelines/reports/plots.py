@@ -23,7 +23,9 @@ _MOST_LABELLED = 12
 # Ellipses are drawn of so many pairs that are correlated at least so much.
 _MOST_ELLIPSES, _STRONG = 5, 0.5
 # The estimates' axis shows what came after this part of the recording.
-_SETTLED = 0.1
+_SETTLED = 0.3
+# Numbers of a variable farther apart than so many of their ranges are shown less their last estimates: those of K.
+_APART = 4.0
 
 
 def common_plots(calibration: Calibration) -> list[Plot]:
@@ -125,19 +127,23 @@ def histories(calibration: Calibration) -> list[Plot]:
         unit, factor = human_unit(members[0])
         out = Figure(unit)
         settled = history.time >= history.time[0] + _SETTLED * np.ptp(history.time)
-        reach, shown = [], set()
-        for q, color in zip(members, _colors([q.name for q in members]), strict=False):
-            values = factor * history.values[:, column[q.name]]
-            sigmas = factor * history.sigmas[:, column[q.name]]
-            out.band(history.time, values - sigmas, values + sigmas, color, q.name)
-            out.line(history.time, values, q.name, color)
-            shown |= _others(out, calibration, q.name, factor, color)
-            reach += [(values - 2.0 * sigmas)[settled].min(), (values + 2.0 * sigmas)[settled].max()]
-        out.y_range = (min(reach), max(reach))
+        shown: set[str] = set()
+        at = [column[q.name] for q in members]
+        values, sigmas = factor * history.values[:, at], factor * history.sigmas[:, at]
+        low, high = (values - 2.0 * sigmas)[settled].min(axis=0), (values + 2.0 * sigmas)[settled].max(axis=0)
+        apart = np.ptp(values[-1]) > _APART * (high - low).max()
+        last = values[-1] if apart else np.zeros(len(members))
+        for i, (q, color) in enumerate(zip(members, _colors([q.name for q in members]), strict=False)):
+            middle, sigma = values[:, i] - last[i], sigmas[:, i]
+            out.band(history.time, middle - sigma, middle + sigma, color, q.name)
+            out.line(history.time, middle, q.name, color)
+            shown |= _others(out, calibration, q.name, factor, color, last[i])
+        out.y_range = (float((low - last).min()), float((high - last).max()))
+        less = ", less the last one" if apart else ""
         plots.append(
             Plot(
                 f"{title} over time",
-                "Estimate at each moment from what was recorded until then; the band is one sigma"
+                f"Estimate at each moment from what was recorded until then{less}; the band is one sigma"
                 + "".join(f", {line}" for line in _OTHERS if line in shown)
                 + ".",
                 out,
@@ -154,22 +160,22 @@ _OTHERS = (
 )
 
 
-def _others(out: Figure, calibration: Calibration, name: str, factor: float, color: str) -> set[str]:
-    """Draws what else is known of a parameter over time; returns which of _OTHERS that was."""
+def _others(out: Figure, calibration: Calibration, name: str, factor: float, color: str, less: float) -> set[str]:
+    """Draw what else is known of a parameter over time, less a number; return which of _OTHERS that was."""
     estimate, beside = calibration.estimate, calibration.beside
     published, smooth, truth = _OTHERS
     shown = set()
     if beside is not None and beside.history is not None and name in beside.names:
         values = factor * beside.history.values[:, beside.names.index(name)]
-        out.line(beside.history.time, values, name, color, "dotted", shown=False)
+        out.line(beside.history.time, values - less, name, color, "dotted", shown=False)
         shown.add(published)
     moving = estimate.smoothed
     if moving is not None and np.ptp(values := factor * moving.values[:, estimate.names.index(name)]) > 0.0:
-        out.line(moving.time, values, name, color, "dotdash", shown=False)
+        out.line(moving.time, values - less, name, color, "dotdash", shown=False)
         shown.add(smooth)
     known = (calibration.truth or {}).get(name)
     if isinstance(known, int | float):
-        out.levels(factor * known, color, "dashed")
+        out.levels(factor * known - less, color, "dashed")
         shown.add(truth)
     return shown
 

@@ -155,7 +155,8 @@ def _left(time: Array, without: Array, compensated: Array) -> Plot:
     for i, axis in enumerate(_AXES):
         out.points(time, _URAD * compensated[:, i], f"{axis}, mounting angles found", COLORS[i], 3)
     spread = [_URAD * robust_sigma(errors) for errors in (without, compensated)]
-    reach = _SHOWN * max(*spread, 1.0)
+    largest = [1.1 * _URAD * float(np.abs(errors).max(initial=0.0)) for errors in (without, compensated)]
+    reach = max(*(min(_SHOWN * s, most) for s, most in zip(spread, largest, strict=True)), 1.0)
     out.y_range = (-reach, reach)
     return Plot(
         "What gyro, gimbal and calibration leave of the LOS error",
