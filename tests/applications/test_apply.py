@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 import alidade as door
 from alidade.pipelines import methods
@@ -171,6 +172,28 @@ def test_everything_recorded_is_copied_to_the_byte(tmp_path: Path) -> None:
     corrected = after.pop("/mag/corrected")
     assert after == before
     assert [log for log, _ in corrected] == [log for log, _ in before["/mag"]]
+
+
+def test_messages_that_nobody_reads_are_copied(tmp_path: Path) -> None:
+    """Without a schema, without content, in an encoding of their own, of undefined types."""
+    write_session(tmp_path / "m.mcap", {"/mag": sensors(60)["/mag"]})
+    with (tmp_path / "s.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        kind, text = forms.ros2_schema("sensor_msgs/msg/MagneticField")
+        mag = writer.register_channel("/mag", "cdr", writer.register_schema(kind, "ros2msg", text))
+        bare = writer.register_channel("/bare", "json", 0)
+        own = writer.register_channel("/own", "x-own", writer.register_schema("own/Type", "x-own", b"what"))
+        empty = writer.register_channel("/empty", "ros1", writer.register_schema("std_msgs/Empty", "ros1msg", b""))
+        for t, data in raw(tmp_path / "m.mcap")["/mag"]:
+            writer.add_message(mag, t, data, t)
+            for channel, other in ((bare, b"{}"), (own, RNG.bytes(int(RNG.integers(0, 9)))), (empty, b"")):
+                writer.add_message(channel, t + 1, other, t + 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    door.apply(tmp_path / "s.mcap", saved("tumble", triad("mag")), tmp_path / "c.mcap")
+    after = raw(tmp_path / "c.mcap")
+    assert len(after.pop("/mag_calibrated")) == 60
+    assert after == raw(tmp_path / "s.mcap")
 
 
 @pytest.mark.parametrize("form", forms.FORMS)
