@@ -312,7 +312,7 @@ def test_of_two_magnetometers_people_choose(names: tuple[str, str], tmp_path: Pa
     field = 5e-5 * np.random.default_rng(2).normal(size=(200, 3))
     write_session(tmp_path / "s.mcap", {name: series.MagneticSeries(t_ns, field) for name in names})
     run = alidade("info", tmp_path / "s.mcap")
-    assert f"tumble: {names[0]} and {names[1]} could be the mag: choose, `topics: {{mag: {names[0]}}}`" in run.out
+    assert f"tumble: {names[0]} and {names[1]} could be the mag: choose" in run.out
     run = alidade("calibrate", tmp_path / "s.mcap", "--method", "tumble", "--auto-topics", "--out", tmp_path / "out")
     assert (run.code, run.out) == (2, "")
     assert "could be the mag: choose" in run.err
