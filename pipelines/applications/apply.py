@@ -174,8 +174,9 @@ def _corrected(
         C = getattr(read, f"{column}_cov")
         change[column] = found[correction.results[column]].array
         change[f"{column}_cov"] = np.where(C[:, :1, :1] < 0.0, C, J @ C @ J.T)
-    for column in correction.inputs.keys() - there:  # no NaN, which ROS does not have for this
-        change |= {column: np.zeros(3), f"{column}_cov": _ABSENT}
+    for column in _SENSORS:  # no NaN, which ROS does not have for this
+        if hasattr(read, column) and not _is_measured(read, column):
+            change |= {column: np.zeros(3), f"{column}_cov": _ABSENT}
     if correction.frame:
         change |= {"frame_id": correction.frame} | ({} if is_field else {"wxyz": None, "wxyz_cov": None})
     sensors = tuple(_SENSORS[column] for column in columns)

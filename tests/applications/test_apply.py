@@ -245,6 +245,17 @@ def test_a_gyro_and_an_accelerometer_on_topics_of_their_own(tmp_path: Path) -> N
     )  # fmt: skip
 
 
+def test_rates_alone_become_an_imu_without_accelerometer(tmp_path: Path) -> None:
+    given: Any = sensors()["/platform/imu"]
+    write_session(tmp_path / "s.mcap", {"/platform/imu": series.VectorSeries(given.t_ns, given.gyro)})
+    calibration = saved("head", xyz("platform_bias"))
+    door.apply(tmp_path / "s.mcap", calibration, tmp_path / "c.mcap")
+    made = open_recording(tmp_path / "c.mcap").imu("/platform/imu_calibrated")
+    np.testing.assert_allclose(made.gyro, calibration.apply(platform_gyro=given.gyro)["w_ib"], rtol=1e-12)
+    np.testing.assert_array_equal(made.accel, 0.0)
+    assert (made.accel_cov[:, 0, 0] == -1.0).all()
+
+
 def test_sensors_that_were_not_calibrated_stay_as_recorded(tmp_path: Path) -> None:
     topics = sensors()
     write_session(tmp_path / "s.mcap", topics)
