@@ -145,7 +145,8 @@ def comparison_summary(comparison: Comparison) -> Summary:
     }[comparison.answer]
     stopped = (comparison.stopped.removesuffix("."),) if comparison.stopped else ()
     notes = (*comparison.calibrations[0].facts.notes, *stopped)
-    return Summary("Do the solvers and both halves agree?", comparison.answer, tone, text, notes, steps)
+    question = f"Do the solvers{' and both halves' if comparison.tested else ''} agree?"
+    return Summary(question, comparison.answer, tone, text, notes, steps)
 
 
 def _solvers_agree(comparison: Comparison) -> str:

@@ -12,6 +12,9 @@ from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula, results
 from alidade.pipelines.reports.result import Calibration, quantities_of
 
+# An error in use below this, in the unit shown, is rounding: nothing that was estimated has to do with that use.
+_ROUNDING = 1e-9
+
 
 class AppliedFormulas:
     """Formulas with values in them; what is not among them counts as zero."""
@@ -39,7 +42,7 @@ def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
     for use in c.method.report.uses(true, c.config, noise):
         with suppress(KeyError):  # its formulas need what this graph has not got
             found.append(use_bands(use, posterior))
-    return tuple(found)
+    return tuple(each for each in found if max(each.before, each.after) > _ROUNDING)
 
 
 def posterior_of(c: Calibration) -> Posterior:
