@@ -35,6 +35,10 @@ def comparison_report(comparison: Comparison) -> Report:
     calibrations = sorted(comparison.calibrations, key=lambda c: c.estimate.solver == "published")
     first, halves = calibrations[0], comparison.halves
     quantities = [q for q in first.problem.quantities if q.prior_sigma != 0.0]
+    z = _z_scores(calibrations, quantities)
+    by_solver = dict(zip((c.estimate.solver for c in calibrations), z, strict=True))
+    if halves:
+        by_solver["halves"] = {name: half.z for name, half in halves.items()}
     online = comparison.of("incremental") or first
     plots = tuple(histories(online))
     over_time = (Details(f"Estimates of {online.estimate.solver} over time", (Plots(plots),), "fold"),)
@@ -44,8 +48,8 @@ def comparison_report(comparison: Comparison) -> Report:
         about=f"{first.recording}: {', '.join(f'{c.estimate.solver} {c.status}' for c in calibrations)}",
         summary=comparison_summary(comparison),
         sections=(
-            Section("Solvers", _solvers(calibrations, quantities)),
-            Section("Differences", (Plots((_differences(calibrations, quantities, halves),)), *_held_out(comparison))),
+            Section("Solvers", _solvers(calibrations, quantities, z)),
+            Section("Differences", (Plots((_differences(by_solver, quantities),)), *_held_out(comparison))),
             Section("First and second half", _halves(first, quantities, halves), printed="never"),
             Section("Over time", over_time if plots else ()),
         ),
@@ -57,57 +61,60 @@ def write_compare(out_dir: Path, comparison: Comparison) -> Path:
     return write_page(out_dir, FILE, render_html(comparison_report(comparison)))
 
 
-def _solvers(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> tuple[Block, ...]:
+def _solvers(
+    calibrations: Sequence[Calibration], quantities: Sequence[Quantity], z: Sequence[Mapping[str, float]]
+) -> tuple[Block, ...]:
     """Verdict of each solver, the required parameters by all of them, and collapsed the nuisance parameters."""
     verdicts = [(c, summary_of(c, result_cards(c))) for c in calibrations]
     required = [q for q in quantities if q.judged]
     others = [q for q in quantities if not q.judged]
-    z = "error over sigma" if _is_known(calibrations) else "difference from batch, in batch's sigmas"
+    known = any(truth_errors(c) for c in calibrations)
+    what = "error over sigma" if known else "difference from batch, in batch's sigmas"
     caption = (
-        f"Value ± sigma; z: {z}. Batch solves the whole recording at once and is the one to go by; incremental as it "
-        "would live; published is the solver of the publication that the method is from."
+        f"Value ± sigma; z: {what}. Batch solves the whole recording at once and is the one to go by; incremental as "
+        "it would live; published is the solver of the publication that the method is from."
     )
     blocks: list[Block] = [
         Bullets(tuple(f"{c.estimate.solver}: {c.status}. {said.text}" for c, said in verdicts)),
-        _solver_table(calibrations, required, caption),
+        _solver_table(calibrations, required, z, caption),
     ]
     if others:
-        blocks.append(Details("Nuisance parameters", (_solver_table(calibrations, others, ""),), "fold"))
+        blocks.append(Details("Nuisance parameters", (_solver_table(calibrations, others, z),), "fold"))
     return tuple(blocks)
 
 
-def _solver_table(calibrations: Sequence[Calibration], quantities: Sequence[Quantity], caption: str) -> Table:
+def _solver_table(
+    calibrations: Sequence[Calibration],
+    quantities: Sequence[Quantity],
+    z: Sequence[Mapping[str, float]],
+    caption: str = "",
+) -> Table:
     """The truth where known, value and sigma of each solver, and z."""
     errors = [truth_errors(c) for c in calibrations]
-    known = _is_known(calibrations)
-    columns: list[Column | str] = ["parameter", Column("unit", "text"), *(["truth"] if known else [])]
+    columns: list[Column | str] = ["parameter", Column("unit", "text"), *(["truth"] if any(errors) else [])]
     for c in calibrations:
         columns += [Column(c.estimate.solver, group=c.estimate.solver), Column("z", group=c.estimate.solver)]
     rows: list[Row] = []
     for q in quantities:
         unit, factor = human_unit(q)
         row: list[Cell | str] = [Cell(q.name, hint=calibrations[0].method.describe(q.name)), unit]
-        if known:
+        if any(errors):
             truth = next((found[q.name].value for found in errors if q.name in found), None)
             sigmas = [p.sigma for c in calibrations if (p := c.parameters.get(q.name)) and p.sigma > 0.0]
             row.append("" if truth is None else to_digits_of(truth * factor, min(sigmas, default=0.0) * factor))
-        for c in calibrations:
-            z = _z(c, calibrations, q.name)
-            row += [_estimate(c, q), "" if z is None else signed(z)]
+        for c, scores in zip(calibrations, z, strict=True):
+            row += [_estimate(c, q), signed(scores[q.name]) if q.name in scores else ""]
         rows.append(tuple(row))
     return Table("", caption, tuple(columns), tuple(rows), style="small", most_rows=None)
 
 
-def _is_known(calibrations: Sequence[Calibration]) -> bool:
-    return any(truth_errors(c) for c in calibrations)
-
-
-def _z(c: Calibration, calibrations: Sequence[Calibration], name: str) -> float | None:
-    """Error over sigma where the truth is known, else the difference from batch in its sigmas."""
-    if not _is_known(calibrations):
-        return _from_batch(c, calibrations, name)
-    error = truth_errors(c).get(name)
-    return None if error is None else error.error_sigmas
+def _z_scores(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[dict[str, float]]:
+    """Error over sigma by parameter where the truth is known, else the difference from batch; one a solver."""
+    errors = [truth_errors(c) for c in calibrations]
+    if any(errors):
+        return [{name: e.error_sigmas for name, e in each.items() if e.error_sigmas is not None} for each in errors]
+    far = ([(q.name, _from_batch(c, calibrations, q.name)) for q in quantities] for c in calibrations)
+    return [{name: z for name, z in each if z is not None} for each in far]
 
 
 def _estimate(c: Calibration, q: Quantity) -> str:
@@ -212,22 +219,15 @@ def _halves(c: Calibration, quantities: Sequence[Quantity], halves: Mapping[str,
     return (Table("", caption, columns, tuple(rows), "halves", "small", None),) if rows else ()
 
 
-def _differences(
-    calibrations: Sequence[Calibration], quantities: Sequence[Quantity], halves: Mapping[str, SplitHalf]
-) -> Plot:
+def _differences(z: Mapping[str, Mapping[str, float]], quantities: Sequence[Quantity]) -> Plot:
     """z of each parameter by each solver, and of the halves."""
-    known = _is_known(calibrations)
-    bars = {c.estimate.solver: [_z(c, calibrations, q.name) for q in quantities] for c in calibrations}
-    shown = {name: heights for name, heights in bars.items() if any(z is not None for z in heights)}
-    if halves:
-        shown["halves"] = [halves[q.name].z if q.name in halves else None for q in quantities]
     out = Figure("z", "", 420, x_labels=tuple(q.name for q in quantities))
-    for k, (name, heights) in enumerate(shown.items()):
-        out.bars(np.array([np.nan if z is None else z for z in heights]), name, _COLORS[name], (k, len(shown)))
+    shown = {name: scores for name, scores in z.items() if scores}
+    for k, (name, scores) in enumerate(shown.items()):
+        out.bars([scores.get(q.name, np.nan) for q in quantities], name, _COLORS[name], (k, len(shown)))
     out.levels((-4.0, -2.0, 2.0, 4.0))
-    largest = max((abs(z) for heights in shown.values() for z in heights if z is not None), default=0.0)
+    largest = max((abs(score) for scores in shown.values() for score in scores.values()), default=0.0)
     reach = max(4.5, min(1.1 * largest, _MAX_Z))
     out.y_range = (-reach, reach)
-    what = "Error of each solver over its sigma" if known else "Each solver less batch, in batch's sigmas"
-    also = "; halves: second half less first, in sigmas of the difference" if halves else ""
-    return Plot("z of each parameter", f"{what}{also}. Dotted: 2 and 4; bars end at {_MAX_Z:g}.", out)
+    also = "; halves: second half less first, in sigmas of the difference" if "halves" in shown else ""
+    return Plot("z of each parameter", f"z as in the table{also}. Dotted: 2 and 4; bars end at {_MAX_Z:g}.", out)
