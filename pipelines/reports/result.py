@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.reports.calibration import SavedRotation
     from alidade.pipelines.reports.html import Page
 
-_PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless")
+_PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.refinement import PoseFit, refine
 from alidade.pipelines.vision.tags import Detections
 
 if TYPE_CHECKING:
@@ -23,8 +24,6 @@ Array = NDArray[np.float64]
 SQUARE = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 # OpenCV's IPPE_SQUARE wants top left, top right, bottom right, bottom left.
 _IPPE_ORDER = [3, 2, 1, 0]
-# Refinement of a pose: first damping, relative; most steps; the last one moves corners by less than this (norm, px).
-_DAMPING, _MAX_STEPS, _SETTLED_PX = 1e-3, 50, 1e-6
 # Odds of the flipped pose above which a pose is called ambiguous.
 _AMBIGUOUS = 1e-3
 # Two refined poses closer than this (rad) are one.
@@ -180,15 +179,6 @@ def part(body: TagBody, keep: NDArray[Any]) -> TagBody:
     return TagBody(body.ids[keep], body.size[keep], body.bRt[keep], body.position[keep], body.family)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    cRb: Array
-    position: Array
-    covariance: Array  # for corners with a sigma of 1 px
-    miss: Array  # (n, 4, 2) px
-    square: float  # sum of squares of miss
-
-
 def _solve(camera: Camera, tags: TagBody, pixels: Array, noise: _Noise, expected: ArrayLike | None) -> BodyPose | None:
     fits = sorted(_minima(camera, tags, pixels, _starts(camera, tags, pixels)), key=lambda fit: fit.square)
     if not fits:
@@ -207,7 +197,7 @@ def _solve(camera: Camera, tags: TagBody, pixels: Array, noise: _Noise, expected
         position=best.position,
         covariance=best.covariance * (variance if noise.raised else noise.sigma**2),
         ids=tags.ids,
-        tag_rms_px=np.sqrt((best.miss**2).mean(axis=(1, 2))),
+        tag_rms_px=np.sqrt((best.miss.reshape(pixels.shape) ** 2).mean(axis=(1, 2))),
         rms_px=float(np.sqrt((best.miss**2).mean())),
         rejected=(),
         ambiguity=odds,
@@ -262,17 +252,20 @@ def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array,
     return so3.exp(vectors), places
 
 
-def _minima(camera: Camera, tags: TagBody, pixels: Array, starts: list[list[tuple[float, Array, Array]]]) -> list[_Fit]:
+def _minima(
+    camera: Camera, tags: TagBody, pixels: Array, starts: list[list[tuple[float, Array, Array]]]
+) -> list[PoseFit]:
     """The refined best start, and the refined best start of those that lie on the other side of the flip."""
     _, cRb, position = min((start for pair in starts for start in pair), key=lambda start: start[0])
-    first = _refine(camera, tags, pixels, cRb, position)
+    corners, seen = tags.corners.reshape(-1, 3), pixels.reshape(-1, 2)
+    first = refine(camera, corners, seen, cRb, position)
     if first is None:
         return []
     far = [max(pair, key=lambda start: _angle(start[1], first.cRb)) for pair in starts if len(pair) > 1]
     if not far:
         return [first]
     _, cRb, position = min(far, key=lambda start: start[0])
-    second = _refine(camera, tags, pixels, cRb, position)
+    second = refine(camera, corners, seen, cRb, position)
     if second is None or _angle(second.cRb, first.cRb) < _SAME:
         return [first]
     return [first, second]
@@ -280,35 +273,3 @@ def _minima(camera: Camera, tags: TagBody, pixels: Array, starts: list[list[tupl
 
 def _miss(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> Array:
     return np.asarray(camera.project(position + so3.rotate(cRb, corners)) - pixels)
-
-
-def _refine(camera: Camera, tags: TagBody, pixels: Array, cRb: Array, position: Array) -> _Fit | None:
-    """The pose of least squares near another (Levenberg and Marquardt); None where there is none."""
-    corners, damping = tags.corners.reshape(-1, 3), _DAMPING
-    miss, J = _linearized(camera, corners, pixels, cRb, position)
-    if not np.isfinite(J).all():
-        return None
-    try:
-        for _ in range(_MAX_STEPS):
-            H, gradient = J.T @ J, J.T @ miss
-            step = -np.linalg.solve(H + np.diag(damping * np.diag(H)), gradient)
-            trial = so3.multiply(cRb, so3.exp(step[:3])), position + step[3:]
-            tried, by_pose = _linearized(camera, corners, pixels, *trial)
-            if tried @ tried <= miss @ miss and np.isfinite(by_pose).all():
-                (cRb, position), miss, J, damping = trial, tried, by_pose, 0.1 * damping
-            else:
-                damping *= 10.0
-            if step @ H @ step < _SETTLED_PX**2:
-                break
-        covariance: Array = np.asarray(np.linalg.inv(J.T @ J), dtype=float)
-    except np.linalg.LinAlgError:
-        return None
-    return _Fit(cRb, position, covariance, miss.reshape(pixels.shape), float(miss @ miss))
-
-
-def _linearized(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> tuple[Array, Array]:
-    """Misses (2 n,) of corners (n, 3), px, and their Jacobian (2 n, 6) by delta of cRb Exp(delta) and the position."""
-    R = so3.matrix(cRb)
-    seen, by_point = camera.project_with_jacobian(position + corners @ R.T)
-    by_turn = np.cross(corners[:, None, :], by_point @ R)  # d(R Exp(delta) x) = R (delta x x)
-    return (seen - pixels.reshape(-1, 2)).ravel(), np.concatenate([by_turn, by_point], axis=-1).reshape(-1, 6)
