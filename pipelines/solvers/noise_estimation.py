@@ -261,8 +261,8 @@ def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: f
 def _level(now: float, square: float, redundancy: float, known: float) -> float:
     """Logarithm of the root of the level's posterior mean square.
 
-    The mode is the root u of square exp(2 (now - u)) - redundancy - u / known^2, by Newton's method; its variance v
-    the mean square is exp(2 (u + v)): sigmas contain what few residuals leave unknown of their level.
+    The mode u is the root of square exp(2 (now - u)) - redundancy - u / known^2, by Newton's method. With v the
+    variance of the logarithm there, the mean square is exp(2 (u + v)): sigmas contain what few residuals leave unknown.
     """
     u, step, curvature = now, np.inf, np.inf
     while abs(step) > 1e-6:
