@@ -51,6 +51,8 @@ FOLLOWS = 0.5
 UNDETERMINED = 1e-4
 # Steps to the constrained solution, and how near it has to be, in sigmas; how often strong directions may turn weak.
 MAX_STEPS, NEAR, ROUNDS = 15, 0.02, 3
+# By what chi-square may rise beside that when weak directions move to their priors: a contradiction of 4 sigmas.
+CONTRADICTION = 4.0
 # Part of their priors by which weak directions go to these at a time: what is curved would lead a longer step astray.
 LEAP = 0.5
 # Random moves whose slopes show along which ways anything is curved, and the share of its sigma, as root mean square,
@@ -287,8 +289,20 @@ def constrained_solution(problem: Problem, minimum: Solution, current_keys: Mapp
         if directions.weak.shape[1] == found.directions.weak.shape[1]:
             break
         known = found.system, found.factorization
-        found = _constrained(problem, engine, found.values, current_keys, directions, known)
+        constrained = _constrained(problem, engine, found.values, current_keys, directions, known)
+        if _contradicts(engine, found, constrained):
+            break
+        found = constrained
     return replace(found, directions=directions)
+
+
+def _contradicts(engine: Engine, before: Posterior, after: Posterior) -> bool:
+    """Whether measurements and other priors contradict that more directions are at their prior means.
+
+    What is hardly determined can be moved at a cost: a chi-square of (move / MAX_SIGMA)^2, to first order.
+    """
+    moved = np.linalg.norm(after.directions.weak.T @ (after.reported.u - before.reported.u))
+    return bool(engine.cost(after.values) - engine.cost(before.values) > (moved / MAX_SIGMA) ** 2 + CONTRADICTION**2)
 
 
 def _unknown(problem: Problem, minimum: Solution, current_keys: Mapping[int, int]) -> Posterior:

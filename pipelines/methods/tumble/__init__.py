@@ -11,8 +11,8 @@ from alidade.pipelines.methods.tumble.topics import REQUIREMENTS, TOPICS
 
 # Priors of triads and strengths are in `tumble.parameters`: over the strength, and by the model of the field.
 PARAMETERS = (
-    *triad_specs("accel", "m/s^2", (0.5, 5e-3), (0.2, 2e-3), per_recording=True),
-    *triad_specs("mag", "T", (0.5, 5e-3), (10.0, 1e-2)),
+    *triad_specs("accel", "m/s^2", (0.3, 5e-3), (0.2, 2e-3), per_recording=True),
+    *triad_specs("mag", "T", (0.3, 5e-3), (10.0, 1e-2)),
     scalar("gravity", "m/s^2", 1e-2, "Local gravity.", per_recording=True),
     scalar(
         "field_strength", "T", 5e-7, "Strength of the local magnetic field.", "field.model_error", per_recording=True

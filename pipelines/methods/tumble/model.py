@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
+from alidade.pipelines.display.sphere_map import described
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import ROUGHLY, Noise
 from alidade.pipelines.estimation.parameters import ParameterSpec, parameter
@@ -24,8 +25,10 @@ from alidade.pipelines.methods.noise import sampled, stated
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
 from alidade.pipelines.methods.static_intervals import quiet_intervals
 from alidade.pipelines.methods.triads import triad_names
-from alidade.pipelines.methods.tumble.published import FEWEST, ellipsoid
+from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess
+from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, NO_RATE, TumbleData
+from alidade.pipelines.methods.tumble.ring import ring
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
 from alidade.pipelines.settings import Config
 
@@ -38,10 +41,13 @@ _GRAVITY, _GRAVITY_SIGMA = 9.80665, 0.02
 _MOSTLY = 1.0 / 3.0
 # Means over this time, s, show what a mean over a rest scatters by, slow tremor of a hand included.
 _BLOCK = 0.25
+# Strength of the earth's field where the place is unknown, T: 22e-6 to 67e-6.
+_EARTH_FIELD = 4.5e-5
+# Scatter of an accelerometer over gravity below which it did not turn; of one without rests and gyro, whose motion is
+# noise, below which it was within 20 deg of upright.
+_TURNED, _TILTED = 0.02, 0.25
 # No sensor resolves a smaller share of what it measures; numbers without noise leave rounding.
 _RESOLUTION = 1e-9
-# Samples this many sigmas from the ellipsoid are left out of the first guess.
-_FAR, _ROUNDS = 5.0, 5
 # A rotation from pairs of vectors is unique where the second-best solution fits this many times worse.
 _CLEAR = 2.0
 # Prior sigma of the noise by the hand's motion, in the logarithm.
@@ -62,6 +68,11 @@ _GRAVITY_DOWN = (
     "The accelerometer shows gravity down where it has to show the force that holds it, up: all its three signs are "
     "inverted, which its K mends (about -1); the magnetometer keeps its signs."
 )
+_UPRIGHT = (
+    "The accelerometer is left out: it felt gravity along much the same axis all the time, which leaves its numbers at "
+    "their priors."
+)
+_NEVER_TOGETHER = "The magnetometer has no reading during a rest: nothing ties its axes to the accelerometer's."
 _NEGATIVE_DIP = (
     "The field rises: right south of the magnetic equator; north of it the accelerometer shows gravity down, and all "
     "signs of K of the magnetometer rest on that. State latitude_deg and longitude_deg in the config to decide."
@@ -81,6 +92,7 @@ class Sensor:
         symmetric: whether K is so by definition: the sensor defines the body's axes.
         is_si: whether it is recorded in SI; else in counts.
         radius: of the ellipsoid, in the unit recorded.
+        gain: prior mean of the singular values of K without unit: what is recorded in SI is about right as it is.
         strength, spread: of what it measures, and how well that is known, one sigma.
         unit: of the strength; "1" where it is unknown and called 1.
         start: (9,) or (12,) first guess, without unit.
@@ -100,6 +112,7 @@ class Sensor:
     symmetric: bool
     is_si: bool
     radius: float
+    gain: float
     strength: float
     spread: float
     unit: str
@@ -200,8 +213,12 @@ def prepare(data: TumbleData, config: Config) -> Model:
         field = field_at(data.latitude, data.longitude, data.height, data.epoch_ns, config.date)
     sensors: list[Sensor] = []
     rests = None
-    if data.accel is not None and data.accel_t is not None:
+    if data.accel is not None:
         rests = _rests(data, config)
+        if data.mag is not None and _is_upright(data, rests):
+            data = replace(data, accel_t=None, accel=None)
+            premises.append(_UPRIGHT)
+    if data.accel is not None:
         sensors.append(_accelerometer(data, config, rests))
     if data.mag is not None and data.mag_t is not None:
         sensors.append(_magnetometer(data, config, field, alone=data.accel is None))
@@ -212,6 +229,8 @@ def prepare(data: TumbleData, config: Config) -> Model:
             )
     gyro, more = _gyro(data, sensors)
     premises += more
+    if gyro is None and sensors[-1].name == "mag":
+        premises += _about_one_axis(sensors[-1])
     if sensors[0].name == "accel" and not sensors[0].rested:
         done = _AT_REST if gyro is None else _SWUNG
         premises.append(f"The accelerometer has fewer than {FEWEST} rests: {done}.")
@@ -244,6 +263,32 @@ def _modelled(config: Config, field: Array) -> tuple[float, float]:
     return float(np.arcsin(-field[2] / strength)), sheet(config, FIELD) / strength
 
 
+def _is_upright(data: TumbleData, rests: Array | None) -> bool:
+    """Whether an accelerometer's readings, its motion among them where it never rests, leave K at its prior."""
+    assert data.accel is not None
+    assert data.accel_t is not None
+    raw = _means(data.accel_t, data.accel, rests)[1]
+    size = float(np.median(np.linalg.norm(raw, axis=1)))
+    turned = float(np.sqrt(raw.var(axis=0).sum())) / size
+    return _is_si("accel", raw) and turned < (_TILTED if rests is None and data.gyro is None else _TURNED)
+
+
+def _about_one_axis(mag: Sensor) -> list[str]:
+    """What a magnetometer shows that was turned about one axis."""
+    found = ring(mag.raw)
+    if found is None:
+        return []
+    unit, factor = ("µT", 1e6) if mag.is_si else ("counts", 1.0)
+    across = sorted(np.argsort(np.abs(found.axis))[:2])
+    centre = " and ".join(f"{'xyz'[i]} {factor * found.centre[i]:.4g}" for i in across)
+    return [
+        f"The magnetometer was turned about one axis only, {described(found.axis)}. Across it the hard iron is "
+        f"{centre} ± {factor * found.sigma:.1g} {unit}, and the longest axis of the ellipse of readings is "
+        f"{found.ratio:.3f} times the shortest, which is what headings about that axis need; what is along it, and by "
+        "how much it leans, is hardly known."
+    ]
+
+
 def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, list[str]]:
     """The magnetometer in the gyro's axes, and why the gyro is not used though it is there."""
     if any(reason.endswith(NO_RATE) for reason in data.dropped):
@@ -251,6 +296,8 @@ def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, l
     if data.gyro is None or data.mag is None:
         return None, []
     found = field_guess(data, sensors[-1].time, sensors[-1].raw)
+    if found is None and ring(sensors[-1].raw) is not None:
+        return None, ["The gyro is not used: turning about one axis does not tell how it is mounted."]
     if found is None:
         return None, ["The gyro is not used: it does not turn as the field does; are its axes and clock right?"]
     return found, []
@@ -294,6 +341,7 @@ def _of_guess(mag: Sensor, guess: FieldGuess) -> Sensor:
     return replace(
         mag,
         radius=radius,
+        gain=mag.gain / scale if mag.is_si else 1.0,
         sigma=scale * mag.sigma,
         sample_scatter=scale * mag.sample_scatter,
         symmetric=False,
@@ -412,7 +460,8 @@ def _sensor(
     if rests is None and len(raw) < FEWEST:
         raise InputError(f"{name}: {len(raw)} readings, at least {FEWEST} in different attitudes are needed")
     is_si = _is_si(name, raw)
-    S, centre = _first_guess(raw)
+    usual = (_EARTH_FIELD if known[2] == "1" else known[0]) if is_si else None
+    S, centre = first_guess(raw, usual, ACCEL_OFFSET if is_si and name == "accel" else OFFSET)
     radius = float(np.linalg.det(S)) ** (-1.0 / 3.0)
     start = np.concatenate([(radius * S)[np.triu_indices(3)], -S @ centre])
     numbers, root_number = start @ entries(True).T, np.sqrt(number)
@@ -438,6 +487,7 @@ def _sensor(
         symmetric=True,
         is_si=is_si,
         radius=radius,
+        gain=1.0 if usual is None else radius / usual,
         strength=known[0],
         spread=known[1],
         unit=known[2],
@@ -481,33 +531,6 @@ def _is_si(name: str, raw: Array) -> bool:
     return low <= float(np.median(np.linalg.norm(raw, axis=1))) <= high
 
 
-def _first_guess(raw: Array) -> tuple[Array, Array]:
-    """S and centre of an ellipsoid, or else a sphere, near the readings; those far from it left out."""
-    kept = np.ones(len(raw), dtype=bool)
-    S, centre = _sphere(raw)
-    for _ in range(_ROUNDS):
-        found = ellipsoid(raw[kept])
-        if found is None:
-            break
-        S, centre = found.S, found.centre
-        misses = np.abs(np.linalg.norm((raw - centre) @ S.T, axis=1) - 1.0)
-        near = misses < _FAR * max(robust_sigma(misses), 1e-9)
-        if (near == kept).all() or near.sum() < FEWEST:
-            break
-        kept = near
-    return S, centre
-
-
-def _sphere(raw: Array) -> tuple[Array, Array]:
-    """The sphere through readings (n, 3), the nearest to their mean where there are many."""
-    origin, unit = raw.mean(axis=0), max(float(raw.std()), np.finfo(float).tiny)
-    scaled = (raw - origin) / unit
-    design = np.column_stack([2.0 * scaled, np.ones(len(raw))])
-    solution = np.linalg.lstsq(design, (scaled**2).sum(axis=1), rcond=1e-3)[0]
-    radius = unit * float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-6)))
-    return np.eye(3) / radius, origin + unit * solution[:3]
-
-
 def _means(t: Array, values: Array, rests: Array | None) -> tuple[Array, Array, Array]:
     """Times, means over the rests and numbers of samples in each, empty ones left out; of no rests, all samples."""
     if rests is None:
@@ -525,11 +548,13 @@ def _together(
     mag: Sensor,
     rests: Array | None,
     model: tuple[float, float] | None,
-) -> tuple[list[Sensor], Dip, Moments, list[str]]:
+) -> tuple[list[Sensor], Dip, Moments | None, list[str]]:
     """Accelerometer, magnetometer turned into its axes, and the angles between what they measured."""
     assert data.mag_t is not None
     assert data.mag is not None
     rows, time, readings, number = _beside(data.mag_t, data.mag, accel.time, rests)
+    if not len(rows):
+        return [accel, mag], Dip(0.0, model), None, [_NEVER_TOGETHER]
     up = accel.directions[rows]
     vectors = nominal_of(readings / mag.radius, mag.start)
     seen = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -15,6 +15,7 @@ from alidade.pipelines.estimation.parameters import quantities
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 from alidade.pipelines.methods.triads import triad_names
+from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, GAIN, OFFSET
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
 from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, EARTH, FILTER, SCALE, SENSITIVITY
@@ -26,9 +27,8 @@ DIP_KEY, SLOPE_KEY = (int(gtsam.symbol(letter, 0)) for letter in "iJ")
 STRENGTHS = {"accel": "gravity", "mag": "field_strength"}
 _DIP = "field_dip"
 
-# Priors: of entries of K against a sensor on the body's axes; of b over the strength: an accelerometer in SI is near
-# zero, hard iron and offsets of counts have no limit. Of a dip without a model, rad.
-_GAIN, _BIAS, _OFFSET, _ANY_DIP = 0.5, 0.2, 10.0, 1.0
+# Prior of a dip without a model, rad.
+_ANY_DIP = 1.0
 # A strength that is known, over itself, where it is set free.
 _ANY_STRENGTH = 1e-2
 # Accuracies wanted: of gains and of b over the strength; of the dip, rad.
@@ -74,16 +74,16 @@ def variables(model: Model, config: Config) -> tuple[Variable, ...]:
 
 def _triad(sensor: Sensor, config: Config) -> Variable:
     gains = len(sensor.start) - 3
-    spread = _BIAS if sensor.name == "accel" and sensor.is_si else _OFFSET
+    spread = ACCEL_OFFSET if sensor.name == "accel" and sensor.is_si else OFFSET
     mounted = np.concatenate([nearest_axes(sensor.turned).ravel(), np.zeros(3)])
-    # What is recorded in SI and measures what is known in SI is about right as it is.
-    nominal = sensor.radius / sensor.strength if sensor.is_si and sensor.unit != "1" else 1.0
     spread_of = entries(sensor.symmetric)
-    mean = nominal * (spread_of.T @ mounted) / spread_of.sum(axis=0)
-    sigma = np.repeat([_GAIN * nominal, spread], [gains, 3])
+    mean = sensor.gain * (spread_of.T @ mounted) / spread_of.sum(axis=0)
+    sigma = np.repeat([GAIN * sensor.gain, spread], [gains, 3])
     # An offset of many times the strength, as of counts, goes with the gain.
     wide = max(1.0, float(np.linalg.norm(sensor.start[-3:])))
-    require = np.repeat([_REQUIRE_GAIN * nominal, _REQUIRE_BIAS[sensor.name] * wide], [gains, 3])
+    require = np.repeat(
+        [_REQUIRE_GAIN * (1.0 if sensor.unit == "1" else sensor.gain), _REQUIRE_BIAS[sensor.name] * wide], [gains, 3]
+    )
     listed = []
     units = [_gain_unit(sensor)] * gains + [sensor.unit] * 3
     for i, (name, unit) in enumerate(zip(sensor.names, units, strict=True)):

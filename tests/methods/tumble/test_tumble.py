@@ -523,12 +523,15 @@ def test_turns_within_the_noise_that_is_stated_are_none() -> None:
 
 
 @pytest.mark.parametrize("scenario", [RESTING, TURNING])
-def test_an_accelerometer_that_did_not_turn_is_refused(scenario: TumbleScenario) -> None:
+def test_an_accelerometer_that_did_not_turn_is_left_out(scenario: TumbleScenario) -> None:
     data: TumbleData = _simulated(scenario, 0).data
     assert data.accel is not None
     rest = [0.0, 0.0, 9.81] + 1e-2 * np.random.default_rng(0).standard_normal(data.accel.shape)
+    problem = TUMBLE.problem(replace(data, accel=rest), Config())
+    assert "The accelerometer is left out" in " ".join(problem.premises)
+    assert "accel_k11" not in [quantity.name for quantity in problem.quantities]
     with pytest.raises(InputError, match="topic /imu: the device did not turn"):
-        TUMBLE.problem(replace(data, accel=rest), Config())
+        TUMBLE.problem(replace(data, accel=rest, mag=None, mag_t=None), Config())
 
 
 def test_other_methods_go_first(tmp_path: Path) -> None:

@@ -1,0 +1,97 @@
+"""First guess of a triad: the likeliest ellipsoid near its readings, with the prior where they determine nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from alidade.factors.ellipsoid import StrengthFactor, entries
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.methods.tumble.published import FEWEST, Ellipsoid, ellipsoid
+
+# Prior sigma of entries of K over their size, against a sensor on the body's axes; of b over the strength: an
+# accelerometer in SI is near zero, hard iron and offsets of counts have no limit.
+GAIN, ACCEL_OFFSET, OFFSET = 0.3, 0.2, 10.0
+# Of a guess: sigma of entries of K over their size, noise of a reading over the radius; readings that are looked at.
+_LIKELY, _NOISE, _READINGS = 0.2, 2e-2, 1000
+# Samples this many sigmas from the ellipsoid are left out of an algebraic fit.
+_FAR, _ROUNDS = 5.0, 5
+_UNIT = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
+
+
+def first_guess(raw: Array, strength: float | None, offset: float) -> tuple[Array, Array]:
+    """S and centre of the likeliest ellipsoid |S (raw - centre)| = 1.
+
+    The starts are the algebraic ellipsoid and spheres. Readings on a ring determine only some of the nine numbers; the
+    others are the prior's.
+
+    Args:
+        raw: (n, 3) readings.
+        strength: in their unit, of a sensor whose K is about 1; None: unknown, the radius of the nearest sphere.
+        offset: prior sigma of b over the strength.
+    """
+    from scipy.optimize import least_squares
+
+    centre, radius = _sphere(raw)
+    unit = strength or radius
+    x = raw[:: max(1, len(raw) // _READINGS)] / unit
+    ones = np.ones(len(x))
+    factor = StrengthFactor(ones, x, _NOISE * ones, 0.0 * ones, symmetric=True)
+    mean, sigma = np.append(_UNIT, np.zeros(3)), np.repeat([_LIKELY, offset], [6, 3])
+
+    def residuals(numbers: Array) -> Array:
+        return np.append(factor(np.tile(numbers, (len(x), 1)), ones[:, None])[0][:, 0], (numbers - mean) / sigma)
+
+    def jacobian(numbers: Array) -> Array:
+        by_numbers = factor(np.tile(numbers, (len(x), 1)), ones[:, None])[1]()[0][:, 0]
+        return np.vstack([by_numbers, np.diag(1.0 / sigma)])
+
+    starts = [_sphere_numbers(each / unit) for each in _centres(raw, centre, radius, strength)]
+    if (found := _inliers_ellipsoid(raw)) is not None:
+        S = unit * found.S
+        starts.append(np.append(S[np.triu_indices(3)], -S @ found.centre / unit))
+    fits = [least_squares(residuals, start, jacobian, loss="soft_l1", max_nfev=50) for start in starts]
+    likeliest = entries(True) @ min(fits, key=lambda fit: float(fit.cost)).x
+    S = likeliest[:9].reshape(3, 3)
+    # Lengths stay where S is replaced by the positive root of its square.
+    sizes, vt = np.linalg.svd(S)[1:]
+    return vt.T @ np.diag(sizes) @ vt / unit, -unit * np.linalg.solve(S, likeliest[9:])
+
+
+def _sphere_numbers(centre: Array) -> Array:
+    return np.append(_UNIT, -centre)
+
+
+def _centres(raw: Array, centre: Array, radius: float, strength: float | None) -> list[Array]:
+    """Of spheres: the nearest one; of a known radius, those two through the same ring, and the one about zero."""
+    if strength is None:
+        return [centre]
+    normal = np.linalg.eigh(np.cov(raw.T))[1][:, 0]
+    away = np.sqrt(max(strength**2 - radius**2, 0.0)) * normal
+    return [centre, centre - away, centre + away, np.zeros(3)]
+
+
+def _inliers_ellipsoid(raw: Array) -> Ellipsoid | None:
+    """The algebraic ellipsoid through the readings that are near it."""
+    kept, last = np.ones(len(raw), dtype=bool), None
+    for _ in range(_ROUNDS):
+        found = ellipsoid(raw[kept])
+        if found is None:
+            return last
+        last = found
+        misses = np.abs(np.linalg.norm((raw - found.centre) @ found.S.T, axis=1) - 1.0)
+        near = misses < _FAR * max(robust_sigma(misses), 1e-9)
+        if (near == kept).all() or near.sum() < FEWEST:
+            break
+        kept = near
+    return last
+
+
+def _sphere(raw: Array) -> tuple[Array, float]:
+    """Centre and radius of the sphere through readings (n, 3), the nearest to their mean where there are many."""
+    origin, unit = raw.mean(axis=0), max(float(raw.std()), np.finfo(float).tiny)
+    scaled = (raw - origin) / unit
+    design = np.column_stack([2.0 * scaled, np.ones(len(raw))])
+    solution = np.linalg.lstsq(design, (scaled**2).sum(axis=1), rcond=1e-3)[0]
+    radius = unit * float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-6)))
+    return origin + unit * solution[:3], radius
