@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from alidade.pipelines.diagnostics.disturbances import disturbances
 from alidade.pipelines.diagnostics.error_budget import dominant_priors
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import Advise, weak_directions
@@ -80,7 +81,7 @@ def diagnose(
     if not published:
         found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
         found += [*rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
-        found += _slow_errors(estimate, quantities)
+        found += [*_slow_errors(estimate, quantities), *disturbances(estimate)]
     found += misfits(estimate.chi_square, estimate.levels, limits)
     if any(finding.severity == WEAK for finding in directions):
         found += dominant_priors(quantities, estimate.covariance)

@@ -25,6 +25,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "jump": ("since_s", "time_s", "size", "sigma"),  # of vision, by the mount or by the reference, rad
     "device_change": ("parameter", "step", "sigma", "recordings", "dates"),  # between two recordings
     "rejection": ("family", "share", "noise_factor"),  # with noise_factor times the noise all of it would fit
+    "disturbance": ("family", "since_s", "time_s", "rejected"),  # measurements rejected one after the other
     "noise": (
         "noise",
         "unit",

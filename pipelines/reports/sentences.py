@@ -259,6 +259,11 @@ def _rejection(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
     return f"{share}; all would fit {e['noise_factor']:.2g} times the noise."
 
 
+def _disturbance(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    when = f"{e['since_s']:.1f} to {e['time_s']:.1f} s"
+    return f"{e['family']} disturbed {when}: {e['rejected']} measurements are left out there."
+
+
 def _noise(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     unit, factor = noise_unit(e["noise"], e["unit"])
     if severity > Severity.NOTE:
@@ -341,6 +346,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "jump": _jump,
     "device_change": _device_change,
     "rejection": _rejection,
+    "disturbance": _disturbance,
     "noise": _noise,
     "correlation": _correlation,
     "slow_error": _slow_error,

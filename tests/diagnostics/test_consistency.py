@@ -348,7 +348,7 @@ def test_a_cut_keeps_stamps_and_readings_together(head: Case) -> None:
 
 def test_a_tenth_rejected_is_a_note_and_a_quarter_is_inconsistent(head: Case) -> None:
     def estimate(share: float) -> Estimate:
-        used = np.arange(100) < 100 * share
+        used = np.random.default_rng(0).permutation(100) < 100 * share
         residuals = {"vision": Residuals(np.arange(100.0), np.zeros((100, 3)), used)}
         return Estimate("batch", (), np.zeros(0), np.zeros((0, 0)), True, "", residuals)
 

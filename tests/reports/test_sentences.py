@@ -101,6 +101,12 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "31 % of vision measurements rejected; all would fit 4.1 times the noise.",
     ),
     (
+        "disturbance",
+        NOTE,
+        {"family": "magnetometer", "since_s": 12.31, "time_s": 15.8, "rejected": 71},
+        "magnetometer disturbed 12.3 to 15.8 s: 71 measurements are left out there.",
+    ),
+    (
         "noise",
         INCONSISTENT,
         {"noise": "vision_attitude", "unit": "rad", "source": "config", "used": 0.078}

@@ -1,0 +1,95 @@
+"""A magnetometer disturbed for a while: named with its time, and sigmas true all the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alidade.factors.chi_square import quantile
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.diagnostics.disturbances import disturbances
+from alidade.pipelines.estimation.problem import Estimate, Residuals
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.simulation.simulated import Simulated
+from tests.support.command import Command
+
+TUMBLE = method("tumble")
+SCENARIO = {"attitudes": 30, "turn_rad_s": 1.5, "magnetometer": {"rate_hz": 20.0}}
+_BEGIN, _END = 12.3, 15.8
+
+
+def _disturbed(kind: str, gyro: bool, seed: int) -> Simulated:
+    """A motor's current, 8 uT in the device; a ring that comes near, up to 20 uT; nothing."""
+    scenario = TumbleScenario.model_validate({**SCENARIO, "gyro": {"rate_hz": 50.0} if gyro else None})
+    simulated = TUMBLE.simulate(scenario, seed)
+    t = simulated.data.mag_t
+    shape = {
+        "motor": 8e-6 * ((t >= _BEGIN) & (t <= _END)),
+        "ring": 2e-5 / (1.0 + ((t - 14.0) / 0.6) ** 2) ** 1.5,
+        "": 0.0 * t,
+    }[kind]
+    mag = simulated.data.mag + shape[:, None] * np.array([0.6, -0.64, 0.48])
+    return replace(simulated, data=replace(simulated.data, mag=mag))
+
+
+def _named(found: Any) -> list[tuple[float, float]]:
+    return [(f.evidence["since_s"], f.evidence["time_s"]) for f in found if f.kind == "disturbance"]
+
+
+@pytest.mark.parametrize("gyro", [False, True])
+@pytest.mark.parametrize("kind", ["", "motor", "ring"])
+def test_disturbed_interval_is_named_and_the_rest_is_calibrated(kind: str, gyro: bool) -> None:
+    calibration = Session.of(TUMBLE, _disturbed(kind, gyro, 0)).calibrate(report=False)
+    # The ends of a ring's approach are below the gate, and bias what a gyro makes precise.
+    assert calibration.status == "calibrated" or (kind == "ring" and gyro)
+    named = _named(calibration.findings)
+    if not kind:
+        assert named == []
+        return
+    ((since, until),) = named
+    begin, end = (_BEGIN, _END) if kind == "motor" else (12.5, 15.5)
+    assert since == pytest.approx(begin, abs=0.7)
+    assert until == pytest.approx(end, abs=0.7)
+
+
+@pytest.mark.parametrize("gyro", [False, True])
+def test_sigmas_are_true_beside_a_motor_current(gyro: bool) -> None:
+    total, dof = 0.0, 0
+    for seed in range(4 if gyro else 8):
+        simulated = _disturbed("motor", gyro, seed)
+        estimate: Estimate = Session.of(TUMBLE, simulated).calibrate(report=False).estimate
+        rows = [i for i, n in enumerate(estimate.names) if n in simulated.truth and estimate.covariance[i, i] > 0.0]
+        error = estimate.values[rows] - [simulated.truth[estimate.names[i]] for i in rows]
+        total += float(error @ np.linalg.solve(estimate.covariance[np.ix_(rows, rows)], error))
+        dof += len(rows)
+    assert quantile(0.005, dof) < total < quantile(0.995, dof), f"NEES {total:.1f} for {dof}"
+
+
+def test_independent_outliers_are_no_disturbance() -> None:
+    """At any share; and a dozen of them one after the other are one."""
+    rng, t = np.random.default_rng(0), np.arange(0.0, 40.0, 0.02)
+    for share in np.repeat([0.002, 0.02, 0.1, 0.2], 25):
+        used = rng.random(len(t)) >= share
+        assert _named(disturbances(_residuals(t, used))) == []
+    used = rng.random(len(t)) >= 0.02
+    used[1000:1012] = False
+    ((since, until),) = _named(disturbances(_residuals(t, used)))
+    assert since == pytest.approx(20.0, abs=0.1)
+    assert until == pytest.approx(20.22, abs=0.1)
+
+
+def _residuals(t: np.ndarray, used: np.ndarray) -> Estimate:
+    residuals = {"magnetometer": Residuals(t, np.zeros((len(t), 1)), used)}
+    return Estimate("batch", (), np.zeros(0), np.zeros((0, 0)), True, "", residuals=residuals)
+
+
+def test_the_command_says_when(tmp_path: Path, alidade: Command) -> None:
+    TUMBLE.write(tmp_path / "s.mcap", _disturbed("motor", True, 0))
+    run = alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
+    assert "magnetometer disturbed 12.3 to 15." in " ".join(run.out.split())
+    assert "magnetometer disturbed 12.3 to 15." in (tmp_path / "out" / "report.html").read_text()
