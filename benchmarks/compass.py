@@ -1,4 +1,4 @@
-"""A magnetometer beside a slow gyro, by tumble and its peers: python -m benchmarks.compass [--draws N] [--seconds S].
+"""A magnetometer beside a gyro, by tumble and its peers: python -m benchmarks.compass [--draws N] [--nees].
 
 The simulation of Rodriguez-Martinez and Troni ("Full magnetometer and gyroscope bias estimation using angular rates",
 IEEE J. Oceanic Eng. 2024): roll, pitch and heading are sinusoids, 10 Hz, magnetometer 10 mG and gyro 10 mrad/s a
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,10 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.chi_square import quantile
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.published import ellipsoid
 from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.methods.tumble.scenario import TumbleScenario
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 
@@ -35,6 +39,16 @@ _FIELD = np.array([227.207, 51.796, 411.731]) * 1e-7  # T, level
 _SOFT = np.array([[1.10, 0.10, 0.04], [0.10, 0.88, 0.02], [0.04, 0.02, 1.22]])
 _HARD = np.array([2e-6, 12e-6, 9e-6])
 _GAUSS = 1e-4  # T
+
+# Noise densities, SI, and gyro bias and scale of a simulated grade.
+GRADES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
+    "tactical": ({"density": 1e-8}, {"density": 5e-6, "bias": 1e-4, "scale": 1e-3}),
+    "consumer": ({"density": 3e-8}, {"density": 1e-4, "bias": 1e-2, "scale": 1e-2}),
+    "poor": ({"density": 2e-7, "soft_iron": 0.1}, {"density": 1e-3, "bias": 5e-2, "scale": 3e-2}),
+}
+# Largest tilt, deg, and number of attitudes: by hand, in flight, on deck.
+TILTS = {"all": (180.0, 16), "flight": (40.0, 20), "level": (8.0, 24)}
+RATES_HZ = (5.0, 25.0, 100.0, 400.0)
 
 # K (3, 3) and b (3,) of calibrated = K raw + b, in any unit.
 Triad = tuple[Array, Array]
@@ -122,13 +136,60 @@ def table(draws: int, seconds: float) -> Iterator[str]:
         yield f"| {name} | {' | '.join(cells)} |"
 
 
+def nees(hz: float, grade: str, motion: str, seeds: Iterable[int], accelerometer: bool = False) -> tuple[float, int]:
+    """Sum over recordings of the NEES of all parameters, and its degrees of freedom; every second place is unknown."""
+    (mag, gyro), (tilt, attitudes) = GRADES[grade], TILTS[motion]
+    total, dof = 0.0, 0
+    for seed in seeds:
+        scenario = TumbleScenario.model_validate(
+            {
+                "tilt_deg": tilt,
+                "attitudes": attitudes,
+                "turn_rad_s": 0.6 if hz < 25.0 else 1.5,
+                "magnetometer": {"rate_hz": min(hz, 50.0), **mag},
+                "gyro": {"rate_hz": hz, **gyro},
+                "accelerometer": {"rate_hz": hz} if accelerometer else None,
+                "latitude_deg": None if seed % 2 else 40.0,
+            }
+        )
+        simulated = method("tumble").simulate(scenario, seed)
+        estimate = solve_batch(Session.of(method("tumble"), simulated).problem())
+        rows = [
+            i for i, n in enumerate(estimate.names) if n in simulated.truth and float(estimate.covariance[i, i]) > 0.0
+        ]
+        error = estimate.values[rows] - [simulated.truth[estimate.names[i]] for i in rows]
+        total += float(error @ np.linalg.solve(estimate.covariance[np.ix_(rows, rows)], error))
+        dof += len(rows)
+    return total, dof
+
+
+def consistency(draws: int) -> Iterator[str]:
+    """Rows, markdown: NEES over its degrees of freedom, * outside its two-sided 99 % interval; time of 30 pairs."""
+    yield f"| rate, Hz | {' | '.join(f'{grade}, {motion}' for grade in GRADES for motion in TILTS)} |"
+    yield "|" + " --- |" * (1 + len(GRADES) * len(TILTS))
+    for hz in RATES_HZ:
+        cells = []
+        for grade in GRADES:
+            for motion in TILTS:
+                total, dof = nees(hz, grade, motion, range(draws))
+                inside = quantile(0.005, dof) < total < quantile(0.995, dof)
+                cells.append(f"{total / dof:.2f}{'' if inside else '*'}")
+        yield f"| {hz:g} | {' | '.join(cells)} |"
+    begin = time.perf_counter()
+    total, dof = nees(100.0, "consumer", "all", range(30), accelerometer=True)
+    low, high = (quantile(p, dof) / dof for p in (0.025, 0.975))
+    yield f"30 pairs with an accelerometer: {time.perf_counter() - begin:.0f} s, simulation included; "
+    yield f"ANEES {total / dof:.3f}, 95 % {low:.3f} to {high:.3f}"
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.compass", description="Angle of the field, RMS, deg.")
     parser.add_argument("--draws", type=int, default=3, help="recordings of each motion")
     parser.add_argument("--seconds", type=float, default=600.0, help="length of each")
+    parser.add_argument("--nees", action="store_true", help="consistency of tumble")
     options = parser.parse_args()
-    for row in table(options.draws, options.seconds):
+    for row in consistency(options.draws) if options.nees else table(options.draws, options.seconds):
         print(row, flush=True)
 
 

@@ -50,13 +50,13 @@ BUDGETS = {
     "start": 2_850,
     "methods": 5_300,
     "tutorials": 360,
-    "howto": 4_800,
+    "howto": 5_000,
     "explanation": 2_400,
     "validation": 2_050,
     "reference": 2_200,
 }
 # Of all pages with what the program writes; blocks of code do not count, nor what autodoc adds (some 600).
-BUDGET = 29_300
+BUDGET = 29_600
 
 
 def words(text: str) -> int:

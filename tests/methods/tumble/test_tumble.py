@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -212,6 +213,24 @@ def test_gyro_of_any_rate_is_consistent_over_many_seeds(hz: float) -> None:
         _assert_consistent(_turned(hz, beside=True), range(8))
     for latitude in (40.0, None):
         _assert_consistent(_turned(hz, beside=False).model_copy(update={"latitude_deg": latitude}), range(12))
+
+
+@pytest.mark.parametrize(
+    ("hz", "grades", "motions", "seeds"),
+    [
+        (100.0, ["tactical"], ["flight"], 1),
+        *(pytest.param(hz, compass.GRADES, compass.TILTS, 4, marks=pytest.mark.slow) for hz in (25.0, 100.0, 400.0)),
+    ],
+)
+def test_compass_of_any_grade_and_motion_is_consistent(
+    hz: float, grades: Sequence[str], motions: Sequence[str], seeds: int
+) -> None:
+    """Not on deck with a gyro of 1 mrad/s/sqrt(Hz), 2 to 6, or a tactical one that samples 25 points a second, 3."""
+    for grade, motion in product(grades, motions):
+        if motion == "level" and (grade == "poor" or (hz == 25.0 and grade == "tactical")):
+            continue
+        total, dof = compass.nees(hz, grade, motion, range(seeds))
+        assert quantile(0.005, dof) < total < quantile(0.995, dof), f"{grade}, {motion}: NEES {total:.1f} for {dof}"
 
 
 @pytest.mark.slow
