@@ -66,7 +66,8 @@ def _centres(raw: Array, centre: Array, radius: float, strength: float | None) -
     """Of spheres: the nearest one; of a known radius, those two through the same ring, and the one about zero."""
     if strength is None:
         return [centre]
-    normal = np.linalg.eigh(np.cov(raw.T))[1][:, 0]
+    spread = raw - raw.mean(axis=0)
+    normal = np.linalg.eigh(spread.T @ spread)[1][:, 0]
     away = np.sqrt(max(strength**2 - radius**2, 0.0)) * normal
     return [centre, centre - away, centre + away, np.zeros(3)]
 
