@@ -283,9 +283,9 @@ def _about_one_axis(mag: Sensor) -> list[str]:
     centre = " and ".join(f"{'xyz'[i]} {factor * found.centre[i]:.4g}" for i in across)
     return [
         f"The magnetometer was turned about one axis only, {described(found.axis)}. Across it the hard iron is "
-        f"{centre} ± {factor * found.sigma:.1g} {unit}, and the longest axis of the ellipse of readings is "
-        f"{found.ratio:.3f} times the shortest, which is what headings about that axis need; what is along it, and by "
-        "how much it leans, is hardly known."
+        f"{centre} ± {factor * found.sigma:.1g} {unit}, with what soft iron makes of the field along the axis, and the "
+        f"longest axis of the ellipse of readings is {found.ratio:.3f} times the shortest, which is what headings "
+        "about that axis need; what is along it, and by how much it leans, is hardly known."
     ]
 
 

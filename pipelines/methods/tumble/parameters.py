@@ -81,9 +81,8 @@ def _triad(sensor: Sensor, config: Config) -> Variable:
     sigma = np.repeat([GAIN * sensor.gain, spread], [gains, 3])
     # An offset of many times the strength, as of counts, goes with the gain.
     wide = max(1.0, float(np.linalg.norm(sensor.start[-3:])))
-    require = np.repeat(
-        [_REQUIRE_GAIN * (1.0 if sensor.unit == "1" else sensor.gain), _REQUIRE_BIAS[sensor.name] * wide], [gains, 3]
-    )
+    accuracy = _REQUIRE_GAIN * (1.0 if sensor.unit == "1" else sensor.gain)
+    require = np.repeat([accuracy, _REQUIRE_BIAS[sensor.name] * wide], [gains, 3])
     listed = []
     units = [_gain_unit(sensor)] * gains + [sensor.unit] * 3
     for i, (name, unit) in enumerate(zip(sensor.names, units, strict=True)):
