@@ -357,7 +357,7 @@ def test_errors_name_what_is_missing_where_and_what_there_is(alidade: Command, s
     assert "c.yaml: unknown key require.helmet_mount_q; the nearest known key is helmet_mount_" in run.err
     run = alidade("simulate", "tumble", "--scenario", "los_nominal", "--out", tmp_path / "x.mcap")
     assert run.code == 2
-    assert "scenario los_nominal is of method los; tumble has tumble_imu, " in run.err
+    assert "scenario los_nominal is of method los; tumble has tumble_car, tumble_imu, " in run.err
     method("tumble").write(tmp_path / "t.mcap", method("tumble").simulate(method("tumble").settings("tumble_imu"), 1))
     run = alidade("calibrate", tmp_path / "t.mcap", "--method", "los", "--out", tmp_path / "out")
     assert run.code == 2

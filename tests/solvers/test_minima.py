@@ -17,7 +17,7 @@ from alidade.pipelines.solvers.batch import BatchConfig, solve_batch
 from alidade.pipelines.solvers.engines import ALL, Compiled
 
 # Iron by which one axis of the magnetometer says little.
-STRONG = TumbleScenario(magnetometer=TumbledMagnetometer(soft_iron=0.2))
+STRONG = TumbleScenario(magnetometer=TumbledMagnetometer(soft_iron=0.3))
 
 
 def tumbled(scenario: TumbleScenario, seed: int) -> Session:
@@ -45,7 +45,8 @@ def test_a_solution_nearly_as_likely_is_told(tmp_path: Path) -> None:
     assert found["status"] == "calibrated"
     second = found["second_best"]
     assert 0.0 < second["chi_square"] < BatchConfig.close
-    assert abs(second["parameters"]["mag_k33"] - calibration.parameters["mag_k33"].value) > 0.3
+    k33 = calibration.parameters["mag_k33"]
+    assert abs(second["parameters"]["mag_k33"] - k33.value) > 100.0 * k33.sigma
     (ambiguous,) = [each for each in found["findings"] if each["kind"] == "ambiguous_solution"]
     assert ambiguous["severity"] == "note"
     assert ambiguous["values"]["mag_k33"][0] == second["parameters"]["mag_k33"]

@@ -403,7 +403,14 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
     except InputError:
         return None
     alone = data.gyro is None and np.diff(found).sum() > _MOSTLY * (t[-1] - t[0])
-    return found if len(found) >= FEWEST or alone else None
+    return found if len(found) >= FEWEST or (alone and _turned_within(t, data.accel, found) < _TURNED) else None
+
+
+def _turned_within(t: Array, accel: Array, rests: Array) -> float:
+    """Median over rests of what an accelerometer scatters by within each, over gravity: a slow turn is no rest."""
+    parts = [accel[first:last] for first, last in np.searchsorted(t, rests)]
+    scatter = [float(np.sqrt(part.var(axis=0).sum()) / np.linalg.norm(part.mean(axis=0))) for part in parts]
+    return float(np.median(scatter))
 
 
 def _at(time: Array, stamps: Array, values: Array) -> Array:
