@@ -17,7 +17,7 @@ import pytest
 from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.sources import Source, StandardInput, source_of
-from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines.applications.session import OpenOptions
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.growing import GrowingFiles
@@ -117,7 +117,7 @@ def follow_live(kind: str, whole: Path, config: Path, folder: Path) -> tuple[Cal
     with ExitStack() as stack:
         source, is_over, began = played(kind, sent, folder, stack)
         stack.enter_context(source)
-        settings = Settings(config=config, patience=10.0)
+        settings = Settings(config=config, patience=10.0, check=True)
         calibration = Follower(source, settings, show, lambda _: None, is_over).follow()
     now, upto = np.array(told).T
     return calibration, now - began() - upto, upto
@@ -141,12 +141,9 @@ def test_ninety_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
     calibration, late, upto = follow_live(kind, whole, config, tmp_path)
     print(f"{kind}: median delay {np.median(late):.3f} s, 95 % below {np.percentile(late, 95):.3f} s")
     assert upto[-1] > 89.0
-    finished = calibrate(whole, ["incremental"])[0]
+    finished = OpenOptions().read(whole).calibrate("incremental")
     for name, p in finished.parameters.items():
-        # The LOS errors that los_scale goes by are smoothed over what there was: it was 0.11 sigma off.
-        # What comes in other portions is linearised elsewhere, by .06 sigma at most; .1 would add .5 % to an error.
-        sigmas = 0.3 if name == "los_scale" else 0.1
-        assert calibration.parameters[name].value == pytest.approx(p.value, abs=sigmas * p.sigma), name
+        assert calibration.parameters[name].value == pytest.approx(p.value, abs=1e-3 * p.sigma), name
 
 
 # Enough for a first look, s.
