@@ -233,7 +233,9 @@ def test_a_look_reads_the_end_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_an_hour_costs_as_much_at_its_end_as_at_its_start(tmp_path: Path) -> None:
     """Pieces of 4 s, as looks five times a second at 20 times the speed would find them."""
     spent = follow_grown(tmp_path, 3600.0, 4.0)
-    time_s, processor = spent.T
+    # In the end a clock that has drifted far is solved anew from the first second.
+    again = np.flatnonzero(np.diff(spent[:, 0]) < 0.0)
+    time_s, processor = spent[: again[0] + 1 if len(again) else None].T
 
     def share(start: float, stop: float) -> float:
         a, b = np.interp([start, stop], time_s, processor)
