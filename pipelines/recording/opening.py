@@ -135,10 +135,9 @@ def _by_content(path: Path, data: Path) -> Container:
 
         return read_ulog(path, data)
     if start.startswith(_ARDUPILOT):
-        raise InputError(
-            f"{path}: an ArduPilot log; make CSV of it (`mavlogdump.py --format csv`, from pymavlink) and say under "
-            "`columns:` in the config which column is what"
-        )
+        from alidade.pipelines.recording.dataflash import read_dataflash
+
+        return read_dataflash(path, data)
     if start.startswith(_ZSTD):
         raise InputError(f"{path}: compressed twice")
     if is_video(start):

@@ -44,6 +44,12 @@ def make_ulog(_: Path, folder: Path) -> Path:
     return forms.ulog(folder / "s.ulg", {"sensor_combined": columns})
 
 
+def make_dataflash(_: Path, folder: Path) -> Path:
+    t_ns, gyro, _wxyz = turning(200)
+    axes = {f"{kind}{axis}": gyro[:, i] for kind in ("Gyr", "Acc") for i, axis in enumerate("XYZ")}
+    return forms.dataflash(folder / "s.bin", {"IMU": ("Qdddddd", {"TimeUS": t_ns // 1000, **axes})})
+
+
 def make_tum(_: Path, folder: Path) -> Path:
     t_ns, position, wxyz = turning(200)
     path = folder / "s.tum"
@@ -76,6 +82,7 @@ MAKERS: dict[str, Callable[[Path, Path], Path]] = {
     "mcap protobuf": lambda s, f: forms.mcap_protobuf(s, f / "p.mcap"),
     "mcap.zstd": lambda s, f: forms.zstd(s, f / "s.mcap.zstd"),
     "ulg": make_ulog,
+    "bin": make_dataflash,
     "csv": make_csv,
     "tum": make_tum,
     "euroc": make_euroc,
@@ -108,7 +115,7 @@ class Small:
         if self.form == "tum":
             poses = recording.poses("/trajectory")
             return {"/trajectory": (poses.t_ns, np.hstack([poses.position, poses.wxyz]))}
-        own = {"ulg": "/sensor_combined", "euroc": "/imu0"}.get(self.form)
+        own = {"ulg": "/sensor_combined", "bin": "/IMU", "euroc": "/imu0"}.get(self.form)
         if own is None:
             return read(recording)
         imu = recording.imu(own)

@@ -541,13 +541,6 @@ def test_px4_logs(tmp_path: Path) -> None:
     np.testing.assert_allclose(forward, [0.0, 1.0, 0.0], atol=1e-12)
 
 
-def test_an_ardupilot_log_names_the_converter(tmp_path: Path) -> None:
-    path = tmp_path / "1.bin"
-    path.write_bytes(b"\xa3\x95\x80\x80" + bytes(100))
-    with pytest.raises(InputError, match=r"an ArduPilot log; make CSV of it .*mavlogdump.*columns:"):
-        open_recording(path)
-
-
 # -- messages
 
 

@@ -268,6 +268,27 @@ def ulog(path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]]) -> Path
     return path
 
 
+def dataflash(path: Path, kinds: dict[str, tuple[str, dict[str, np.ndarray[Any, Any]]]]) -> Path:
+    """An ArduPilot log: kinds, name -> letters of the format and columns, the first of which is the time."""
+    letters = {"c": "h", "C": "H", "e": "i", "E": "I", "L": "i", "N": "16s", "Z": "64s"}
+
+    def record(number: int, body: bytes) -> bytes:
+        return b"\xa3\x95" + bytes([number]) + body
+
+    def form(number: int, length: int, name: str, codes: str, columns: str) -> bytes:
+        texts = name.encode(), codes.encode(), columns.encode()
+        return record(0x80, struct.pack("<BB4s16s64s", number, length, *texts))
+
+    out, rows = [form(0x80, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")], []
+    for number, (name, (codes, columns)) in enumerate(kinds.items(), start=1):
+        packed = "<" + "".join(letters.get(code, code) for code in codes)
+        out.append(form(number, 3 + struct.calcsize(packed), name, codes, ",".join(columns)))
+        lines = zip(*(values.tolist() for values in columns.values()), strict=True)
+        rows += [(int(line[0]), record(number, struct.pack(packed, *line))) for line in lines]
+    path.write_bytes(b"".join([*out, *(data for _, data in sorted(rows, key=lambda row: row[0]))]))
+    return path
+
+
 def h264(pictures: Any) -> list[bytes]:
     """Grey pictures (n, height, width), in multiples of 16, as H.264: a key picture a message, of raw macroblocks."""
     _, height, width = pictures.shape

@@ -1,0 +1,192 @@
+"""ArduPilot logs (.bin, DataFlash), indexed with pymavlink.
+
+Axes stay those of the log: forward, right, down. Of ATT the world alone is turned from North-East-Down to
+East-North-Up, as ROS has it. Times are those since the start of the autopilot, put into Unix time by the fixes.
+Columns and their units: ArduPilot's LogStructure.h of AP_InertialSensor, AP_Compass, AP_AHRS and AP_GPS.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.array_container import ArrayContainer
+from alidade.pipelines.recording.container import byte_windows
+
+Array = NDArray[np.float64]
+# Messages: their kind and the number of the sensor; their columns by name.
+Kind = tuple[str, int]
+Columns = Mapping[str, NDArray[Any]]
+
+_MILLIGAUSS = 1e-7
+# East-North-Up from North-East-Down, w, x, y, z: half a turn about the line between the first two axes.
+_ENU_FROM_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+# Start of GPS time less its leap seconds since 2017, Unix us, and a week, us.
+_GPS_EPOCH_US, _WEEK_US = 315_964_782_000_000, 604_800_000_000
+# Bytes of every message before its columns: two marks and the number of its kind.
+_HEAD = 3
+# Bytes at the end of a log that need not be messages: logs are written in pages (pymavlink's own limit).
+_TAIL = 528
+_CORRECTED = "readings are as the autopilot corrected them: a calibration comes on top of its own"
+
+
+def read_dataflash(path: Path, data: Path) -> ArrayContainer:
+    """The sensors, attitudes and fixes in a log, each under the name of its messages there, `/IMU`.
+
+    Further instances of a sensor are `/IMU/1` and so on, an IMU's temperature `/IMU/temperature`. Raises InputError
+    when pymavlink is not installed or the file is damaged beyond reading.
+    """
+    try:
+        from pymavlink.DFReader import FORMAT_TO_STRUCT, DFReader_binary
+    except ImportError as error:
+        raise InputError(f"{path}: an ArduPilot log; to read it: pip install 'alidade[ardupilot]'") from error
+
+    class Index(DFReader_binary):  # type: ignore[misc]
+        """Formats, and where messages lie; without a clock, for which pymavlink reads all messages one by one."""
+
+        def init_clock(self) -> None:
+            return
+
+        def init_arrays_fast(self, progress_callback: Any = None) -> None:
+            """By pymavlink's Python: its C prints what is damaged."""
+            self.init_arrays(progress_callback)
+
+    content = np.fromfile(data, np.uint8)
+    try:
+        said = io.StringIO()
+        with redirect_stdout(said), redirect_stderr(said), closing(Index(data)) as log:
+            found = dict(_messages(log, FORMAT_TO_STRUCT, content))
+            is_damaged = _is_damaged(log, len(content))
+    except Exception as error:  # a parser on bytes that may be anything
+        why = " ".join(str(error).split())[:200]
+        raise InputError(f"{path}: an ArduPilot log that cannot be read ({why})") from error
+    try:
+        offset = _unix_offset(found)
+        topics = dict(_topics(found, offset))
+    except KeyError as error:
+        raise InputError(f"{path}: an ArduPilot log without the columns of its messages ({error})") from error
+    assumptions = [_CORRECTED]
+    if not offset:
+        assumptions.append("no fix says what time it was: times are those since the autopilot was switched on")
+    container = ArrayContainer(path, topics, assumptions, data)
+    if is_damaged:
+        container.incomplete = ("the log is damaged; what could be read of it is used",)
+    return container
+
+
+def _is_damaged(log: Any, size: int) -> bool:
+    """Whether there is something else between the messages, or behind them."""
+    there = [(log.offsets[number], form.len) for number, form in log.formats.items() if log.offsets[number]]
+    end = max((at[-1] + length for at, length in there), default=0)
+    return end > sum(len(at) * length for at, length in there) or size - end > _TAIL
+
+
+def _messages(log: Any, codes: Mapping[str, Any], content: NDArray[np.uint8]) -> Iterator[tuple[Kind, Columns]]:
+    """Columns of the messages of each kind and instance, scaled as their format says.
+
+    Logs before 2020 number instances in the name of the kind, `IMU2`. Raises ValueError and KeyError for formats that
+    do not fit their messages.
+    """
+    for number, form in log.formats.items():
+        name = form.name.rstrip("123")
+        if name not in _READERS:
+            continue
+        types = [f"<{codes[code][0]}" for code in form.msg_fmts]
+        dtype = np.dtype([("", f"V{_HEAD}"), *zip(form.columns, types, strict=True)])
+        if dtype.itemsize != form.len:
+            raise ValueError(f"the columns of {form.name} do not fill its messages")
+        at = np.asarray(log.offsets[number], dtype=np.int64)
+        read = byte_windows(content, form.len)[at[at + form.len <= len(content)]].view(dtype)
+        scales = (1.0 if scale is None else 1.0 / scale for scale in form.msg_mults)
+        data = {column: _scaled(read[column], per_unit) for column, per_unit in zip(form.columns, scales, strict=True)}
+        which = data.get("I", np.full(len(read), int(form.name.removeprefix(name) or 1) - 1))
+        for instance in np.unique(which).tolist():
+            yield (name, instance), {column: values[which == instance] for column, values in data.items()}
+
+
+def _scaled(values: NDArray[Any], per_unit: float) -> NDArray[Any]:
+    """Values in units, exact to the last bit: divided by a whole number."""
+    return values if per_unit == 1.0 else values / round(per_unit)
+
+
+def _topics(found: Mapping[Kind, Columns], offset: int) -> Iterator[tuple[str, series.Topic]]:
+    """Topics from the messages, with an IMU's temperature where it has one."""
+    for (kind, instance), data in found.items():
+        name = f"/{kind}" + (f"/{instance}" if instance else "")
+        yield name, _READERS[kind](data, offset)
+        if kind == "IMU" and "T" in data:
+            yield f"{name}/temperature", series.TemperatureSeries(_stamps(data, offset), data["T"].astype(float))
+
+
+def _unix_offset(found: Mapping[Kind, Columns]) -> int:
+    """Offset from log time to Unix time, us, the median over all fixes; 0 without one that knows the time."""
+    offsets = [np.zeros(0, np.int64)]
+    for data in (data for (kind, _), data in found.items() if kind == "GPS"):
+        week, ms, logged = (data[name].astype(np.int64) for name in ("GWk", "GMS", "TimeUS"))
+        offsets.append((_GPS_EPOCH_US + _WEEK_US * week + 1000 * ms - logged)[week > 0])
+    known = np.concatenate(offsets)
+    return int(np.median(known)) if len(known) else 0
+
+
+def _stamps(data: Columns, offset: int) -> NDArray[np.int64]:
+    """When it was measured, Unix ns; a compass says so in the lower 32 bits of the clock."""
+    logged = data["TimeUS"].astype(np.int64)
+    if np.any(data.get("S", 0)):
+        logged = logged - (logged - data["S"].astype(np.int64)) % (1 << 32)
+    return (data.get("SampleUS", logged).astype(np.int64) + offset) * 1000
+
+
+def _columns(data: Columns, *names: str) -> Array:
+    return np.stack([data[name].astype(float) for name in names], axis=1)
+
+
+def _imu(data: Columns, offset: int) -> series.ImuSeries:
+    rates, forces = _columns(data, "GyrX", "GyrY", "GyrZ"), _columns(data, "AccX", "AccY", "AccZ")
+    return series.ImuSeries(_stamps(data, offset), rates, forces)
+
+
+def _gyro(data: Columns, offset: int) -> series.VectorSeries:
+    return series.VectorSeries(_stamps(data, offset), _columns(data, "GyrX", "GyrY", "GyrZ"))
+
+
+def _accel(data: Columns, offset: int) -> series.VectorSeries:
+    return series.VectorSeries(_stamps(data, offset), _columns(data, "AccX", "AccY", "AccZ"))
+
+
+def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
+    """Readings, each once: the log repeats one until there is the next."""
+    t_ns = _stamps(data, offset)
+    new = np.diff(t_ns, prepend=t_ns[0] - 1) != 0
+    return series.MagneticSeries(t_ns[new], _MILLIGAUSS * _columns(data, "MagX", "MagY", "MagZ")[new])
+
+
+def _attitude(data: Columns, offset: int) -> series.QuaternionSeries:
+    """Turned about down by the yaw, then about right by the pitch, then about forward by the roll."""
+    turns = np.radians(_columns(data, "Yaw", "Pitch", "Roll"))
+    about = [so3.exp(turns[:, i, None] * np.eye(3)[2 - i]) for i in range(3)]
+    return series.QuaternionSeries(_stamps(data, offset), so3.compose(_ENU_FROM_NED, *about))
+
+
+def _fix(data: Columns, offset: int) -> series.FixSeries:
+    """Fixes, with the height above mean sea level."""
+    status = np.where(data["Status"] >= 3, 0.0, -1.0)
+    return series.FixSeries(_stamps(data, offset), data["Lat"], data["Lng"], data["Alt"], status=status)
+
+
+_READERS: dict[str, Callable[[Columns, int], series.Topic]] = {
+    "IMU": _imu,
+    "GYR": _gyro,
+    "ACC": _accel,
+    "MAG": _magnetic,
+    "ATT": _attitude,
+    "GPS": _fix,
+}
