@@ -261,7 +261,7 @@ def test_the_person_is_told_what_moved_and_when() -> None:
 @pytest.mark.slow
 def test_the_incremental_solver_finds_slips_and_raises_no_false_alarms() -> None:
     for seed in range(4):
-        calibration = session(seed, 0.5).calibrate("incremental", check=False)
+        calibration = session(seed, 0.5).calibrate("incremental")
         assert calibration.status == "inconsistent"
         assert calibration.stability is not None
         assert calibration.stability.time_s == pytest.approx(30.0, abs=5.0)
