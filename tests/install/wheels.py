@@ -85,4 +85,4 @@ def main() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    sys.exit("\n".join(main()))
+    sys.exit("\n".join(main()) or None)  # an empty text would be a failure
