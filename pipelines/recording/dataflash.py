@@ -21,15 +21,12 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.container import byte_windows
+from alidade.pipelines.recording.ulog import ENU_FROM_NED, Columns, columns
 
-Array = NDArray[np.float64]
-# Messages: their kind and the number of the sensor; their columns by name.
+# Messages: their kind and the number of the sensor.
 Kind = tuple[str, int]
-Columns = Mapping[str, NDArray[Any]]
 
 _MILLIGAUSS = 1e-7
-# East-North-Up from North-East-Down, w, x, y, z: half a turn about the line between the first two axes.
-_ENU_FROM_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 # Start of GPS time less its leap seconds since 2017, Unix us, and a week, us.
 _GPS_EPOCH_US, _WEEK_US = 315_964_782_000_000, 604_800_000_000
 # Bytes of every message before its columns: two marks and the number of its kind.
@@ -40,7 +37,7 @@ _CORRECTED = "readings are as the autopilot corrected them: a calibration comes 
 
 
 def read_dataflash(path: Path, data: Path) -> ArrayContainer:
-    """The sensors, attitudes and fixes in a log, each under the name of its messages there, `/IMU`.
+    """Read sensors, attitudes and fixes of an ArduPilot log as topics named as its messages, `/IMU`.
 
     Further instances of a sensor are `/IMU/1` and so on, an IMU's temperature `/IMU/temperature`. Raises InputError
     when pymavlink is not installed or the file is damaged beyond reading.
@@ -145,35 +142,31 @@ def _stamps(data: Columns, offset: int) -> NDArray[np.int64]:
     return (data.get("SampleUS", logged).astype(np.int64) + offset) * 1000
 
 
-def _columns(data: Columns, *names: str) -> Array:
-    return np.stack([data[name].astype(float) for name in names], axis=1)
-
-
 def _imu(data: Columns, offset: int) -> series.ImuSeries:
-    rates, forces = _columns(data, "GyrX", "GyrY", "GyrZ"), _columns(data, "AccX", "AccY", "AccZ")
+    rates, forces = columns(data, "GyrX", "GyrY", "GyrZ"), columns(data, "AccX", "AccY", "AccZ")
     return series.ImuSeries(_stamps(data, offset), rates, forces)
 
 
 def _gyro(data: Columns, offset: int) -> series.VectorSeries:
-    return series.VectorSeries(_stamps(data, offset), _columns(data, "GyrX", "GyrY", "GyrZ"))
+    return series.VectorSeries(_stamps(data, offset), columns(data, "GyrX", "GyrY", "GyrZ"))
 
 
 def _accel(data: Columns, offset: int) -> series.VectorSeries:
-    return series.VectorSeries(_stamps(data, offset), _columns(data, "AccX", "AccY", "AccZ"))
+    return series.VectorSeries(_stamps(data, offset), columns(data, "AccX", "AccY", "AccZ"))
 
 
 def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
     """Readings, each once: the log repeats one until there is the next."""
     t_ns = _stamps(data, offset)
     new = np.diff(t_ns, prepend=t_ns[0] - 1) != 0
-    return series.MagneticSeries(t_ns[new], _MILLIGAUSS * _columns(data, "MagX", "MagY", "MagZ")[new])
+    return series.MagneticSeries(t_ns[new], _MILLIGAUSS * columns(data, "MagX", "MagY", "MagZ")[new])
 
 
 def _attitude(data: Columns, offset: int) -> series.QuaternionSeries:
     """Turned about down by the yaw, then about right by the pitch, then about forward by the roll."""
-    turns = np.radians(_columns(data, "Yaw", "Pitch", "Roll"))
+    turns = np.radians(columns(data, "Yaw", "Pitch", "Roll"))
     about = [so3.exp(turns[:, i, None] * np.eye(3)[2 - i]) for i in range(3)]
-    return series.QuaternionSeries(_stamps(data, offset), so3.compose(_ENU_FROM_NED, *about))
+    return series.QuaternionSeries(_stamps(data, offset), so3.compose(ENU_FROM_NED, *about))
 
 
 def _fix(data: Columns, offset: int) -> series.FixSeries:

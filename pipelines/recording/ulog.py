@@ -27,7 +27,7 @@ Columns = Mapping[str, NDArray[Any]]
 
 _GAUSS = 1e-4
 # East-North-Up from North-East-Down, w, x, y, z: half a turn about the line between the first two axes.
-_ENU_FROM_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+ENU_FROM_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 
 
 def read_ulog(path: Path, data: Path) -> ArrayContainer:
@@ -93,12 +93,13 @@ def _stamps(data: Columns, offset: int) -> NDArray[np.int64]:
     return (stamps.astype(np.int64) + offset) * 1000
 
 
-def _columns(data: Columns, *names: str) -> Array:
+def columns(data: Columns, *names: str) -> Array:
+    """Columns (n, len(names)) of messages, side by side."""
     return np.stack([data[name].astype(float) for name in names], axis=1)
 
 
 def _indexed(data: Columns, name: str, count: int) -> Array:
-    return _columns(data, *(f"{name}[{i}]" for i in range(count)))
+    return columns(data, *(f"{name}[{i}]" for i in range(count)))
 
 
 def _sensor_combined(data: Columns, offset: int) -> series.ImuSeries:
@@ -116,7 +117,7 @@ def _vehicle_imu(data: Columns, offset: int) -> series.ImuSeries:
 
 
 def _vector(data: Columns, offset: int) -> series.VectorSeries:
-    return series.VectorSeries(_stamps(data, offset), _columns(data, "x", "y", "z"))
+    return series.VectorSeries(_stamps(data, offset), columns(data, "x", "y", "z"))
 
 
 def _fifo(data: Columns, offset: int) -> series.VectorSeries:
@@ -131,16 +132,16 @@ def _fifo(data: Columns, offset: int) -> series.VectorSeries:
 
 
 def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
-    field = _columns(data, "x", "y", "z") if "x" in data else _indexed(data, "magnetometer_ga", 3)
+    field = columns(data, "x", "y", "z") if "x" in data else _indexed(data, "magnetometer_ga", 3)
     return series.MagneticSeries(_stamps(data, offset), _GAUSS * field)
 
 
 def _attitude(data: Columns, offset: int) -> series.QuaternionSeries:
-    return series.QuaternionSeries(_stamps(data, offset), so3.multiply(_ENU_FROM_NED, _indexed(data, "q", 4)))
+    return series.QuaternionSeries(_stamps(data, offset), so3.multiply(ENU_FROM_NED, _indexed(data, "q", 4)))
 
 
 def _odometry(data: Columns, offset: int) -> series.PoseSeries:
-    position = _indexed(data, "position", 3) if "position[0]" in data else _columns(data, "x", "y", "z")
+    position = _indexed(data, "position", 3) if "position[0]" in data else columns(data, "x", "y", "z")
     return series.PoseSeries(_stamps(data, offset), _indexed(data, "q", 4), position)
 
 
