@@ -63,7 +63,7 @@ def _sphere_numbers(centre: Array) -> Array:
 
 
 def _centres(raw: Array, centre: Array, radius: float, strength: float | None) -> list[Array]:
-    """Of spheres: the nearest one; of a known radius, those two through the same ring, and the one about zero."""
+    """Centres of spheres near the readings: the nearest; of a known radius, both through their ring, and zero."""
     if strength is None:
         return [centre]
     spread = raw - raw.mean(axis=0)

@@ -43,9 +43,11 @@ _MOSTLY = 1.0 / 3.0
 _BLOCK = 0.25
 # Strength of the earth's field where the place is unknown, T: 22e-6 to 67e-6.
 _EARTH_FIELD = 4.5e-5
-# Scatter of an accelerometer over gravity below which it did not turn; of one without rests and gyro, whose motion is
-# noise, below which it was within 20 deg of upright.
-_TURNED, _TILTED = 0.02, 0.25
+# Scatter of readings over their size below which a device did not turn: a degree, which is more than noise. A
+# magnetometer in T with ten times the field for its offset scatters by more when it turns; counts may have any offset.
+TURNED = 0.02
+# The same of an accelerometer without rests and gyro, whose motion is noise: it was within 20 deg of upright.
+_TILTED = 0.25
 # No sensor resolves a smaller share of what it measures; numbers without noise leave rounding.
 _RESOLUTION = 1e-9
 # A rotation from pairs of vectors is unique where the second-best solution fits this many times worse.
@@ -268,13 +270,17 @@ def _is_upright(data: TumbleData, rests: Array | None) -> bool:
     assert data.accel is not None
     assert data.accel_t is not None
     raw = _means(data.accel_t, data.accel, rests)[1]
-    size = float(np.median(np.linalg.norm(raw, axis=1)))
-    turned = float(np.sqrt(raw.var(axis=0).sum())) / size
-    return _is_si("accel", raw) and turned < (_TILTED if rests is None and data.gyro is None else _TURNED)
+    least = _TILTED if rests is None and data.gyro is None else TURNED
+    return _is_si("accel", raw) and relative_scatter(raw) < least
+
+
+def relative_scatter(raw: Array) -> float:
+    """Scatter of readings (n, 3) about their mean, all axes together, over their median length."""
+    return float(np.sqrt(raw.var(axis=0).sum()) / np.median(np.linalg.norm(raw, axis=1)))
 
 
 def _about_one_axis(mag: Sensor) -> list[str]:
-    """What a magnetometer shows that was turned about one axis."""
+    """Note on a magnetometer that was turned about one axis: hard iron across it, its sigma, ratio of the ellipse."""
     found = ring(mag.raw)
     if found is None:
         return []
@@ -403,14 +409,12 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
     except InputError:
         return None
     alone = data.gyro is None and np.diff(found).sum() > _MOSTLY * (t[-1] - t[0])
-    return found if len(found) >= FEWEST or (alone and _turned_within(t, data.accel, found) < _TURNED) else None
+    return found if len(found) >= FEWEST or (alone and _scatter_within(t, data.accel, found) < TURNED) else None
 
 
-def _turned_within(t: Array, accel: Array, rests: Array) -> float:
+def _scatter_within(t: Array, accel: Array, rests: Array) -> float:
     """Median over rests of what an accelerometer scatters by within each, over gravity: a slow turn is no rest."""
-    parts = [accel[first:last] for first, last in np.searchsorted(t, rests)]
-    scatter = [float(np.sqrt(part.var(axis=0).sum()) / np.linalg.norm(part.mean(axis=0))) for part in parts]
-    return float(np.median(scatter))
+    return float(np.median([relative_scatter(accel[first:last]) for first, last in np.searchsorted(t, rests)]))
 
 
 def _at(time: Array, stamps: Array, values: Array) -> Array:

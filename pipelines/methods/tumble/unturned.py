@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from alidade.factors.ellipsoid import entries, excess, sagitta
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.tumble.model import Sensor
+from alidade.pipelines.methods.tumble.model import TURNED, Sensor, relative_scatter
 from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.recording.topics import IMU, MAG
 from alidade.pipelines.settings import Config
@@ -23,9 +23,6 @@ from alidade.pipelines.settings import Config
 _OFF = 1.0
 # ... and those of its parts no farther apart, as a square in such units, than outliers do.
 _NEAR = 6.0
-# A device whose readings scatter by less than this share of them did not turn: a degree, which is more than noise. A
-# magnetometer in T with ten times the field for its offset scatters by more when it turns; counts may have any offset.
-_SAME = 0.02
 _TOPICS = {"accel": IMU, "mag": MAG}
 
 
@@ -60,10 +57,8 @@ def unturned(sensor: Sensor) -> Sensor:
 
 def check_turned(sensor: Sensor, config: Config) -> None:
     """Raise InputError if readings, or the means of `unturned`, show too few attitudes for any of the numbers."""
-    scatter = float(np.sqrt(sensor.raw.var(axis=0).sum()))
-    size = float(np.median(np.linalg.norm(sensor.raw, axis=1)))
     few = not sensor.rested and len(sensor.raw) < FEWEST
-    if few or (sensor.is_si and scatter < _SAME * size):
+    if few or (sensor.is_si and relative_scatter(sensor.raw) < TURNED):
         raise InputError(
             f"topic {config.topic(_TOPICS[sensor.name])}: the device did not turn, or hardly, beyond the noise of its "
             f"readings; turn it slowly through all attitudes, {FEWEST} at the very least, and record again"
