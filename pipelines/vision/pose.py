@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.refinement import PoseFit, refine
+from alidade.pipelines.vision.refinement import PoseFit, refine, reprojection_errors
 from alidade.pipelines.vision.tags import Detections
 
 if TYPE_CHECKING:
@@ -218,7 +218,7 @@ def _starts(camera: Camera, tags: TagBody, pixels: Array) -> list[list[tuple[flo
         for cRt, place in zip(attitudes, places, strict=True):
             cRb = so3.multiply(cRt, so3.inverse(tags.bRt[k]))
             origin = place - so3.rotate(cRb, tags.position[k])
-            miss = _miss(camera, corners, pixels, cRb, origin)
+            miss = reprojection_errors(camera, corners, pixels, cRb, origin)
             square_sum = float((miss**2).sum())
             pair.append((square_sum if np.isfinite(square_sum) else np.inf, cRb, origin))
         starts.append(pair)
@@ -269,7 +269,3 @@ def _minima(
     if second is None or _angle(second.cRb, first.cRb) < _SAME:
         return [first]
     return [first, second]
-
-
-def _miss(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> Array:
-    return np.asarray(camera.project(position + so3.rotate(cRb, corners)) - pixels)

@@ -54,6 +54,11 @@ def refine(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: 
     return (refine_by_pycolmap if _has_pycolmap() else refine_here)(camera, corners, pixels, cRb, position)
 
 
+def reprojection_errors(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> Array:
+    """Where corners (..., 3) of the body are projected less where they are seen, (..., 2) px."""
+    return np.asarray(camera.project(position + so3.rotate(cRb, corners)) - pixels)
+
+
 @cache
 def _has_pycolmap() -> bool:
     return importlib.util.find_spec("pycolmap") is not None
@@ -82,7 +87,7 @@ def refine_by_pycolmap(camera: Camera, corners: Array, pixels: Array, cRb: Array
         return None
     pose = found["cam_from_world"]
     cRb, position = so3.from_matrix(pose.rotation.matrix()), np.array(pose.translation)
-    miss = np.asarray(camera.project(position + so3.rotate(cRb, corners)) - pixels)
+    miss = reprojection_errors(camera, corners, pixels, cRb, position)
     if not np.isfinite(miss).all():
         return None
     # pycolmap turns from the left, Exp(2 h) cRb, with h half an angle in c; here cRb Exp(delta): delta = 2 cRb^T h.
@@ -128,7 +133,7 @@ def refine_here(camera: Camera, corners: Array, pixels: Array, cRb: Array, posit
 
 
 def _linearized(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> tuple[Array, Array]:
-    """Misses (2 n,) of corners (n, 3), px, and their Jacobian (2 n, 6) by delta of cRb Exp(delta) and the position."""
+    """Reprojection errors (2 n,) of corners (n, 3), px, with their Jacobian (2 n, 6) by attitude and position."""
     R = so3.matrix(cRb)
     seen, by_point = camera.project_with_jacobian(position + corners @ R.T)
     by_turn = np.cross(corners[:, None, :], by_point @ R)  # d(R Exp(delta) x) = R (delta x x)
