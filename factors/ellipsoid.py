@@ -199,7 +199,7 @@ def by_slope(by_triad: Array, drivers: Array | None) -> tuple[Array, ...]:
 
 
 def _polar(raw: Array, triads: Array, symmetric: bool) -> tuple[Array, Array, Array]:
-    """K (n, 3, 3), length (n,) and direction (n, 3) of K raw + b."""
+    """Matrix K (n, 3, 3) of triads, and length (n,) and direction (n, 3) of the calibrated readings K raw + b."""
     numbers = triads @ entries(symmetric).T
     vectors = nominal_of(raw, numbers)
     length = np.maximum(np.linalg.norm(vectors, axis=1), _LEAST)

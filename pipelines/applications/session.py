@@ -699,7 +699,7 @@ def _check_figures(method: Method, config: Config) -> None:
 
 
 def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference | None) -> Iterator[Finding]:
-    """Findings beside those on the estimate: how a run ended, and the premises of the method."""
+    """Notes on a calibration: how its incremental run ended, and the premises of its method."""
     if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
         yield Finding("solver_difference", Severity.NOTE, asdict(difference))
     if estimate.concluded:

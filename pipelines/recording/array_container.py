@@ -50,7 +50,7 @@ class SeriesEncoder(ABC):
         return self._encode(which)
 
     def block(self, channel: int, count: int) -> MessageBlock:
-        """The next messages as a block."""
+        """Encode the next `count` messages as one block of a channel."""
         log_ns, rows = self.log_ns[self.taken : self.taken + count], self.take(count)
         if self.varies:
             return MessageBlock.pack(channel, rows, log_ns)

@@ -157,7 +157,7 @@ class SensorValues:
 
 
 def difference(one: Value, other: Value) -> Array:
-    """One value less another: of rotations the rotation vector between them about the axes of the parent."""
+    """Difference of two values; of rotations, the rotation vector from the second to the first in the parent's axes."""
     if one.kind == "rotation":
         return so3.log(so3.multiply(one.array, so3.inverse(other.array)))
     return np.asarray(one.array - other.array)

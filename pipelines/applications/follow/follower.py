@@ -64,7 +64,7 @@ class Settings:
         window: s, of the incremental solver; None keeps the whole history.
         patience: s, without anything new, after which what is there is taken as all there will be.
         checkpoint: file the run is saved in from time to time, and resumed from.
-        check: hold the result against batch.
+        check: end with the solution of all measurements by batch.
         prior: an earlier calibration of the device to begin from.
     """
 
