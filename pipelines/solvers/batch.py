@@ -38,11 +38,11 @@ from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, Ind
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
     Influence,
-    added_variance,
+    added_covariance,
     autocorrelations,
     error_budget,
-    inflation,
     most_influential,
+    sigma_ratio,
 )
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize, without_rejected
@@ -177,7 +177,7 @@ def solve_batch(
     config = BatchConfig.of(max_iterations)
     solved = solve(compiled, config)
     found = time.perf_counter()
-    estimate = _estimate(solved, config, budget, changed)
+    estimate = whole_estimate(solved, config, budget, changed)
     if device:
         estimate = replace(estimate, sqrt_info=_information_of(solved, device, elsewhere))
     done = time.perf_counter()
@@ -213,8 +213,10 @@ def _numbers(compiled: Compiled, values: Values) -> Array:
     return Reported.of(compiled.problem, compiled.layout, values, compiled.current_keys).numbers
 
 
-def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterable[tuple[str, Problem]]) -> Estimate:
-    """Everything that is reported of a solution."""
+def whole_estimate(
+    solved: Solved, config: BatchConfig, budget: bool = False, changed: Iterable[tuple[str, Problem]] = ()
+) -> Estimate:
+    """Everything that is reported of a solution; see `solve_batch`."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, solved.posterior.factorization
     names = tuple(q.name for q in problem.quantities)
@@ -222,14 +224,16 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
     influence, added = None, dict[str, Array]()
     if budget or correlations:
         influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
-        added = added_variance(influence, correlations)
-    by = inflation(names, posterior.covariance, influence.names if influence else (), added)
+        added = added_covariance(influence, correlations)
+    covariance = posterior.covariance
+    covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
+    by = sigma_ratio(np.diag(posterior.covariance), np.diag(covariance))
     sandwich, steps, wide = None, None, by
     if problem.marginal_likelihood and isinstance(engine, Linearization) and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
         steps = largest_steps(compiled, solved.levels, solved.solution)
-        wide = by * np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
-    covariance = posterior.covariance * np.outer(wide, wide)
+        widened = np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
+        wide, covariance = by * widened, covariance * np.outer(widened, widened)
     system, history = posterior.system, None
     if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
         final = posterior.reported.numbers, posterior.covariance

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -123,6 +124,16 @@ def require_finite(factors: Sequence[Factor], values: gtsam.Values, time: float)
 def finite_measurements(step: Step, values: gtsam.Values) -> Step:
     """A step without the measurements that give no finite numbers at the values."""
     return replace(step, factors=[f for f in step.factors if f.measurement is None or _is_finite(f, values)])
+
+
+def counted_apart(steps: Sequence[Step], kept: Sequence[Step]) -> dict[str, int]:
+    """Family -> number of measurements of some steps that are not in those kept."""
+    count: Counter[str] = Counter()
+    for sign, each in ((1, steps), (-1, kept)):
+        for f in (f for step in each for f in step.factors if f.measurement is not None):
+            assert f.measurement is not None
+            count[f.family] += sign * len(f.measurement.model.time)
+    return {family: n for family, n in count.items() if n}
 
 
 def _is_finite(factor: Factor, values: gtsam.Values) -> bool:

@@ -116,7 +116,7 @@ def error_budget(influence: Influence, added: Mapping[str, Array], covariance: A
 
     Args:
         influence: of the residuals.
-        added: family -> variance (m,) that correlation of its residuals adds, see `added_variance`.
+        added: family -> covariance (m, m) that correlation of its residuals adds, see `added_covariance`.
         covariance: (n, n) final posterior of all reported numbers.
     """
     names, variances = influence.names, dict[str, Array]()
@@ -127,7 +127,7 @@ def error_budget(influence: Influence, added: Mapping[str, Array], covariance: A
     for name, column in zip(2 * names, np.square(influence.from_priors).T, strict=True):
         variances[f"prior of {name}"] = variances.get(f"prior of {name}", np.zeros(len(names))) + column
     for family, more in added.items():
-        variances[family] = variances[family] + more
+        variances[family] = variances[family] + np.diag(more)
     known = np.sum(list(variances.values()), axis=0)
     final = np.diag(covariance)[influence.reported.free]
     variances["not modelled"] = np.maximum(final - known, ROUNDING * final) * (final - known > 1e-6 * final)
@@ -197,7 +197,7 @@ def autocorrelation(whitened: Array) -> Array:
     n, r = whitened.shape
     if n < MIN_MEASUREMENTS:
         return np.empty(0)
-    sums = _lagged(whitened[..., None], int(MAX_LAG * n))[:, 0]
+    sums = _lagged(whitened, int(MAX_LAG * n))
     if not sums[0] > 0.0:
         return np.empty(0)
     correlation = sums[1:] / sums[0]
@@ -227,19 +227,36 @@ def autocorrelations(engine: Engine, values: Values) -> dict[str, Array]:
     return found
 
 
-def added_variance(influence: Influence, correlations: Mapping[str, Array]) -> dict[str, Array]:
-    """Family -> variance (m,) that the correlation of its residuals adds to each number, none negative.
+def added_covariance(influence: Influence, correlations: Mapping[str, Array]) -> dict[str, Array]:
+    """Family -> covariance (m, m) that the correlation of its residuals adds to the numbers, negative in no direction.
+
+    Residuals of correlation T beside the identity add L'TL to the covariance L'L that white ones leave.
 
     Args:
         influence: of the residuals.
         correlations: see `autocorrelations`.
     """
-    added, groups = {}, _measured(influence.engine)
+    added, groups, scale = {}, _measured(influence.engine), influence.reported.scale
     for family, correlation in correlations.items():
         L = np.concatenate([influence.rows(group)[0] for group in groups[family]])[_in_time(groups[family])]
-        more = 2.0 * correlation @ _lagged(L, len(correlation) + 1)[1:]
-        added[family] = np.maximum(more, 0.0)
+        more = _correlated(L, correlation) / np.outer(scale, scale)
+        variances, axes = np.linalg.eigh(0.5 * (more + more.T))
+        root = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
+        added[family] = root @ root.T
     return added
+
+
+def _correlated(L: Array, correlation: Array) -> Array:
+    """L'TL (m, m) of influences L (n, r, m), T with a correlation (K,) at the lags 1 ... K, both ways."""
+    size = 1 << (2 * len(L) - 1).bit_length()
+    kernel = np.fft.rfft(
+        np.concatenate([[0.0], correlation, np.zeros(size - 2 * len(correlation) - 1), correlation[::-1]])
+    ).real
+    out = np.empty((L.shape[2], L.shape[2]))
+    for j in range(L.shape[2]):  # one number at a time: the transform of all would be several times L
+        moved = np.fft.irfft(kernel[:, None] * np.fft.rfft(L[..., j], size, axis=0), size, axis=0)[: len(L)]
+        out[:, j] = np.einsum("nrm,nr->m", L, moved)
+    return out
 
 
 def _measured(engine: Engine) -> dict[str, list[Group]]:
@@ -256,29 +273,11 @@ def _in_time(groups: Sequence[Group]) -> NDArray[np.intp]:
     return np.argsort(np.concatenate([group.model.time for group in groups]), kind="stable")
 
 
-def _lagged(L: Array, lags: int) -> Array:
-    """Sums (lags, m) over measurements and rows of L (n, r, m) times itself, 0 ... lags - 1 measurements later."""
-    size = 1 << (2 * len(L) - 1).bit_length()
-    out = np.empty((min(lags, len(L)), L.shape[2]))
-    for j in range(L.shape[2]):  # one number at a time: the transform of all would be several times L
-        power = (np.abs(np.fft.rfft(L[..., j], size, axis=0)) ** 2).sum(axis=1)
-        out[:, j] = np.fft.irfft(power, size)[: len(out)]
-    return out
-
-
-def inflation(names: Sequence[str], covariance: Array, free: Sequence[str], added: Mapping[str, Array]) -> Array:
-    """Ratio of inflated to nominal sigma, (n,); 1 for fixed numbers.
-
-    Args:
-        names: (n,) of all reported numbers.
-        covariance: (n, n) of these for white noise.
-        free: (m,) names of those that the added variances are of.
-        added: see `added_variance`.
-    """
-    more = dict(zip(free, np.sum(list(added.values()), axis=0), strict=True)) if added else {}
-    variance = np.diag(covariance)
-    grown = variance + np.array([more.get(name, 0.0) for name in names])
-    return sigma_ratio(variance, grown)
+def _lagged(whitened: Array, lags: int) -> Array:
+    """Sums (lags,) over residuals (n, r) times themselves, 0 ... lags - 1 measurements later."""
+    size = 1 << (2 * len(whitened) - 1).bit_length()
+    power = (np.abs(np.fft.rfft(whitened, size, axis=0)) ** 2).sum(axis=1)
+    return np.asarray(np.fft.irfft(power, size)[: min(lags, len(whitened))])
 
 
 def sigma_ratio(variance: Array, grown: Array) -> Array:

@@ -133,28 +133,12 @@ class InnovationGate:
         information: family -> information (d, d) that its measurements added about the parameters' tangents, all else
             marginalised out.
         rejected_in_a_row: number of steps until now.
-        counted: family -> number of measurements, and of those rejected, when `begin_count` was called last.
     """
 
     families: dict[str, RowBuffer] = field(default_factory=dict)
     unusable: dict[str, int] = field(default_factory=dict)
     information: dict[str, Array] = field(default_factory=dict)
     rejected_in_a_row: int = 0
-    counted: dict[str, tuple[int, int]] = field(default_factory=dict)
-
-    def begin_count(self) -> None:
-        """Count rejections from now on."""
-        self.rejected_in_a_row = 0
-        self.counted = self._counts()
-
-    def too_many_rejected(self) -> bool:
-        """Whether a family is rejected more often since `begin_count` than it was until then, by more than chance."""
-        return any(
-            binomial_tail(rejected - before[1], count - before[0], (before[1] + 1.0) / (before[0] + 2.0)) < FALSE_ALARM
-            for count, rejected, before in (
-                (*counts, self.counted.get(family, (0, 0))) for family, counts in self._counts().items()
-            )
-        )
 
     def too_few_to_decide(self) -> bool:
         """Whether a family has rejections among so few measurements that outliers may be its majority.
@@ -224,16 +208,12 @@ class InnovationGate:
         rows = self.families.setdefault(factor.family, RowBuffer())
         rows.add(np.column_stack([time, used, whitened.reshape(len(time), -1)]))
 
-    def adopt_inliers(self, residuals: Mapping[str, Residuals]) -> None:
-        """Adopt the inlier set of a solution, and its residuals by family where the gate had decided otherwise."""
-        for family, found in residuals.items():
-            rows = np.column_stack([found.time, found.used, found.whitened])
-            live = self.families.setdefault(family, RowBuffer()).array
-            if len(live):
-                known = len(live)
-                kept = (live[:, 1] > 0.0) & found.used[:known]
-                rows[:known][kept] = live[kept]
-            self.families[family] = RowBuffer(rows)
+    def adopt(self, residuals: Mapping[str, Residuals]) -> None:
+        """Take the residuals of a solution as the innovations so far, and its inliers."""
+        self.families = {
+            family: RowBuffer(np.column_stack([found.time, found.used, found.whitened]))
+            for family, found in residuals.items()
+        }
 
     def chi_square(self) -> ChiSquare:
         """The sum of the squared innovations of the measurements used."""

@@ -1,33 +1,23 @@
 """Incremental solver: the steps of a problem, fed one by one to a smoother of gtsam.
 
 **Initialisation phase.** A linearisation where little is known turns noise into information, and among few measurements
-outliers cannot be identified. So everything so far is solved in batch at times 1, 1.25, 1.25^2, ... s, and at once when
-the gate rejects significantly many, or when the variance of a number has fallen to a quarter. Between these solutions
-the smoother continues from the last one. The phase ends when no direction of the calibrated numbers is weak
-any more, second-order terms are a small share of every variance, and a new batch solution confirms what the smoother
-made of the last quarter of the recording; at the latest after 600 s.
+outliers cannot be identified. So there is no smoother yet: everything so far is solved in batch at times 1, 1.1, 1.1^2,
+... s, and until the next solution the estimate is the last one, with batch's weak directions and second-order terms
+(alidade.pipelines.solvers.weak_directions). Only while outliers may be the majority of a family does everything that
+has a prior stay there. The phase ends when no direction of the calibrated numbers is weak any more and second-order
+terms are a small share of every variance; at the latest after 600 s.
 
 **Afterwards** states are marginalised out of a fixed-lag window: an update costs the same in hour ten as in minute one.
 From time to time all but the active variables are marginalised out, and a new smoother continues from that Gaussian
 alone; a run can be saved there (alidade.pipelines.solvers.checkpoint). Without a window it is iSAM2 over the whole
-history.
-
-A direction of the calibrated numbers is weak while its posterior sigma is above MAX_SIGMA of the usual prior's. It is
-reported at its prior, uncorrelated with the others: for an error of covariance C, E[NEES] = tr(P^-1 C) is the number of
-directions for every P of diagonal blocks of C. While it may still move far, strong directions follow it along curves:
-of a head that turns about one axis the mount about that axis is known to .35 rad, the rest of the mount, along the
-tangent, to .001 rad. The covariance of what the curves leave off the tangent (alidade.pipelines.solvers.curvature) is
-added to that of the strong directions. Without it the joint NEES of 24 numbers of such heads (three, after 30 s) is
-155, with it 23. Numbers for which second order does not go far enough, as with two or three attitudes of a triad, stay
-at their priors, too, until it does.
+history. Directions that are weak even then have their priors, as in batch.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import gtsam
 import numpy as np
@@ -44,16 +34,16 @@ from alidade.pipelines.estimation.problem import (
     Problem,
     Step,
 )
-from alidade.pipelines.solvers.batch import Solved, residuals_by_family, solve
-from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, IndeterminateError
+from alidade.pipelines.solvers.batch import BatchConfig, Solved, residuals_by_family, solve, whole_estimate
+from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.checkpoint import (
     MarginalState,
     SavedRun,
+    counted_apart,
     finite_measurements,
     require_finite,
     require_known_variables,
 )
-from alidade.pipelines.solvers.curvature import SecondOrder, beyond_second_order
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
@@ -61,7 +51,6 @@ from alidade.pipelines.solvers.gtsam_engine import GtsamEngine, undetermined
 from alidade.pipelines.solvers.levenberg import without_rejected
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.posterior import WIDEST, Reported
-from alidade.pipelines.solvers.posterior_history import posterior_history
 from alidade.pipelines.solvers.smoother import (
     FixedLagSmoother,
     Isam2,
@@ -72,14 +61,20 @@ from alidade.pipelines.solvers.smoother import (
     weigh,
     without_loss,
 )
-from alidade.pipelines.solvers.weak_directions import MAX_SIGMA
+from alidade.pipelines.solvers.weak_directions import (
+    Posterior,
+    WeakDirections,
+    at_prior,
+    beyond_second_order,
+    constrained_step,
+)
 from alidade.pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
 # Steps freed with each new one, of those marginalised out: a thousand at once take longer than an update.
 _FREED = 10
-# Elements of a unit vector below this are rounding.
-_ROUNDING = 1e-9
+# Variance, in units of the priors', below which that of a smoother is rounding.
+_LEAST_VARIANCE = 1e-24
 
 
 @dataclass(frozen=True)
@@ -89,24 +84,20 @@ class IncrementalConfig:
     Attributes:
         first_solve: time from the first step to the first batch solution, s.
         solve_growth: ratio of the times of successive batch solutions.
-        learned: ratio of a reported number's variance to that of the last batch solution below which there is another.
         max_initialisation: time after which the initialisation phase ends in any case, s: the cost of a batch solution
             grows with it.
         min_steps: number of steps before which the phase does not end: few large steps cost little to solve again.
         max_curvature: largest share of a variance that is of second order with which the phase ends.
-        max_change: largest change of a number, in its sigma, between smoother and batch solution that ends the phase.
         marginalize_every: time between marginalisations afterwards, s.
         history_rate: largest number of estimates kept per second.
         moment_spacing: time between moments of the joint history, as a share of the time since the first.
     """
 
     first_solve: float = 1.0
-    solve_growth: float = 1.25
-    learned: float = 0.25
+    solve_growth: float = 1.1
     max_initialisation: float = 600.0
     min_steps: int = 100
     max_curvature: float = 0.15
-    max_change: float = 0.1
     marginalize_every: float = 20.0
     history_rate: float = 5.0
     moment_spacing: float = 0.02
@@ -179,47 +170,6 @@ class MomentRecorder:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Posterior:
-    """Mean and covariance of the free reported numbers u, in units of their usual priors' sigmas.
-
-    Attributes:
-        reported: the numbers.
-        covariance: (m, m) of u, with terms of second order.
-    """
-
-    reported: Reported
-    covariance: Array
-
-    def weak(self, unknown: NDArray[np.bool_] | bool = False) -> Array:
-        """Orthonormal weak directions (m, w): of calibrated numbers but some unknown, with sigmas above MAX_SIGMA.
-
-        Nuisance parameters are small whatever they are: nothing is nonlinear across their priors.
-        """
-        own = np.flatnonzero(self.reported.calibrated & ~np.asarray(unknown))
-        variance, vectors = np.linalg.eigh(self.covariance[np.ix_(own, own)])
-        weak = np.zeros((len(self.covariance), int((variance > MAX_SIGMA**2).sum())))
-        weak[own] = vectors[:, len(own) - weak.shape[1] :]
-        return weak
-
-    def at_prior(self, directions: Array) -> tuple[Array, Array]:
-        """Values (n,) and covariance (n, n) of the reported numbers, with some directions at their priors.
-
-        These have the prior's mean and covariance, and no correlation with the others, which keep their marginal
-        posterior. Directions that numbers without a prior are part of stay as they are.
-
-        Args:
-            directions: (m, w), orthonormal.
-        """
-        reported = self.reported
-        E = directions[:, ~(np.abs(directions[~reported.bounded]) > _ROUNDING).any(axis=0)]
-        others = np.eye(len(self.covariance)) - E @ E.T
-        own = others @ self.covariance @ others + E @ (E.T @ np.linalg.inv(reported.prior) @ E) @ E.T
-        values = reported.numbers.copy()
-        values[reported.free] -= reported.scale * (E @ (E.T @ reported.u))
-        return values, reported.covariance(own)
-
-
 class IncrementalSolver:
     """One pass of a smoother through the steps.
 
@@ -259,15 +209,14 @@ class IncrementalSolver:
         self.moments = 0
         self.walked: set[int] = set()
         self._outdated: list[Step] = []  # steps no longer needed, yet to be freed
-        self._smoother: Smoother | None = None  # None before the first batch solution
+        self._smoother: Smoother | None = None  # None in the initialisation phase
         self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
         self._times: list[float] = []  # of the keyframes, where they are the window's unit
         self._before = 0.0  # number of keyframes before these
-        self._solved = 0, 0.0  # number of steps in the last batch solution, and their time, s
-        self._known = np.empty(0)  # (m,) variances of the free reported numbers after the last batch solution
-        self._second: Array | None = None  # (m, m) covariance of second order in the last batch solution, prior units
+        self._solved: Solved | None = None  # the last batch solution, in the initialisation phase
+        self._of = 0, 0.0  # number of its steps, and their time, s
+        self._estimate: Estimate | None = None  # made of it
         self._beyond = np.ones(len(problem.quantities), dtype=bool)  # numbers that need more than second order
-        self._posterior_history: Callable[[], PosteriorHistory | None] = lambda: None  # of the last batch solution
 
     @classmethod
     def resumed(
@@ -333,7 +282,7 @@ class IncrementalSolver:
     @property
     def started(self) -> bool:
         """Whether there is an estimate yet."""
-        return self._smoother is not None
+        return self._smoother is not None or self._solved is not None
 
     @property
     def keys(self) -> list[int]:
@@ -351,11 +300,9 @@ class IncrementalSolver:
             self._times.extend(sorted({*step.timestamps.values(), step.time}))
         if self._smoother is not None:
             self._advance(self._smoother, step)
-        else:
-            self._stamps.update(self._ages(step.timestamps))
         since = step.time - (self.steps_since[0].time if self.marginal is None else self.marginal.time)
         if self.initialising:
-            if self._should_resolve(since):
+            if since >= max(self.config.first_solve, self.config.solve_growth * self._of[1]):
                 self._solve_batch()
         elif since >= self.config.marginalize_every and isinstance(self._smoother, FixedLagSmoother):
             graph, values = self._smoother.active_variables()
@@ -375,7 +322,7 @@ class IncrementalSolver:
     def posterior_history(self) -> PosteriorHistory | None:
         """Joint estimates at moments; in the initialisation phase until its last batch solution."""
         if self.initialising:
-            return self._posterior_history()
+            return self.estimate().posterior_history
         steady = np.repeat(
             [p.key not in self.walked for p in self.problem.parameters],
             [len(p.quantities) for p in self.problem.parameters],
@@ -383,23 +330,51 @@ class IncrementalSolver:
         return self.recorder.posterior_history(self.time, *self._constrained(), steady)
 
     def chi_square(self) -> ChiSquare:
-        """The sum of the squared innovations of the measurements used."""
-        return self.gate.chi_square()
+        """Squared residuals of the last batch solution, after the initialisation phase squared innovations."""
+        found = self.estimate().chi_square if self.initialising else None
+        return self.gate.chi_square() if found is None else found
 
     def finish(self, seconds: float) -> Estimate:
         """The estimate after the last step, as batch has it. More steps may follow."""
-        if self.initialising and len(self.steps_since) > self._solved[0]:
-            self._solve_batch()
-        return replace(self._estimate_of(*self._constrained(decided=True)), seconds={"solve": seconds})
+        if self.initialising:
+            if len(self.steps_since) > self._of[0]:
+                self._solve_batch()
+            self._estimate = self._with_own_history(whole_estimate(self._batch(), BatchConfig()))
+        return replace(self.estimate(), seconds={"solve": seconds})
 
     def estimate(self) -> Estimate:
         """The estimate now. Raises IndeterminateError when it is no finite number."""
-        return self._estimate_of(*self._constrained())
+        if not self.initialising:
+            return self._filtered()
+        if self._estimate is None:
+            solved = self._batch()
+            self._estimate = self._with_own_history(
+                whole_estimate(replace(solved, posterior=self._posterior_of(solved)), BatchConfig())
+            )
+        return self._estimate
 
-    def _estimate_of(self, values: Array, covariance: Array) -> Estimate:
+    def _with_own_history(self, estimate: Estimate) -> Estimate:
+        """An estimate of a batch solution, with what was known over time."""
+        message = self.trouble or "all steps taken"
+        return replace(
+            estimate,
+            solver="incremental",
+            message=message,
+            history=self._history(estimate.inflation),
+            rejected=self.gate.rejected(),
+        )
+
+    def _history(self, inflation: Array | None) -> History:
+        """What was known over time, with sigmas (n,) times as wide."""
+        rows, n = self.history.array.copy(), len(self.problem.quantities)
+        history = History(rows[:, 0], rows[:, 1 : 1 + n], rows[:, 1 + n :])
+        return history if inflation is None else history.inflated(inflation)
+
+    def _filtered(self) -> Estimate:
+        """The estimate of the smoother."""
+        values, covariance = self._constrained()
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
-        history, n = self.history.array.copy(), len(values)
         to_tangents = np.asarray(np.linalg.pinv(self._reported().jacobian), dtype=float)
         grown, lengths = correlation_inflation(self.problem, covariance, self.gate, to_tangents)
         inflation = sigma_ratio(np.diag(covariance), np.diag(grown))
@@ -414,36 +389,48 @@ class IncrementalSolver:
             converged=not self.trouble,
             message=self.trouble or "all steps taken",
             residuals=self.gate.residuals(),
-            chi_square=self.chi_square(),
-            history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]).inflated(inflation),
+            chi_square=self.gate.chi_square(),
+            history=self._history(inflation),
             posterior_history=self.posterior_history(),
             attitudes=None if self.problem.attitudes is None else Attitudes(attitudes[:, 0], attitudes[:, 1:]),
             rejected=self.gate.rejected(),
             levels=self.levels,
         )
 
-    def _current(self) -> gtsam.Values:
-        """Values of all variables held."""
-        if self._smoother is None:
+    def _batch(self) -> Solved:
+        """The last batch solution of the initialisation phase."""
+        if self._solved is None:
             self._solve_batch()
-        assert self._smoother is not None
-        return self._smoother.estimate()
+        assert self._solved is not None
+        return self._solved
 
-    def _constrained(self, decided: bool = False) -> tuple[Array, Array]:
-        """Values and covariance, weak directions at their priors.
+    def _posterior_of(self, solved: Solved) -> Posterior:
+        """The posterior of a batch solution; at its prior while outliers may be the majority of a family.
 
-        Unless `decided`, so are numbers for which second order does not go far enough yet, and all numbers while
-        outliers cannot be separated from measurements.
+        So are numbers for which second order does not go far enough yet.
         """
-        posterior = self._posterior()
-        unknown = np.zeros(len(posterior.covariance), dtype=bool)
-        if self.initialising and not decided:
-            unknown = self._beyond[posterior.reported.free] | self.gate.too_few_to_decide() | bool(self.trouble)
-        return posterior.at_prior(np.hstack([np.eye(len(unknown))[:, unknown], posterior.weak(unknown)]))
+        is_undecided = bool(self.trouble) or self.gate.too_few_to_decide()
+        return at_prior(solved.posterior, self._beyond[solved.posterior.reported.free] | is_undecided)
 
-    def _posterior(self) -> _Posterior:
-        """The smoother's posterior of the reported numbers. Raises IndeterminateError when it is singular."""
+    def _constrained(self) -> tuple[Array, Array]:
+        """Values (n,) and covariance (n, n) of the reported numbers, weak directions at their priors.
+
+        Raises:
+            IndeterminateError: the smoother's covariance is singular.
+        """
+        if self.initialising:
+            posterior = self._posterior_of(self._batch())
+            return posterior.reported.numbers, posterior.covariance
         reported = self._reported()
+        variances, axes = np.linalg.eigh(self._smoothed_covariance(reported))
+        R = axes.T / np.sqrt(np.clip(variances, _LEAST_VARIANCE, WIDEST**2))[:, None]
+        directions = WeakDirections.of(R, reported.prior, reported.calibrated)
+        values = reported.numbers.copy()
+        values[reported.free] += reported.scale * constrained_step(directions, R, np.zeros(len(R)), reported.u)
+        return values, reported.covariance(directions.covariance())
+
+    def _smoothed_covariance(self, reported: Reported) -> Array:
+        """The smoother's covariance (m, m) of the free reported numbers, in units of their usual priors' sigmas."""
         assert self._smoother is not None
         J = reported.jacobian[reported.free] / reported.scale[:, None]
         try:
@@ -452,13 +439,12 @@ class IncrementalSolver:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is singular: {error}") from error
         if not np.isfinite(covariance).all():
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
-        variances, axes = np.linalg.eigh(covariance)
-        covariance = (axes * np.clip(variances, 0.0, WIDEST**2)) @ axes.T
-        return _Posterior(reported, covariance if self._second is None else covariance + self._second)
+        return np.asarray(covariance)
 
     def _reported(self) -> Reported:
-        """The reported numbers now, with their Jacobian by the tangents of the variables that hold them."""
-        values, keys = self._current(), self.keys
+        """The reported numbers of the smoother, with their Jacobian by the tangents of the variables that hold them."""
+        assert self._smoother is not None
+        values, keys = self._smoother.estimate(), self.keys
         dims = values.dims()  # made anew of all variables at every call
         where, unit = slices(keys, dims), np.eye(sum(dims[key] for key in keys))
         return Reported.at(self.problem, values, keys, [unit[where[key]] for key in keys])
@@ -469,11 +455,7 @@ class IncrementalSolver:
         """Predict the new states, then update with the measurements that agree with the prediction."""
         try:
             about = smoother.linearization_point()
-            new = (
-                step.initial
-                if step.predict is None
-                else step.predict(about if self.initialising else smoother.estimate())
-            )
+            new = step.initial if step.predict is None else step.predict(smoother.estimate())
             about.insert(new)
             stamps = self._ages(step.timestamps)
             smoother.update(self._selected(smoother, step, about, new), new, stamps)
@@ -484,7 +466,9 @@ class IncrementalSolver:
             return
         values = smoother.estimate()
         self._stamps = {k: t for k, t in {**self._stamps, **stamps}.items() if values.exists(k)}
-        self._record(step.keyframes, values)
+        if self.problem.attitudes is not None:
+            self._add_attitudes(self.problem.attitudes(step.keyframes, values))
+        self._record()
 
     def _selected(self, smoother: Smoother, step: Step, about: gtsam.Values, new: gtsam.Values) -> list[Factor]:
         """The processes of a step and the measurements used, for a window linear about the values."""
@@ -514,10 +498,11 @@ class IncrementalSolver:
         number = self._before + np.searchsorted(self._times, list(timestamps.values()))
         return dict(zip(timestamps, number.tolist(), strict=True))
 
-    def _record(self, keyframes: Sequence[int], values: gtsam.Values) -> None:
-        if self.problem.attitudes is not None:
-            attitudes = self.problem.attitudes(keyframes, values)
-            self.attitudes.add(np.column_stack([attitudes.time, attitudes.wxyz]))
+    def _add_attitudes(self, attitudes: Attitudes) -> None:
+        self.attitudes.add(np.column_stack([attitudes.time, attitudes.wxyz]))
+
+    def _record(self) -> None:
+        """Add the estimate now to the history, and after the initialisation phase to the moments."""
         if not len(self.history) or self.time - self.history.array[-1, 0] >= 1.0 / self.config.history_rate:
             numbers, covariance = self._constrained()
             self.history.add(np.concatenate([[self.time], numbers, np.sqrt(np.diag(covariance))])[None])
@@ -525,47 +510,44 @@ class IncrementalSolver:
                 self.recorder.add(self.time, numbers, covariance)
                 self.moments += 1
 
-    # -- initialisation phase
-
-    def _should_resolve(self, since: float) -> bool:
-        """Whether everything so far is to be solved in batch, `since` s after the first step."""
-        if self._smoother is None:
-            return since >= self.config.first_solve
-        if since >= self.config.solve_growth * self._solved[1] or self.gate.too_many_rejected():
-            return True
-        return self._has_learned()
-
-    def _has_learned(self) -> bool:
-        """Whether a number is known so much better than at the last batch solution that it was linearised badly.
-
-        What was linear within its uncertainty alone may be multiplied by what is weak, as a gyro's scale by a mount.
-        """
-        return bool((np.diag(self._posterior().covariance) < self.config.learned * self._known).any())
+    # -- batch solutions
 
     def _solve_batch(self) -> None:
-        """Solve everything since the marginal in batch, and start the smoother from the solution, without outliers."""
-        from_start = self.marginal is None
-        steps = self._all_steps_since()
-        stamps = self._ages({key: time for step in self.steps_since for key, time in step.timestamps.items()})
-        if self.marginal is not None:
-            stamps = {**self.marginal.stamps, **stamps}
-        solved = self._batch_solution(steps)
-        values = solved.compiled.layout.to_gtsam(solved.solution.values)
-        if from_start:
-            self.gate.adopt_inliers(residuals_by_family(solved.engine, solved.solution.values))
-        since = self.time - self.steps_since[0].time if from_start and self.steps_since else 0.0
-        last = self.steps_since[-1].keyframes if self.steps_since else range(0)
-        self._restart(solved, values, stamps, since)
-        if from_start:
+        """Solve everything since the marginal in batch; start the smoother from it, or end the initialisation phase."""
+        solved = self._batch_solution(self._all_steps_since())
+        if self.marginal is None:
+            self.gate.adopt(residuals_by_family(solved.engine, solved.solution.values))
+        if self.initialising:
+            since = self.time - self.steps_since[0].time
+            self._solved, self._of, self._estimate = solved, (len(self.steps_since), since), None
             self.moments += 1
-            self._posterior_history = cache(lambda: _posterior_history_of(solved))
-            if not self.initialising:
-                self.recorder, self._posterior_history = MomentRecorder.after(self._posterior_history()), lambda: None
-            self.attitudes.clear()
-        self._record(solved.compiled.keyframes if from_start else last, values)
-        self._solved = len(self.steps_since), since
-        self._known = np.diag(self._posterior().covariance)
-        self.gate.begin_count()
+            if self._beyond.any():
+                # Second order that has once gone far enough does so from then on.
+                posterior = solved.posterior
+                kept = replace(solved.solution, engine=without_rejected(solved.engine, solved.solution.values))
+                keys = solved.compiled.current_keys
+                self._beyond[posterior.reported.free] &= beyond_second_order(self.problem, kept, posterior, keys)
+            if since < self.config.max_initialisation and not self._is_linear(solved):
+                self._record()
+                return
+            self.recorder = MomentRecorder.after(self.estimate().posterior_history)
+            self.initialising, self._solved, self._estimate = False, None, None
+        if self.problem.attitudes is not None:
+            from_start = self.marginal is None
+            if from_start:
+                self.attitudes.clear()
+            values = solved.compiled.layout.to_gtsam(solved.solution.values)
+            keyframes = solved.compiled.keyframes if from_start else self.steps_since[-1].keyframes
+            self._add_attitudes(self.problem.attitudes(keyframes, values))
+        self._start_from(solved)
+        self._record()
+
+    def _is_linear(self, solved: Solved) -> bool:
+        """Whether no calibrated direction is weak, and second-order terms are a small share of every variance."""
+        if self.trouble or len(self.steps_since) < self.config.min_steps or self.gate.too_few_to_decide():
+            return False
+        posterior = solved.posterior
+        return not posterior.directions.weak.shape[1] and posterior.second_order_share() < self.config.max_curvature
 
     def _all_steps_since(self) -> list[Step]:
         """The steps since the marginal, the marginal as the first of them."""
@@ -596,42 +578,26 @@ class IncrementalSolver:
         return solved
 
     def _finite(self, steps: Sequence[Step], values: gtsam.Values) -> list[Step]:
-        """The steps without the measurements that the gate has found unusable: no finite numbers at the values.
+        """The steps without measurements that give no finite numbers at the values; these are counted.
 
         Raises:
-            InputError: another factor gives none.
+            InputError: another factor gives none, or a measurement before the first solution.
         """
-        if self._smoother is not None:
-            steps = [finite_measurements(step, values) for step in steps]
-        require_finite([f for step in steps for f in step.factors], values, self.time)
+        if self.started:
+            kept = [finite_measurements(step, values) for step in steps]
+            if self.marginal is None:
+                self.gate.unusable = counted_apart(steps, kept)
+            steps = kept
+        for step in steps:
+            require_finite(step.factors, values, step.time)
         return list(steps)
 
-    def _restart(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float], since: float) -> None:
-        """Start the smoother from a batch solution `since` s after the first step; may end the initialisation phase."""
-        before = self._posterior() if self._smoother is not None else None
-        self._start_from(solved, values, stamps)
-        if not self.initialising:
-            return
-        second = SecondOrder.of(solved.posterior)
-        self._second = second.covariance
-        # Second order that has once gone far enough does so from then on.
-        if self._beyond.any() and np.isfinite(second.share):
-            self._beyond &= beyond_second_order(solved)
-        is_curved = second.share > self.config.max_curvature
-        if since >= self.config.max_initialisation or (not is_curved and self._is_settled(before)):
-            self.initialising = False
-            self._start_from(solved, values, stamps)
-
-    def _is_settled(self, before: _Posterior | None) -> bool:
-        """Whether no calibrated direction is weak, and a batch solution agrees with the smoother's posterior before."""
-        if self.trouble or before is None or len(self.steps_since) < self.config.min_steps:
-            return False
-        now = self._posterior()
-        change = np.abs(now.reported.u - before.reported.u) / np.sqrt(np.diag(now.covariance))
-        return now.weak().shape[1] == 0 and bool(change.max() < self.config.max_change)
-
-    def _start_from(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float]) -> None:
+    def _start_from(self, solved: Solved) -> None:
         """Start the smoother from a solution: from its active variables alone, or without a window from all of it."""
+        values = solved.compiled.layout.to_gtsam(solved.solution.values)
+        stamps = self._ages({key: time for step in self.steps_since for key, time in step.timestamps.items()})
+        if self.marginal is not None:
+            stamps = {**self.marginal.stamps, **stamps}
         if self.window is None:
             factors = (f for step in self.steps_since for f in weigh(step.factors, self.levels))
             used = [without_loss(f) for f in (inliers(f, values, self.problem.loss) for f in factors) if f is not None]
@@ -641,20 +607,15 @@ class IncrementalSolver:
         engine = without_rejected(solved.engine, at)
         assert isinstance(engine, Linearization | GtsamEngine)
         system, _ = (engine if isinstance(engine, GtsamEngine) else GtsamEngine(engine)).at(at)
-        state = MarginalState.of(self.time, system.graph, values, active_variables(values, stamps), stamps)
-        if self.initialising:
-            self._start([state.factor], state.values, state.stamps)
-        else:
-            self._continue_from(state)
+        self._continue_from(MarginalState.of(self.time, system.graph, values, active_variables(values, stamps), stamps))
 
     def _continue_from(self, state: MarginalState) -> None:
         """Continue from a Gaussian alone."""
         self.marginal, self._outdated, self.steps_since = state, self.steps_since, []
-        self._second = None
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        self._smoother = Isam2() if self.window is None else FixedLagSmoother(self.window, self.initialising)
+        self._smoother = Isam2() if self.window is None else FixedLagSmoother(self.window)
         self._stamps = dict(stamps)
         try:
             self._smoother.update(factors, values, stamps)
@@ -666,15 +627,3 @@ def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[
     """Keys of the variables that later steps may refer to: those of the last moment and those that never age."""
     latest = max(stamps.values(), default=-np.inf)
     return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]
-
-
-def _posterior_history_of(solved: Solved) -> PosteriorHistory | None:
-    """Posterior at moments before a batch solution."""
-    compiled, posterior = solved.compiled, solved.posterior
-    engine, system, found = solved.engine, posterior.system, posterior.factorization
-    if not (isinstance(engine, Linearization) and isinstance(system, ChainSystem)):
-        return None
-    assert isinstance(found, ChainFactorization)
-    final = posterior.reported.numbers, posterior.covariance
-    keys = compiled.current_keys
-    return posterior_history(compiled.problem, engine, system, found, posterior.values, keys, engine.time, final)

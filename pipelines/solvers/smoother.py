@@ -90,11 +90,10 @@ class FixedLagSmoother(Smoother):
 
     Args:
         window: time for which variables are kept after their last use, s or whatever the stamps count.
-        fixed: whether new factors are linear about these values, too; else about the estimate of vectors.
     """
 
-    def __init__(self, window: float, fixed: bool) -> None:
-        self._window, self._fixed = window, fixed
+    def __init__(self, window: float) -> None:
+        self._window = window
         self._stamps: dict[int, float] = {}
         self._past: list[tuple[int, gtsam.GaussianConditional]] = []  # a variable, given younger ones; oldest first
         self._present: gtsam.GaussianConditional | None = None  # of the active variables
@@ -172,7 +171,7 @@ class FixedLagSmoother(Smoother):
 
     def _moved(self) -> set[int]:
         """Active vectors, about whose estimate new factors are linear."""
-        return set() if self._fixed or self._present is None else self._vectors.intersection(self._present.keys())
+        return set() if self._present is None else self._vectors.intersection(self._present.keys())
 
     def _oldest(self, keys: Collection[int]) -> int:
         """Index of the oldest of the variables among the conditionals; their number if none of them is there."""

@@ -38,13 +38,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.solvers.chain import Array
+from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System
 from alidade.pipelines.solvers.posterior import Reported, ReportedRoot, followed
 
 # Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
 MAX_SIGMA = 0.3
+# Ratio of a posterior's variance to its prior's that no linear system has.
+BEYOND = 1.0 + 1e-9
 # Ratio of sigmas up to which the better known of two directions follows the other one.
 FOLLOWS = 0.5
 # Singular values of a square-root information below which there is none: sigmas of 1e4 prior sigmas.
@@ -61,6 +63,12 @@ DRAWS, STRAIGHT = 3, 0.1
 # Chance that moves drawn so far happen to be across a way that something follows by its sigma: of one normal number to
 # be below x it is .8 x. Below this chance no more moves are drawn where all look straight.
 MISSED = 0.02
+# Random moves along which slopes half the way are compared with those of the whole, and what these may miss, in sigmas
+# of the combination of numbers that misses most. Gimbals and heads at rest miss .03 to .05, a cube whose gains are
+# known to a tenth .02; two or three attitudes of a triad whose gains are open by a half up to 1.2.
+THIRD_DRAWS, MAX_THIRD = 8, 0.05
+# A direction with a sigma within this share of the prior follows less known ones.
+KNOWN = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +113,7 @@ class WeakDirections:
         """Weak directions (m, w) as given, all others with the covariance that R and the prior of these leave.
 
         With C = (R_o'R_o)^-1 of the others, G = -C R_o'R_w their slope along the weak ones and S the prior covariance
-        of the weak ones it is C + G S G'.
+        of the weak ones it is C + G S G'. Those that would follow the weak ones past their own priors are weak, too.
         """
         w = weak.shape[1]
         others = np.linalg.svd(weak, full_matrices=True)[0][:, w:] if w else np.eye(len(R))
@@ -118,7 +126,11 @@ class WeakDirections:
             root = np.hstack([root, slope @ np.linalg.cholesky(prior)])
         turned, sigmas, _ = np.linalg.svd(root, full_matrices=False)
         order = np.argsort(sigmas)
-        return cls(others @ turned[:, order], weak, sigmas[order], precision, calibrated)
+        strong, sigmas = others @ turned[:, order], sigmas[order]
+        beyond = sigmas**2 > BEYOND * np.einsum("ia,ia->a", strong, np.linalg.solve(precision, strong))
+        if w and beyond.any():
+            return cls.given(R, np.hstack([weak, strong[:, beyond]]), precision, calibrated)
+        return cls(strong, weak, sigmas, precision, calibrated)
 
     @property
     def prior_covariance(self) -> Array:
@@ -267,6 +279,12 @@ class Posterior:
         """Covariance (n, n) of all reported numbers."""
         return self.reported.covariance(self.directions.covariance())
 
+    def second_order_share(self) -> float:
+        """Largest ratio of the second-order variance to the variance that the linear system has."""
+        linear = self.directions.again(self.reported.root(self.factorization.root).R)
+        unit = linear.strong / linear.sigmas
+        return float(np.linalg.norm((self.directions.strong * self.directions.sigmas).T @ unit, 2)) ** 2 - 1.0
+
 
 def constrained_solution(problem: Problem, minimum: Solution, current_keys: Mapping[int, int]) -> Posterior:
     """The posterior near a minimum, its weak directions at the prior.
@@ -311,6 +329,63 @@ def _unknown(problem: Problem, minimum: Solution, current_keys: Mapping[int, int
     R, known = reported.root(minimum.factorization.root).R, (minimum.system, minimum.factorization)
     fixed = WeakDirections.given(R, np.eye(len(R))[:, reported.calibrated], reported.prior, reported.calibrated)
     return replace(_constrained(problem, minimum.engine, minimum.values, current_keys, fixed, known), converged=False)
+
+
+def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
+    """The posterior with some free numbers (m,) at their priors, uncorrelated with the rest, which keeps its marginal.
+
+    Those without a prior stay as they are.
+    """
+    reported, directions = posterior.reported, posterior.directions
+    fixed = numbers & reported.bounded
+    prior, rest = (np.eye(len(fixed))[:, mask] for mask in (fixed, ~fixed))
+    variances, axes = np.linalg.eigh(rest.T @ directions.covariance() @ rest)
+    there = reported.numbers.copy()
+    there[reported.free[fixed]] = reported.mean[fixed]
+    own = replace(directions, strong=rest @ axes, weak=prior, sigmas=np.sqrt(np.maximum(variances, 0.0)))
+    return replace(posterior, reported=replace(reported, numbers=there), directions=own)
+
+
+def beyond_second_order(
+    problem: Problem, minimum: Solution, found: Posterior, current_keys: Mapping[int, int]
+) -> NDArray[np.bool_]:
+    """Which free numbers (m,), those of one variable together, are part of terms of higher than second order.
+
+    Second order goes far enough where slopes grow in proportion to the way: half the way they are half of what they
+    are at the whole one. What that misses is compared with the covariance of all that stays.
+
+    Args:
+        problem: of which the reported numbers are.
+        minimum, current_keys: see `constrained_solution`.
+        found: its posterior.
+    """
+    reported, directions = found.reported, found.directions
+    left = np.ones(len(reported.free), dtype=bool)
+    linear = directions.again(reported.root(found.factorization.root).R)
+    ways = np.random.default_rng(0).standard_normal((len(linear.axes), THIRD_DRAWS))
+    roots = partial(moved_roots, problem, minimum.engine, found, current_keys)
+    follows = linear.followers & (linear.sigmas < KNOWN)[:, None]
+    try:
+        half, whole = (slopes(linear, roots, follows, length * ways) for length in (0.5, 1.0))
+    except (IndeterminateStateError, np.linalg.LinAlgError):
+        return left
+    missed = linear.strong @ np.hstack(list(half - 0.5 * whole)) / np.sqrt(THIRD_DRAWS)
+    prior = directions.weak @ np.linalg.cholesky(directions.prior_covariance)
+    known = np.hstack([directions.strong * directions.sigmas, prior])
+    numbers = [len(p.quantities) for p in problem.parameters]
+    own = np.repeat(np.arange(len(numbers)), numbers)[reported.free]
+    while _share(known[left], missed[left]) > MAX_THIRD:
+        each = [left & (own != one) for one in np.unique(own[left])]
+        left = min(each, key=lambda some: _share(known[some], missed[some]))
+    return ~left
+
+
+def _share(known: Array, missed: Array) -> float:
+    """Largest ratio of two sigmas of a combination of numbers, by square roots (k, .) of their covariances."""
+    if not len(known):
+        return 0.0
+    R = np.asarray(np.linalg.qr(known.T, mode="r"))
+    return float(np.linalg.norm(np.linalg.solve(R.T, missed), 2))
 
 
 def _constrained(
