@@ -5,8 +5,7 @@ the covariance S = A P A' + I. Its normalised square (NIS) e' S^-1 e is chi-squa
 good; beyond the gate, which one good measurement in 10,000 exceeds, it is rejected (Bar-Shalom, Li, Kirubarajan,
 "Estimation with applications to tracking and navigation", 2001, section 5.4).
 
-Each family of measurements has its own binomial tests: whether it is rejected more often than its outliers are, so that
-the linearisation is in doubt, and whether it is certain that most of it is good.
+Each family of measurements has its own binomial test: whether it is certain that most of it is good.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from alidade.pipelines.solvers.smoother import Smoother, linear_graph_of, orderi
 
 # Steps in a row that are rejected whole before one is taken nevertheless: by then it is the prediction that is wrong.
 MAX_REJECTED_IN_A_ROW = 10
-# Significance of the binomial tests.
+# Significance of the binomial test.
 FALSE_ALARM = 1e-3
 # Outliers are a minority of every family of measurements.
 MAX_OUTLIER_SHARE = 0.5

@@ -1,7 +1,7 @@
 """Incremental solver: the steps of a problem, fed one by one to a smoother of gtsam.
 
 **Initialisation phase.** A linearisation where little is known turns noise into information, and among few measurements
-outliers cannot be identified. So there is no smoother yet: everything so far is solved in batch at times 1, 1.1, 1.1^2,
+outliers cannot be identified. So there is no smoother yet: everything so far is solved in batch at times 1, 1.15, 1.15^2,
 ... s, and until the next solution the estimate is the last one, with batch's weak directions and second-order terms
 (alidade.pipelines.solvers.weak_directions). Only while outliers may be the majority of a family does everything that
 has a prior stay there. The phase ends when no direction of the calibrated numbers is weak any more and second-order
@@ -94,7 +94,7 @@ class IncrementalConfig:
     """
 
     first_solve: float = 1.0
-    solve_growth: float = 1.1
+    solve_growth: float = 1.15
     max_initialisation: float = 600.0
     min_steps: int = 100
     max_curvature: float = 0.15
