@@ -215,12 +215,9 @@ def load(path: str | Path, config: Settings = None) -> SavedCalibration:
         InputError: file or config cannot be used.
     """
     from alidade.pipelines.reports.calibration import load_calibration
-    from alidade.pipelines.reports.known import load_known, with_covariance
+    from alidade.pipelines.reports.known import with_covariance
 
-    saved = load_calibration(Path(path), load_config(None, _override(config)))
-    known = load_known(Path(path))
-    joint = with_covariance(known, Path(path))
-    return saved if joint is known else saved.knowing(joint.gaussian_prior)
+    return with_covariance(load_calibration(Path(path), load_config(None, _override(config))), Path(path))
 
 
 def simulate(

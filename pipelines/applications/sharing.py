@@ -17,7 +17,7 @@ import numpy as np
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
-from alidade.pipelines.reports.known import Known
+from alidade.pipelines.reports.calibration import SavedCalibration
 from alidade.pipelines.settings import Config
 
 DAY_S = 86_400.0
@@ -52,7 +52,7 @@ def _share(config: Config, name: str) -> str | float | None:
     return found[-1] if found else None
 
 
-def device_prior(known: Known, method: Method, config: Config, sha256: str, start_ns: int) -> GaussianPrior:
+def device_prior(known: SavedCalibration, method: Method, config: Config, sha256: str, start_ns: int) -> GaussianPrior:
     """What an earlier calibration says of the device at the time of another recording.
 
     Args:
@@ -66,19 +66,17 @@ def device_prior(known: Known, method: Method, config: Config, sha256: str, star
         InputError: the calibration is another method's, has no sigmas worth the name, or is of this very recording; or
             the walk of a parameter is to be estimated.
     """
-    source = known.gaussian_prior.source
-    known.of_method(method.name)
+    every = known.of_method(method.name).gaussian_prior
+    source = every.source
     if known.solver == "published":
         raise InputError(f"{source}: is of the published solver, whose sigmas make no prior; use batch's")
-    if known.sha256 == sha256:
+    if known.recording.sha256 == sha256:
         raise InputError(f"{source}: was made of this very recording, which would count twice; name another one's")
-    rates = walks(method, config, known.gaussian_prior.names)
-    for name in stated_walks(config, known.gaussian_prior.names):
+    rates = walks(method, config, every.names)
+    for name in stated_walks(config, every.names):
         raise InputError(f"share: how far {name} walks, only several recordings together determine it; give a number")
-    uncertain = [
-        name for name, sigma in zip(known.gaussian_prior.names, known.gaussian_prior.sigmas, strict=True) if sigma > 0.0
-    ]
-    gaussian_prior = known.gaussian_prior.of([name for name in uncertain if name in rates])
+    uncertain = [name for name, sigma in zip(every.names, every.sigmas, strict=True) if sigma > 0.0]
+    gaussian_prior = every.of([name for name in uncertain if name in rates])
     days = abs(start_ns - known.start_ns) * 1e-9 / DAY_S
     walked = np.diag([rates[name] ** 2 * days for name in gaussian_prior.names])
     date = datetime.datetime.fromtimestamp(known.start_ns // 1_000_000_000, datetime.UTC).date()

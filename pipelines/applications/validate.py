@@ -19,7 +19,7 @@ from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
-from alidade.pipelines.reports.known import Known, known_of, load_known, saved_of, with_covariance
+from alidade.pipelines.reports.known import load_known, with_covariance
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -127,22 +127,21 @@ def validate(
         InputError: recording, config or calibration cannot be used, or the calibration is another method's.
     """
     if isinstance(calibration_file, Path):
-        known = load_known(calibration_file)
-        calibration, known = saved_of(known, calibration_file), with_covariance(known, calibration_file)
+        calibration = with_covariance(load_known(calibration_file), calibration_file)
     else:
-        known, calibration = known_of(calibration_file), saved(calibration_file)
+        calibration = saved(calibration_file)
     recording, config = configured(open_recording(path, strict), config_file)
     name = resolve_method(method_name or calibration.method, recording, config)
-    known.of_method(name)
+    calibration.of_method(name)
     chosen = method(name)
     data = chosen.read(recording, config)
     values = calibration.values
     validations = chosen.report.validate(data, config, values)
-    if known.sha256 == recording.sha256():
+    if calibration.recording.sha256 == recording.sha256():
         return Validated(calibration, path.name, validations, True, recording.notes)
     session = Session(chosen, data, config, Recorded(recording))
     with session.usual_time():
-        held, estimate, own = _held(session, known)
+        held, estimate, own = _held(session, calibration)
         lost = (*recording.notes, *filter(None, [deadline.stopped()]))
     if held is None or estimate is None:
         return Validated(calibration, path.name, validations, False, lost)
@@ -163,7 +162,9 @@ def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float
     return dict(zip(estimate.names, (estimate.values + scale * (correlation @ weights)).tolist(), strict=True)) | fixed
 
 
-def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, Estimate | None, dict[str, float]]:
+def _held(
+    session: Session, known: SavedCalibration
+) -> tuple[CalibrationCheck | None, Estimate | None, dict[str, float]]:
     """What the recording says of the calibration, and its own estimate; neither where it cannot be solved."""
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError

@@ -6,6 +6,7 @@ saved.value("gyro_bias_x"), saved.rotations["helmet_mount"]
 
 from __future__ import annotations
 
+import datetime
 import re
 from collections.abc import Mapping, Sequence
 from io import StringIO
@@ -21,7 +22,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
-from alidade.pipelines.gaussian_prior import GaussianPrior
+from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import invalid
@@ -110,13 +111,37 @@ class SavedCalibration(_Record, SensorValues):
     formulas: list[str] = []
     constants: dict[str, float] = {}
     _config: Config = PrivateAttr(default_factory=Config)
-    _gaussian_prior: GaussianPrior | None = PrivateAttr(default=None)
+    _joint_prior: GaussianPrior | None = PrivateAttr(default=None)
+    _source: str = PrivateAttr(default="")
 
-    def knowing(self, gaussian_prior: GaussianPrior) -> SavedCalibration:
-        """The same with the joint distribution that result.json beside the file has."""
+    def with_joint(self, gaussian_prior: GaussianPrior) -> SavedCalibration:
+        """The same with the joint distribution of its parameters, which calibration.yaml does not have."""
         known = self.model_copy()
-        known._gaussian_prior = gaussian_prior
+        known._joint_prior = gaussian_prior
         return known
+
+    @property
+    def gaussian_prior(self) -> GaussianPrior:
+        """Distribution of its parameters; independent ones where their joint distribution is not known."""
+        given = self.parameters.values()
+        return self._joint_prior or independent(
+            list(self.parameters), [p.value for p in given], [p.sigma for p in given], self._source
+        )
+
+    @property
+    def start_ns(self) -> int:
+        """Start of its recording, Unix ns, to the second; UTC where no zone is stated. Raises InputError."""
+        try:
+            date = datetime.datetime.fromisoformat(self.recording.start)
+        except ValueError as error:
+            raise InputError(f"{self._source}: start of the recording: {self.recording.start!r} is no date") from error
+        return round((date if date.tzinfo else date.replace(tzinfo=datetime.UTC)).timestamp()) * 1_000_000_000
+
+    def of_method(self, name: str) -> SavedCalibration:
+        """Itself. Raises InputError when it is another method's calibration."""
+        if self.method != name:
+            raise InputError(f"{self.gaussian_prior.source}: is a calibration of {self.method}, not of {name}")
+        return self
 
     @property
     def values(self) -> dict[str, float]:
@@ -124,11 +149,11 @@ class SavedCalibration(_Record, SensorValues):
         return {**self.constants, **{name: parameter.value for name, parameter in self.parameters.items()}}
 
     def _joint(self) -> tuple[Sequence[str], Array]:
-        if self._gaussian_prior is None:
+        if self._joint_prior is None:
             raise InputError(
                 "calibration.yaml has no joint covariance: result.json is not beside it, or of another one"
             )
-        return self._gaussian_prior.names, self._gaussian_prior.covariance
+        return self._joint_prior.names, self._joint_prior.covariance
 
     def to_dict(self) -> dict[str, Any]:
         """The content of calibration.yaml."""
@@ -216,7 +241,10 @@ def saved(calibration: Calibration) -> SavedCalibration:
         formulas=[formula.text for formula in calibration.formulas],
         constants=dict(calibration.problem.constants),
     )
-    content._config = calibration.config
+    content._config, estimate = calibration.config, calibration.estimate
+    content._joint_prior = GaussianPrior(
+        estimate.names, estimate.values, calibration.covariance, str(Path(calibration.recording))
+    )
     return content
 
 
@@ -225,7 +253,7 @@ def load_calibration(path: Path, config: Config | None = None) -> SavedCalibrati
     data = read_bytes(path, MAX_YAML_BYTES)
     try:
         read = SavedCalibration.model_validate(load_yaml(data, str(path)))
-        read._config = config or Config()
+        read._config, read._source = config or Config(), str(path)
         return read
     except InputError as error:
         raise InputError(f"{error}; a calibration.yaml as `alidade calibrate` writes it is needed") from error
