@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.pipelines import methods
-from alidade.pipelines.applications.session import Arrays, Session
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.methods.head.report import helmet_gyro
 from alidade.pipelines.reports.result import Calibration
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for noise in options.noise:
             data = to_session(trial, 0, float(np.deg2rad(noise)))
             head = methods.method("head")
-            session = Session(head, data, load_config(None, options.config), Arrays(head, data))
+            session = Session(head, data, load_config(None, options.config))
             for solver in options.solver:
                 start = time.process_time()
                 calibration = session.calibrate(solver, check=False)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from alidade.pipelines import methods
-from alidade.pipelines.applications.session import Arrays, Session
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import first_error, load_config
 from alidade.pipelines.config import model as _config_model
 from alidade.pipelines.errors import InputError
@@ -122,7 +122,7 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     if isinstance(source, Simulated):
         text = load_config(source.config.encode(), override)
         chosen = methods.method(method or text.method or "")
-        return Session(chosen, source.data, text, Arrays(chosen, source.data, source.truth))
+        return Session(chosen, source.data, text, known=source.truth)
     settings = load_config(None, override)
     name = method or settings.method
     if name is None:
@@ -131,7 +131,7 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     data = _placed(_checked(chosen, _data(chosen, source)), settings)
     with _of_arrays():
         chosen.check(data)
-    return Session(chosen, data, settings, Arrays(chosen, data))
+    return Session(chosen, data, settings)
 
 
 def _override(config: object) -> Path | _BaseConfig | None:

@@ -234,7 +234,7 @@ def _day(session: Session) -> float:
     """The date of a recording, days since 1970."""
     date = session.config.date
     if date is None:
-        return session.origin.epoch_ns * 1e-9 / DAY_S
+        return session.epoch_ns * 1e-9 / DAY_S
     return datetime.datetime(date.year, date.month, date.day, 12, tzinfo=datetime.UTC).timestamp() / DAY_S
 
 

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -84,104 +84,14 @@ _CONCLUDED = "at the end all measurements were solved together"
 _NOTABLE_DIFFERENCE = 1.0
 
 
-class Origin(Protocol):
-    """Where a session's data come from."""
-
-    @property
-    def name(self) -> str:
-        """For people."""
-
-    @property
-    def epoch_ns(self) -> int:
-        """Zero of all times, Unix ns."""
-
-    def sha256(self) -> str:
-        """Of what was recorded, hexadecimal."""
-
-    def facts(self, config: Config) -> SessionFacts:
-        """Topics, rates, gaps, losses."""
-
-    def truth(self) -> dict[str, object] | None:
-        """Parameter -> true value, where known."""
-
-
-@dataclass(frozen=True, eq=False)
-class Recorded:
-    """A recording as origin."""
-
-    recording: Recording
-
-    @property
-    def name(self) -> str:
-        """Of the file."""
-        return self.recording.path.name
-
-    @property
-    def epoch_ns(self) -> int:
-        """First stamp."""
-        return self.recording.epoch_ns
-
-    def sha256(self) -> str:
-        """Of the file."""
-        return self.recording.sha256()
-
-    def facts(self, config: Config) -> SessionFacts:
-        """Of the recording, whose stamps are not kept then."""
-        facts = session_facts(self.recording, config)
-        self.recording.forget_times()
-        return facts
-
-    def truth(self) -> dict[str, object] | None:
-        """The attachment's. Raises InputError when it is no JSON object."""
-        attachment = self.recording.attachment(TRUTH, needed=False)
-        try:
-            return None if attachment is None else dict(json.loads(attachment, parse_int=float))
-        except (ValueError, TypeError, RecursionError) as error:
-            raise InputError(
-                f"{self.recording.path}: the attachment {TRUTH} is no JSON object of parameters and their values"
-            ) from error
-
-
-@dataclass(frozen=True, eq=False)
-class Arrays:
-    """Data in memory as origin."""
-
-    method: Method
-    data: Any
-    known: Mapping[str, float] | None = None
-
-    @property
-    def name(self) -> str:
-        """There is no file."""
-        return "arrays"
-
-    @property
-    def epoch_ns(self) -> int:
-        """The data's own."""
-        return int(self.data.epoch_ns)
-
-    def sha256(self) -> str:
-        """Of all arrays and numbers, field by field."""
-        digest = hashlib.sha256()
-        _feed(digest, self.data)
-        return digest.hexdigest()
-
-    def facts(self, _: Config) -> SessionFacts:
-        """Length of the data; there are no topics."""
-        start, stop = self.method.faults.span(self.data)
-        return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
-
-    def truth(self) -> dict[str, object] | None:
-        """As given."""
-        return None if self.known is None else dict(self.known)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Session:
-    """Data as their method takes them, the config in force, and where both come from.
+    """Data as their method takes them, the config in force, and the recording that both come from.
 
     Attributes:
-        method, data, config, origin: as above.
+        method, data, config: as above.
+        recording: that the data were read from; None: they are arrays in memory.
+        known: parameter -> true value, of simulated arrays.
         engine: that eliminates batch's linear systems.
         near: numbers that rotations are reported near of, as another recording of the device has them.
         attitude_rate: of the trajectory that is reported.
@@ -191,7 +101,8 @@ class Session:
     method: Method
     data: Any
     config: Config
-    origin: Origin
+    recording: Recording | None = None
+    known: Mapping[str, float] | None = None
     engine: EngineName = "auto"
     near: Mapping[str, float] = field(default_factory=dict)
     attitude_rate: AttitudeRate = "vision"
@@ -229,7 +140,7 @@ class Session:
         many = [f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted)]
         for sentence in (*many, *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
             recording.remark(sentence)
-        session = cls(chosen, data, config, Recorded(recording))
+        session = cls(chosen, data, config, recording)
         return session if prior is None else session.beginning_from(prior)
 
     def beginning_from(self, prior: Path) -> Session:
@@ -238,24 +149,51 @@ class Session:
         Raises:
             InputError: it cannot be used, is another method's, or was made of this recording.
         """
-        known, origin = load_known(prior), self.origin
-        gaussian_prior = device_prior(known, self.method, self.config, origin.sha256(), origin.epoch_ns)
+        gaussian_prior = device_prior(load_known(prior), self.method, self.config, self.sha256(), self.epoch_ns)
         return replace(self, config=self.config.with_prior(gaussian_prior))
 
     def again(self, recording: Recording) -> Session:
         """The same method and config with another recording, or another part of it. Raises InputError."""
         recording = recording.with_config(self.config.topics.values(), self.config.columns)
-        return replace(self, data=self.method.read(recording, self.config), origin=Recorded(recording))
+        return replace(self, data=self.method.read(recording, self.config), recording=recording)
 
     @classmethod
     def of(cls, method: Method, simulated: Simulated, config_file: Path | Config | None = None) -> Session:
         """A simulated recording that was never written."""
         config = load_config(simulated.config.encode(), config_file)
-        return cls(method, simulated.data, config, Arrays(method, simulated.data, simulated.truth))
+        return cls(method, simulated.data, config, known=simulated.truth)
 
     def __repr__(self) -> str:
         """One line."""
-        return f"<Session {self.method.name} of {self.origin.name}>"
+        return f"<Session {self.method.name} of {self.name}>"
+
+    @property
+    def name(self) -> str:
+        """Name of the recording, for people."""
+        return "arrays" if self.recording is None else self.recording.path.name
+
+    @property
+    def epoch_ns(self) -> int:
+        """Zero of all times, Unix ns: the recording's first stamp."""
+        return int(self.data.epoch_ns)
+
+    def sha256(self) -> str:
+        """SHA-256 of the recording, or of all arrays and numbers in memory, hexadecimal."""
+        if self.recording is not None:
+            return self.recording.sha256()
+        return sha256_of(self.data)
+
+    def truth(self) -> Mapping[str, object] | None:
+        """Parameter -> true value, where known. Raises InputError for an attachment that is no JSON object."""
+        attachment = None if self.recording is None else self.recording.attachment(TRUTH, needed=False)
+        if self.recording is None or attachment is None:
+            return self.known
+        try:
+            return dict(json.loads(attachment, parse_int=float))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise InputError(
+                f"{self.recording.path}: the attachment {TRUTH} is no JSON object of parameters and their values"
+            ) from error
 
     def problem(self) -> Problem:
         """The graph. Raises InputError when the data are too few, or the config says what the method has no use for."""
@@ -273,8 +211,13 @@ class Session:
 
     @cached_property
     def facts(self) -> SessionFacts:
-        """What went in."""
-        return self.origin.facts(self.config)
+        """Topics, rates, gaps and losses of the recording, whose stamps are not kept then; the length of arrays."""
+        if self.recording is None:
+            start, stop = self.faults.span(self.data)
+            return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
+        facts = session_facts(self.recording, self.config)
+        self.recording.forget_times()
+        return facts
 
     def calibrate(
         self, solver: str = "batch", window: float | None = 1.0, check: bool = True, report: bool = True
@@ -348,7 +291,7 @@ class Session:
         if self.attitude_rate == "gyro" and self.problem().at_gyro_rate is None:
             raise InputError(f"attitude rate gyro: {self.method.name} has no attitudes between those it estimates")
         # The facts before anything is solved, so that the stamps need not be kept meanwhile.
-        sha256, truth, facts = self.origin.sha256(), self.origin.truth(), self.facts
+        sha256, truth, facts = self.sha256(), self.truth(), self.facts
         found, published = [], None
         for estimate, problem in solved:
             quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
@@ -378,7 +321,7 @@ class Session:
                             *_stopped(),
                         ]
                     ),
-                    recording=self.origin.name,
+                    recording=self.name,
                     sha256=sha256,
                     facts=facts,
                     config=self.config,
@@ -663,6 +606,13 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         f"({ENCODING}): `alidade info` lists them for each method, `topics:` in the config can rename"
         + (f"; nearest is {nearest}" if nearest else "")
     )
+
+
+def sha256_of(data: Any) -> str:
+    """SHA-256 of a dataclass' arrays and numbers, field by field, hexadecimal."""
+    digest = hashlib.sha256()
+    _feed(digest, data)
+    return digest.hexdigest()
 
 
 def _feed(digest: hashlib._Hash, data: Any) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from alidade.pipelines import deadline, progress
-from alidade.pipelines.applications.session import Recorded, Session, resolve_method
+from alidade.pipelines.applications.session import Session, resolve_method
 from alidade.pipelines.applications.sharing import device_prior, walks
 from alidade.pipelines.config import configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
@@ -139,7 +139,7 @@ def validate(
     validations = chosen.report.validate(data, config, values)
     if calibration.recording.sha256 == recording.sha256():
         return Validated(calibration, path.name, validations, True, recording.notes)
-    session = Session(chosen, data, config, Recorded(recording))
+    session = Session(chosen, data, config, recording)
     with session.usual_time():
         held, estimate, own = _held(session, calibration)
         lost = (*recording.notes, *filter(None, [deadline.stopped()]))
@@ -175,9 +175,7 @@ def _held(
         dict(zip(known.gaussian_prior.names, known.gaussian_prior.mean.tolist(), strict=True))
     )
     device = walks(session.method, session.config, [q.name for q in problem.quantities])
-    gaussian_prior = device_prior(
-        known, session.method, session.config, session.origin.sha256(), session.origin.epoch_ns
-    )
+    gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:
         with progress.doing("solving"):
             estimate = solve_batch(problem, device=device)

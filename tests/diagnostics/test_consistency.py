@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
-from alidade.pipelines.applications.session import Arrays, Session
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics import hypothesis_tests, trial_fit
 from alidade.pipelines.diagnostics.cross_validation import split_halves
@@ -99,7 +99,7 @@ def first_hypothesis(case: Case) -> str:
 def findings(case: Case) -> tuple[Finding, ...]:
     """Of the whole calibration, which need not have converged."""
     found, data, config = case
-    return Session(found, data, config, Arrays(found, data)).calibrate().findings
+    return Session(found, data, config).calibrate().findings
 
 
 def first_of_calibration(case: Case) -> str:
@@ -128,7 +128,7 @@ def test_noise_stated_three_times_too_small_is_no_cause_and_told(head: Case) -> 
 def test_noise_known_exactly_and_three_times_too_small_does_not_fit() -> None:
     find, data, config = head_of(5.0)
     known = with_noise(config, vision_attitude=1.0 / 3.0).model_copy(update={"noise_known": 0.0})
-    calibration = Session(find, data, known, Arrays(find, data)).calibrate()
+    calibration = Session(find, data, known).calibrate()
     assert calibration.status == "inconsistent"
     assert any(f.kind == "misfit" and f.evidence["largest"] == "vision" for f in calibration.findings)
 

@@ -231,10 +231,10 @@ def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
 
 def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, str, dict[str, float]]:
     """Identity of the recordings of a study: method, data of one, their config and truth."""
-    from alidade.pipelines.applications.session import Arrays
+    from alidade.pipelines.applications.session import sha256_of
 
     simulated = method.simulate(scenario, seed)
-    return method.name, Arrays(method, simulated.data).sha256(), simulated.config, dict(simulated.truth)
+    return method.name, sha256_of(simulated.data), simulated.config, dict(simulated.truth)
 
 
 def _numbers(calibration: Calibration) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from alidade.pipelines.applications.follow.guidance import WAITING, View, Watch, view_of
 from alidade.pipelines.applications.follow.sources import Source
-from alidade.pipelines.applications.session import Recorded, Session
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.camera_clock import Clock
@@ -234,9 +234,9 @@ class Follower:
         # A sensor whose first message comes late may bring variables of its own.
         if self._run is not None and _names(self._run.problem) != _names(problem):
             self._run = None
-        if problem.steps_after is None or belongs != self._identity or session.origin.epoch_ns != self._epoch_ns:
+        if problem.steps_after is None or belongs != self._identity or session.epoch_ns != self._epoch_ns:
             self._run = None
-        self._identity, self._epoch_ns = belongs, session.origin.epoch_ns
+        self._identity, self._epoch_ns = belongs, session.epoch_ns
         if self._run is None and problem.steps_after is not None:
             self._run = self._resumed(problem)
         if self._run is None:
@@ -300,7 +300,7 @@ class Follower:
     def _identify(self, session: Session) -> dict[str, str]:
         """What a checkpoint belongs to, in words."""
         return {
-            "recording": f"one that starts at {session.origin.epoch_ns} ns ({file_identity(self.source.parts[0])})",
+            "recording": f"one that starts at {session.epoch_ns} ns ({file_identity(self.source.parts[0])})",
             "method": session.method.name,
             "config": session.config.model_dump_json(exclude_defaults=True),
             "window": str(self.settings.window),
@@ -351,8 +351,8 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
 
 def _min_delay_ns(session: Session) -> int:
     """Least delay of the log times after the stamps, ns, of the topics that were read."""
-    assert isinstance(session.origin, Recorded)
-    return session.origin.recording.delay_ns
+    assert session.recording is not None
+    return session.recording.delay_ns
 
 
 def _is_misplaced(run: IncrementalSolver) -> bool:
