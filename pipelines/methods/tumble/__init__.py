@@ -3,11 +3,18 @@
 from pathlib import Path
 
 from alidade.pipelines.estimation.parameters import ParameterSpec, gyro_bias, scalar
-from alidade.pipelines.methods import Guidance, Method, Report, deferred
-from alidade.pipelines.methods.triads import CORRECTIONS, triad_specs
+from alidade.pipelines.methods import Method, deferred
+from alidade.pipelines.methods.triads import triad_specs
 from alidade.pipelines.methods.tumble import turning
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES, TumbleData, read_tumble, tumble_topics
-from alidade.pipelines.methods.tumble.topics import REQUIREMENTS, TOPICS
+from alidade.pipelines.methods.tumble.recording import (
+    ACCEL_SQUARE,
+    REQUIREMENTS,
+    SLOPES,
+    TOPICS,
+    TumbleData,
+    read_tumble,
+    tumble_topics,
+)
 
 # Priors of triads and strengths are in `tumble.parameters`: over the strength, and by the model of the field.
 PARAMETERS = (
@@ -30,17 +37,6 @@ PARAMETERS = (
     *SLOPES,
 )
 
-CARDS = {
-    "Gyro": (
-        ("Bias", "deg/s", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
-        ("Scale error", "%", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
-    ),
-    "Field": (
-        ("Strength", "", ("field_strength",)),
-        ("Dip", "deg", ("field_dip",)),
-        ("Delay of the magnetometer", "ms", ("mag_delay",)),
-    ),
-}
 METHOD = Method(
     name="tumble",
     title="Tumbled magnetometer and accelerometer",
@@ -53,20 +49,9 @@ METHOD = Method(
     problem=deferred("alidade.pipelines.methods.tumble.graph:problem"),
     published=deferred("alidade.pipelines.methods.tumble.published:published_estimate"),
     simulator=deferred("alidade.pipelines.methods.tumble.simulation:SIMULATOR"),
-    guidance=Guidance(
-        checklist=deferred("alidade.pipelines.methods.tumble.guidance:checklist"),
-        variations=deferred("alidade.pipelines.methods.tumble.candidates:candidates"),
-    ),
-    faults=deferred("alidade.pipelines.methods.tumble.hypotheses:FAULTS"),
-    report=Report(
-        uses=deferred("alidade.pipelines.methods.tumble.uses:uses"),
-        cards=CARDS,
-        formulas=deferred("alidade.pipelines.methods.tumble.formulas:formulas"),
-        corrections=CORRECTIONS,
-        findings=deferred("alidade.pipelines.methods.tumble.findings:findings"),
-        figures=deferred("alidade.pipelines.methods.tumble.figures:figures"),
-        validate=deferred("alidade.pipelines.methods.tumble.validation:validate"),
-    ),
+    guidance=deferred("alidade.pipelines.methods.tumble.guidance:GUIDANCE"),
+    faults=deferred("alidade.pipelines.methods.tumble.guidance:FAULTS"),
+    report=deferred("alidade.pipelines.methods.tumble.report:REPORT"),
     frames=Path(__file__).with_name("frames.svg"),
     fallback=True,
 )

@@ -1,17 +1,19 @@
-"""Guidance for the person who rotates the device: coverage so far."""
+"""Guidance for the person who rotates the device, coverage so far; what can be wrong with the data."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from alidade.factors import so3
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
+from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.display.drawing import along, covered, resting
 from alidade.pipelines.display.sphere_map import described, share_near, widest_gap
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.settings import Config
@@ -46,3 +48,21 @@ def _picture(sensor: str, where: Array) -> str:
     if sine < _UPRIGHT:  # half a turn about x where it points down
         return resting(so3.exp([0.0 if where[2] > 0.0 else np.pi, 0.0, 0.0]), lit=where)
     return resting(so3.exp(axis / sine * np.arctan2(sine, where[2])), lit=where)
+
+
+# Longer than an accelerometer needs to be seen at rest, s.
+_REST = 1.5
+
+
+def variations(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+    """Changes of a planned motion that may determine more: in words, and the changed scenario."""
+    yield "twice as many attitudes", {**scenario, "attitudes": 2 * scenario["attitudes"]}
+    if scenario["tilt_deg"] < 180.0:
+        yield "turned upside down too", {**scenario, "tilt_deg": 180.0}
+    if scenario["accelerometer"] and scenario["rest_s"] < _REST:
+        yield f"{_REST:g} s of rest in each attitude", {**scenario, "rest_s": _REST}
+
+
+# Signs, order and scale of axes are what is calibrated.
+FAULTS = FaultModel(streams={"mag_t": ("mag",), "accel_t": ("accel",), "gyro_t": ("gyro",)}, signs={})
+GUIDANCE = Guidance(checklist=checklist, variations=variations)

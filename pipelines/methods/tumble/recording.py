@@ -22,10 +22,15 @@ from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, is_there, 
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.recording.streams import Samples, StreamReader, Temperature, white_covariance
-from alidade.pipelines.recording.topics import FIX, IMU, MAG, wanted
+from alidade.pipelines.recording.topics import FIX, IMU, MAG, TEMPERATURE, Need, Setting, wanted
 from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
+
+TOPICS = (MAG, IMU, FIX, TEMPERATURE)
+_METHOD = Setting("`method: tumble` in the config", lambda config: config.method == "tumble")
+# An accelerometer by itself is in most recordings, and seldom meant.
+REQUIREMENTS: tuple[Need, ...] = (((MAG,), (IMU, _METHOD)),)
 
 # Why a gyro is left out.
 NO_RATE = "gyro beyond what rad/s can be, not used"

@@ -28,9 +28,9 @@ from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.methods.triads import triad_names, triad_of
-from alidade.pipelines.methods.tumble.formulas import formulas
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData, read_tumble, tumble_topics
+from alidade.pipelines.methods.tumble.report import formulas
 from alidade.pipelines.methods.tumble.scenario import (
     TumbledAccelerometer,
     TumbledGyro,
