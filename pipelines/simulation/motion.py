@@ -6,21 +6,20 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from alidade.factors import so3
+from alidade.pipelines.simulation.scenario import ScenarioPart
 
 Array = NDArray[np.float64]
 
 
-class Swing(BaseModel):
+class Swing(ScenarioPart):
     """One part of an angle: an oscillation and a turn at constant rate, between `start_s` and `end_s`.
 
     angle = amplitude * sin(2 pi * frequency * s + phase) + rate * s, with s = clip(t, start, end) - start in seconds:
     constant outside the interval, continuous everywhere.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     amplitude_deg: float = 0.0
     frequency_hz: float = 0.0
@@ -30,10 +29,8 @@ class Swing(BaseModel):
     end_s: float = float("inf")
 
 
-class EulerMotion(BaseModel):
+class EulerMotion(ScenarioPart):
     """Yaw, pitch and roll over time, each the sum of its swings; no swings = zero."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     yaw: list[Swing] = Field(default_factory=list)
     pitch: list[Swing] = Field(default_factory=list)

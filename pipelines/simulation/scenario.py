@@ -6,9 +6,9 @@ import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from alidade.pipelines.errors import InputError, nearest, nearest_three
@@ -18,6 +18,17 @@ Model = TypeVar("Model", bound=BaseModel)
 
 # Installed beside this file; in a source tree among the data sets.
 _FOLDERS = (Path(__file__).parent / "scenarios", Path(__file__).resolve().parents[2] / "datasets" / "scenarios")
+
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class ScenarioPart(BaseModel):
+    """Settings of a simulator, or a part of them: unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | None = None) -> Model:

@@ -7,21 +7,19 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.parameters import ParameterSpec, quantities
 from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config, Sensors
+from alidade.pipelines.simulation.scenario import Positive, ScenarioPart
 
 Array = NDArray[np.float64]
-Positive = Annotated[float, Field(gt=0.0)]
 
 
-class Warming(BaseModel):
+class Warming(ScenarioPart):
     """What a sensor's temperature does: it goes from one to another, slower and slower."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     start_c: Annotated[float, Field(ge=-100.0, le=200.0)] = 20.0
     rise_k: Annotated[float, Field(ge=-100.0, le=100.0)] = 10.0  # after a long time

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from alidade.factors import so3
 from alidade.factors.model import ROT3, Array, Model, Residuals
@@ -42,7 +41,7 @@ from alidade.pipelines.recording.streams import StreamReader, imu_series
 from alidade.pipelines.recording.topics import Topic
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from alidade.pipelines.simulation.scenario import sways
+from alidade.pipelines.simulation.scenario import ScenarioPart, sways
 from alidade.pipelines.simulation.simulated import Simulated
 
 MAX_OFFSET_S = 0.5  # the time offset is searched for within this
@@ -272,20 +271,18 @@ def figures(data: GyroPairData, calibration: Any) -> list[Plot]:
     return [Plot("Both gyros in one frame", f"Mean rates over windows; difference {left:.3g} deg/s RMS.", both)]
 
 
-class Gyro(BaseModel):
+class Gyro(ScenarioPart):
     """Settings of one simulated gyro."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     rate_hz: float = 200.0
     phase: float = 0.0  # of the first stamp, in sample intervals
     density: float = 1e-4  # rad/s/sqrt(Hz)
     bias_deg_s: float = 0.3  # sigma per axis
 
 
-class GyroPairScenario(BaseModel):
+class GyroPairScenario(ScenarioPart):
     """Settings of the simulator."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
     duration_s: float = 60.0
     motion: EulerMotion = EulerMotion(
         yaw=[Swing(amplitude_deg=40, frequency_hz=0.31), Swing(amplitude_deg=6, frequency_hz=1.1)],

@@ -6,9 +6,10 @@ from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import model_validator
 
 from alidade.factors import so3
+from alidade.pipelines.simulation.scenario import ScenarioPart
 
 Array = NDArray[np.float64]
 
@@ -34,10 +35,8 @@ SIDES: dict[Side, tuple[float, float, float]] = {
 }
 
 
-class Resting(BaseModel):
+class Resting(ScenarioPart):
     """An attitude to rest in: a side of the cube up, another one to the north, then the top leaned to the east."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     up: Side
     north: Side

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.cube.faces import FACES, Resting
 from alidade.pipelines.settings import SensorSheets
+from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
 from alidade.pipelines.simulation.sensors import Warming
 
 # 2026-11-20 12:00 UTC, and the year of that day for the field model.
@@ -16,16 +17,8 @@ EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
 # BRC of a camera that looks along x of the reference, z up.
 FORWARD = (-0.5, 0.5, -0.5, 0.5)
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class CubeNoise(_Part):
+class CubeNoise(ScenarioPart):
     """Noise of the sensors, under the names the recording's config gives them."""
 
     gyro_density: Positive = 1.2e-4  # rad/s/sqrt(Hz)
@@ -35,7 +28,7 @@ class CubeNoise(_Part):
     corner_px: Positive = 0.2  # of the detections; pictures have their own
 
 
-class Errors(_Part):
+class Errors(ScenarioPart):
     """Sigmas of what is to be found."""
 
     gain: NotNegative = 0.02  # of each entry of K - 1
@@ -46,14 +39,14 @@ class Errors(_Part):
     tag_mount: NotNegative = 3e-3  # rad
 
 
-class FieldErrors(_Part):
+class FieldErrors(ScenarioPart):
     """Sigmas of the earth's field against its model, T; a data sheet of the field goes before them."""
 
     direction: NotNegative = 5e-7  # each way across the model's field
     strength: NotNegative = 1.33e-7  # along it
 
 
-class Place(_Part):
+class Place(ScenarioPart):
     """Place on the earth."""
 
     latitude_deg: float = 40.0
@@ -61,7 +54,7 @@ class Place(_Part):
     height: float = 50.0
 
 
-class TagCube(_Part):
+class TagCube(ScenarioPart):
     """Size and tags of the cube that carries the device, m."""
 
     edge: Positive = 0.16
@@ -69,7 +62,7 @@ class TagCube(_Part):
     hidden: tuple[int, ...] = ()  # ids of tags that are never seen
 
 
-class Pictures(_Part):
+class Pictures(ScenarioPart):
     """Settings of the camera, where pictures replace detections."""
 
     rate_hz: Positive = 5.0
@@ -78,7 +71,7 @@ class Pictures(_Part):
     exposure_s: Positive = 4e-3
 
 
-class CubeCamera(_Part):
+class CubeCamera(ScenarioPart):
     """The camera that looks at the cube."""
 
     rate_hz: Positive = 20.0
@@ -87,7 +80,7 @@ class CubeCamera(_Part):
     pictures: Pictures = Pictures()
 
 
-class Magnetometer(_Part):
+class Magnetometer(ScenarioPart):
     """The device's magnetometer, and iron about it."""
 
     rate_hz: Positive = 50.0
@@ -95,7 +88,7 @@ class Magnetometer(_Part):
     disturbance: NotNegative = 2e-6  # T, sigma per axis
 
 
-class ReferenceAttitude(_Part):
+class ReferenceAttitude(ScenarioPart):
     """The attitude reference that carries the camera."""
 
     rate_hz: Positive = 10.0
@@ -105,7 +98,7 @@ class ReferenceAttitude(_Part):
     heading_noise_deg: Positive = 0.05
 
 
-class CubeScenario(_Part):
+class CubeScenario(ScenarioPart):
     """Settings of the `cube` simulator; every key has a default, `null` leaves a sensor out."""
 
     poses: Annotated[int, Field(ge=0)] = 24  # in random attitudes

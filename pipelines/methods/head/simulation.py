@@ -13,7 +13,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
@@ -27,6 +27,7 @@ from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import Board, SensorSheets, Tag
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
+from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
 from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.vision.camera import Camera
@@ -35,8 +36,6 @@ Array = NDArray[np.float64]
 
 # 2026-11-20 12:00 UTC: simulated sessions start here.
 EPOCH_NS = 1_795_176_000_000_000_000
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 Fraction = Annotated[float, Field(ge=0.0, lt=1.0)]
 Vector = tuple[float, float, float]
 
@@ -59,10 +58,8 @@ def _board(*tags: tuple[float, float, float, float]) -> Board:
     return Board(tags=out)
 
 
-class HeadPictures(BaseModel):
+class HeadPictures(ScenarioPart):
     """The camera, its pictures, the tag board and where it is: a pinhole camera with plumb_bob distortion."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     width: Annotated[int, Field(gt=0)] = 640
     height: Annotated[int, Field(gt=0)] = 480
@@ -117,10 +114,8 @@ def _exposures(
         yield encode(picture, settings.format, 92)
 
 
-class HeadNoise(BaseModel):
+class HeadNoise(ScenarioPart):
     """Noise of the sensors, under the names the recording's config gives them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     gyro_density: NotNegative = 1e-4  # rad/s/sqrt(Hz)
     gyro_bias_walk: NotNegative = 1e-6  # rad/s/sqrt(s)
@@ -129,10 +124,8 @@ class HeadNoise(BaseModel):
     vision_attitude: NotNegative = 8.7e-3  # rad per axis of frame h
 
 
-class HeadScenario(BaseModel):
+class HeadScenario(ScenarioPart):
     """Settings of the `head` simulator; every key has a default."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     duration_s: Positive = 60.0
     head: EulerMotion = EulerMotion(

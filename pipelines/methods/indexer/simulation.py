@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate
@@ -24,6 +24,7 @@ from alidade.pipelines.methods.indexer.parameters import NUISANCE
 from alidade.pipelines.methods.indexer.recording import JOINTS, IndexerData
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.motion import sample_times
+from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
 from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
 from alidade.pipelines.simulation.simulated import Simulated
 
@@ -33,15 +34,11 @@ Array = NDArray[np.float64]
 EPOCH_NS = 1_795_176_000_000_000_000
 ARCSEC = np.deg2rad(1.0 / 3600.0)
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 Vector = tuple[float, float, float]
 
 
-class Position(BaseModel):
+class Position(ScenarioPart):
     """Turns about one axis, forward and back, the other axis standing at an angle."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     axis: Literal["outer", "inner"]
     other_deg: float
@@ -56,20 +53,16 @@ _SCHEDULE = [
 ]
 
 
-class IndexerNoise(BaseModel):
+class IndexerNoise(ScenarioPart):
     """Noise of the sensors, under the names the recording's config gives them; `encoder` is white, rad."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     gyro_density: NotNegative = 5.8e-7  # rad/s/sqrt(Hz); 0.002 deg/sqrt(h)
     gyro_bias_walk: NotNegative = 0.0  # rad/s/sqrt(s)
     encoder: NotNegative = 0.0  # rad
 
 
-class IndexerScenario(BaseModel):
+class IndexerScenario(ScenarioPart):
     """Settings of the `indexer` simulator; every key has a default."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     positions: list[Position] = _SCHEDULE
     cycles: Annotated[int, Field(ge=1)] = 1  # how many times the positions are gone through

@@ -18,7 +18,7 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
@@ -31,6 +31,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
 from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
 from alidade.pipelines.simulation.simulated import Simulated
 
@@ -42,16 +43,11 @@ EPOCH_NS = 1_795_176_000_000_000_000
 # Gyro samples that are simulated at once.
 _BLOCK = 100_000
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Span = tuple[float, float]
 
 
-class LosNoise(BaseModel):
+class LosNoise(ScenarioPart):
     """Noise of the sensors, under the names the recording's config gives them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     gyro_density: NotNegative = 3e-5  # rad/s/sqrt(Hz)
     gyro_bias_walk: NotNegative = 2e-7  # rad/s/sqrt(s)
@@ -61,10 +57,8 @@ class LosNoise(BaseModel):
     los_roll: NotNegative = 2e-4  # rad
 
 
-class LosAngles(BaseModel):
+class LosAngles(ScenarioPart):
     """Mounting angles, deg: what the method is to find."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     delta_px: float = 0.5
     delta_pz: float = 0.25
@@ -73,10 +67,8 @@ class LosAngles(BaseModel):
     delta_gz: float = -0.25
 
 
-class Loss(BaseModel):
+class Loss(ScenarioPart):
     """A target lost over [start, end), after which the camera holds on to another one."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     start_s: float
     end_s: float
@@ -84,10 +76,8 @@ class Loss(BaseModel):
     elevation_step_deg: float = 0.0
 
 
-class LosCamera(BaseModel):
+class LosCamera(ScenarioPart):
     """Pictures of the target: a pinhole camera with plumb_bob distortion, what it looks at, and how well."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     width: Annotated[int, Field(gt=0)] = 640
     height: Annotated[int, Field(gt=0)] = 480
@@ -99,10 +89,8 @@ class LosCamera(BaseModel):
     grey_noise: NotNegative = 2.0
 
 
-class LosScenario(BaseModel):
+class LosScenario(ScenarioPart):
     """Settings of the `los` simulator; every key has a default."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     duration_s: Positive = 60.0
     carrier: EulerMotion = EulerMotion(

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from alidade.pipelines.files import dump_yaml
+from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
 from alidade.pipelines.simulation.sensors import Warming
 
 # 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
 EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class TumbledMagnetometer(_Part):
+class TumbledMagnetometer(ScenarioPart):
     """The magnetometer, with the iron about it."""
 
     rate_hz: Positive = 50.0
@@ -29,7 +23,7 @@ class TumbledMagnetometer(_Part):
     hard_iron: NotNegative = 3e-5  # T, sigma of each component of b
 
 
-class TumbledAccelerometer(_Part):
+class TumbledAccelerometer(ScenarioPart):
     """The accelerometer."""
 
     rate_hz: Positive = 100.0
@@ -42,7 +36,7 @@ class TumbledAccelerometer(_Part):
     arm: NotNegative = 0.1  # m, from the centre that the device is turned about
 
 
-class TumbledGyro(_Part):
+class TumbledGyro(ScenarioPart):
     """The gyro, which samples when the accelerometer does, if there is one."""
 
     rate_hz: Positive = 100.0
@@ -55,7 +49,7 @@ class TumbledGyro(_Part):
     mag_delay: NotNegative = 1e-2  # s, sigma
 
 
-class TumbleScenario(_Part):
+class TumbleScenario(ScenarioPart):
     """What the `tumble` simulator is asked for; every key has a default, `null` leaves a sensor out."""
 
     attitudes: Annotated[int, Field(ge=2)] = 30  # random ones, gone through one after the other
