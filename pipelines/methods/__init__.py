@@ -134,7 +134,10 @@ class Method:
 
     def simulate(self, scenario: Any, seed: int, images: bool = False) -> Simulated:
         """Data and truth in memory of a scenario. Raises InputError when there is no simulator, or it refuses."""
-        return self.require_simulator().simulate(scenario, seed, images)
+        simulator = self.require_simulator()
+        if images and not simulator.has_camera:
+            raise InputError(f"{self.name} has no camera: leave out --images")
+        return simulator.simulate(scenario, seed, images)
 
     def write(self, path: Path, simulated: Simulated) -> None:
         """Write simulated data as a recording with truth and config attached. Raises InputError."""
@@ -203,6 +206,7 @@ class Simulator:
         folder: the method's own scenario files.
         randomised: motion or sensors depend on the seed, not only the noise: recordings of one scenario differ in what
             they determine.
+        has_camera: pictures can be simulated.
     """
 
     scenario: type[BaseModel]
@@ -210,6 +214,7 @@ class Simulator:
     default_with_images: str = ""
     folder: Path | None = None
     randomised: bool = False
+    has_camera: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.parameters import ParameterSpec, quantities
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.scenario import Positive, ScenarioPart
@@ -36,23 +37,42 @@ class Warming(ScenarioPart):
         return Temperature(t, self.at(t))
 
 
-def true_values(
-    assumptions: Sequence[ParameterSpec],
-    sensors: Sensors | None,
-    given: Mapping[str, float],
-    rng: np.random.Generator,
-) -> dict[str, float]:
+def true_values(specs: Sequence[ParameterSpec], scenario: Any, rng: np.random.Generator) -> dict[str, float]:
     """A value for each parameter: as given, else drawn from the prior that data sheets make, else 0 for perfect ones.
 
-    Raises InputError, naming the nearest known name, for one given that is not known.
+    Args:
+        specs: of errors of sensors; without a temperature those that follow from one are left out.
+        scenario: has `effects`, values by name, `sensors`, their data sheets or None, and `temperature`.
+        rng: draws them.
+
+    Raises:
+        InputError: `effects` has an unknown name.
     """
-    config = Config(sensors=sensors or Sensors())
-    known = [q for assumption in assumptions for q in quantities(assumption, config)]
-    drawn = {q.name: float((q.prior_sigma or 0.0) * rng.standard_normal()) if sensors else 0.0 for q in known}
-    for name in given:
+    config = Config(sensors=scenario.sensors or Sensors())
+    known = [spec for spec in specs if scenario.temperature is not None or spec.figure != "temperature"]
+    sigmas = {q.name: q.prior_sigma or 0.0 for spec in known for q in quantities(spec, config)}
+    drawn = {name: float(sigma * rng.standard_normal()) if scenario.sensors else 0.0 for name, sigma in sigmas.items()}
+    for name in scenario.effects:
         if name not in drawn:
             raise InputError(f"unknown key effects.{name}{nearest(name, list(drawn))}")
-    return {**drawn, **given}
+    return {**drawn, **scenario.effects}
+
+
+def by_axis(**vectors: ArrayLike) -> dict[str, float]:
+    """Components of vectors as parameters: name_x, name_y, name_z."""
+    return {
+        f"{name}_{axis}": float(x)
+        for name, vector in vectors.items()
+        for axis, x in zip("xyz", np.asarray(vector), strict=True)
+    }
+
+
+def recording_config(method: str, scenario: Any, noise: Mapping[str, float], **more: object) -> str:
+    """The config of a simulated recording (YAML): the noise, priors and data sheets of the scenario, other keys."""
+    config = {"method": method, "noise": dict(noise), "priors": scenario.priors, **more}
+    if getattr(scenario, "sensors", None) is not None:
+        config["sensors"] = scenario.model_dump()["sensors"]
+    return dump_yaml(config)
 
 
 def read_by(rate: Array, sensor: str, values: Mapping[str, float], force: Array | None = None) -> Array:
@@ -68,11 +88,6 @@ def read_by(rate: Array, sensor: str, values: Mapping[str, float], force: Array 
 def measured(warming: Warming | None, duration: float) -> Temperature | None:
     """What messages say; None without a topic."""
     return None if warming is None else warming.measured(duration)
-
-
-def known(assumptions: Sequence[ParameterSpec], warming: Warming | None) -> list[ParameterSpec]:
-    """Without those about a temperature, where there is none."""
-    return [each for each in assumptions if warming is not None or each.figure != "temperature"]
 
 
 def drift(warming: Warming | None, sensor: str, values: Mapping[str, float], t: Array) -> Array:

@@ -6,11 +6,10 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.cube.faces import FACES, Resting
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
-from alidade.pipelines.simulation.sensors import Warming
+from alidade.pipelines.simulation.sensors import Warming, recording_config
 
 # 2026-11-20 12:00 UTC, and the year of that day for the field model.
 EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
@@ -137,9 +136,7 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
     noise = {**scenario.noise.model_dump(), **repeats}
     if images:
         del noise["corner_px"]  # the tracker's own
-    config: dict[str, Any] = {"method": "cube", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
-    if scenario.sensors is not None:
-        config["sensors"] = scenario.model_dump()["sensors"]
+    cube: dict[str, Any] = {}
     if scenario.camera:
         tags = {
             i: {
@@ -149,5 +146,5 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
             }
             for i, (wxyz, normal) in FACES.items()
         }
-        config["cube"] = {"tag_family": "36h11", "tags": tags, "camera_rotation": list(FORWARD)}
-    return dump_yaml(config)
+        cube = {"cube": {"tag_family": "36h11", "tags": tags, "camera_rotation": list(FORWARD)}}
+    return recording_config("cube", scenario, noise, date="2026-11-20", **cube)

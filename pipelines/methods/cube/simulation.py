@@ -48,7 +48,7 @@ from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from alidade.pipelines.simulation.sensors import drift, known, measured, true_values
+from alidade.pipelines.simulation.sensors import by_axis, drift, measured, true_values
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.vision.camera import Camera
 
@@ -90,8 +90,7 @@ class _World:
         self.scenario = scenario
         # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
         self.rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-        assumed = known(NUISANCE, scenario.temperature)
-        self.effects = true_values(assumed, scenario.sensors, scenario.effects, rng_of_sensors)
+        self.effects = true_values(NUISANCE, scenario, rng_of_sensors)
         config = Config(sensors=scenario.sensors or Sensors())
         for assumption in (FOCAL, CENTRE):
             if not is_stated(assumption, config):
@@ -297,12 +296,8 @@ class _World:
                 vectors["camera_mount"] = self.mount
                 truth["reference_heading"] = self.heading
                 truth |= {name: self.effects[name] for name in TILT.names}
-            truth |= {
-                f"{name}_{axis}": float(x)
-                for name, vector in vectors.items()
-                for axis, x in zip("xyz", vector, strict=True)
-            }
+            truth |= by_axis(**vectors)
         return truth
 
 
-SIMULATOR = Simulator(scenario=CubeScenario, simulate=simulated, randomised=True)
+SIMULATOR = Simulator(scenario=CubeScenario, simulate=simulated, randomised=True, has_camera=True)

@@ -18,7 +18,6 @@ from pydantic import Field, model_validator
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.head.parameters import NUISANCE
 from alidade.pipelines.methods.head.recording import HeadData
@@ -28,7 +27,15 @@ from alidade.pipelines.settings import Board, SensorSheets, Tag
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
-from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
+from alidade.pipelines.simulation.sensors import (
+    Warming,
+    by_axis,
+    drift,
+    measured,
+    read_by,
+    recording_config,
+    true_values,
+)
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.vision.camera import Camera
 
@@ -170,7 +177,7 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     noise = scenario.noise
-    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(NUISANCE, scenario, rng_of_sensors)
     head_t, head_rate = _gyro(scenario, scenario.gyro_rate_hz, scenario.gyro_phase, helmet=True)
     force = _specific_force(scenario, head_t)
     bias = _walking_bias(scenario, len(head_t), rng)
@@ -216,7 +223,7 @@ def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraI
     if scenario.outlier_fraction > 0.0:
         raise InputError("outlier_fraction: pictures are simulated without outliers; leave out --images")
     rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(NUISANCE, scenario, rng_of_sensors)
     t, at, cRh = _sights(scenario, effects)
     rng = np.random.default_rng(seed)
     return draw(scenario.pictures, at, nanoseconds(t, EPOCH_NS), cRh, rng)
@@ -230,13 +237,10 @@ def head_config(scenario: HeadScenario, images: bool = False) -> str:
     noise = scenario.noise.model_dump()
     if scenario.platform is None:
         del noise["platform_gyro_density"]
-    config: dict[str, object] = {"method": "head", "noise": noise, "priors": scenario.priors}
-    if scenario.sensors is not None:
-        config["sensors"] = scenario.model_dump()["sensors"]
-    if images:
-        del noise["vision_attitude"]
-        config["head"] = {"board": scenario.pictures.board.model_dump()}
-    return dump_yaml(config)
+    if not images:
+        return recording_config("head", scenario, noise)
+    del noise["vision_attitude"]
+    return recording_config("head", scenario, noise, head={"board": scenario.pictures.board.model_dump()})
 
 
 def _platform_attitude(scenario: HeadScenario, t: Array) -> Array:
@@ -316,17 +320,8 @@ def _mount(rotation_vector_deg: Vector) -> Array:
 
 
 def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
-    vectors = {
-        "gyro_bias": bias.mean(axis=0),
-        "helmet_mount": np.deg2rad(scenario.helmet_mount_deg),
-        "camera_mount": np.deg2rad(scenario.camera_mount_deg),
-    }
-    truth = {
-        f"{name}_{axis}": float(value)
-        for name, vector in vectors.items()
-        for axis, value in zip("xyz", vector, strict=True)
-    }
-    return truth | {"time_offset": scenario.time_offset_s}
+    mounts = {f"{name}_mount": np.deg2rad(getattr(scenario, f"{name}_mount_deg")) for name in ("helmet", "camera")}
+    return by_axis(gyro_bias=bias.mean(axis=0), **mounts) | {"time_offset": scenario.time_offset_s}
 
 
 def simulated(scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
@@ -340,4 +335,4 @@ def simulated(scenario: HeadScenario, seed: int, images: bool = False) -> Simula
     return Simulated(data, truth, head_config(scenario, images), pictures)
 
 
-SIMULATOR = Simulator(scenario=HeadScenario, simulate=simulated, default_with_images="head_pictures")
+SIMULATOR = Simulator(scenario=HeadScenario, simulate=simulated, default_with_images="head_pictures", has_camera=True)

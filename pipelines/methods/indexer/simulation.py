@@ -17,15 +17,21 @@ from pydantic import Field
 
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate
-from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.indexer.parameters import NUISANCE
 from alidade.pipelines.methods.indexer.recording import JOINTS, IndexerData
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
-from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
+from alidade.pipelines.simulation.sensors import (
+    Warming,
+    by_axis,
+    drift,
+    measured,
+    read_by,
+    recording_config,
+    true_values,
+)
 from alidade.pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
@@ -122,7 +128,7 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng = np.random.default_rng(seed)
     rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(NUISANCE, scenario, rng_of_sensors)
     drives, duration = _program(scenario)
     phases = rng.uniform(0.0, 2.0 * np.pi, size=(2, 1 + len(scenario.encoder_harmonics_arcsec)))
     gyro_t = _recorded(sample_times(duration, scenario.gyro_rate_hz), drives, scenario)
@@ -158,14 +164,8 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     return data, {**_truth(scenario, bias), **effects}
 
 
-def simulated(scenario: IndexerScenario, seed: int, images: bool = False) -> Simulated:
-    """A session in memory.
-
-    Raises:
-        InputError: pictures are asked for.
-    """
-    if images:
-        raise InputError("indexer: there is no camera in this method; leave out --images")
+def simulated(scenario: IndexerScenario, seed: int, _images: bool = False) -> Simulated:
+    """A session in memory."""
     return Simulated(*simulate_indexer(scenario, seed), indexer_config(scenario))
 
 
@@ -180,15 +180,8 @@ def indexer_config(scenario: IndexerScenario) -> str:
     noise = scenario.noise.model_dump() | {"encoder": float(np.sqrt(variance))}
     if not noise["gyro_density"]:
         del noise["gyro_density"]
-    config: dict[str, object] = {
-        "method": "indexer",
-        "noise": noise,
-        "priors": scenario.priors,
-        "indexer": {"base_attitude": list(scenario.base_attitude)},
-    }
-    if scenario.sensors is not None:
-        config["sensors"] = scenario.model_dump()["sensors"]
-    return dump_yaml(config)
+    base = {"base_attitude": list(scenario.base_attitude)}
+    return recording_config("indexer", scenario, noise, indexer=base)
 
 
 def _program(scenario: IndexerScenario) -> tuple[list[_Drive], float]:
@@ -277,15 +270,7 @@ def _encoders(scenario: IndexerScenario, commanded: Array, rng: np.random.Genera
 
 
 def _truth(scenario: IndexerScenario, bias: Array) -> dict[str, float]:
-    vectors = {
-        "theta": np.deg2rad(scenario.mounting_deg),
-        "gyro_bias": bias.mean(axis=0),
-    }
-    truth = {
-        f"{name}_{axis}": float(value)
-        for name, vector in vectors.items()
-        for axis, value in zip("xyz", vector, strict=True)
-    }
+    truth = by_axis(theta=np.deg2rad(scenario.mounting_deg), gyro_bias=bias.mean(axis=0))
     return truth | {"axis_nonperpendicularity": float(scenario.axis_nonperpendicularity_arcsec * ARCSEC)}
 
 

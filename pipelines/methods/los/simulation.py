@@ -23,7 +23,6 @@ from pydantic import Field, model_validator
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.los.parameters import NUISANCE
 from alidade.pipelines.methods.los.recording import JOINTS, LosData
@@ -32,7 +31,15 @@ from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
-from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
+from alidade.pipelines.simulation.sensors import (
+    Warming,
+    by_axis,
+    drift,
+    measured,
+    read_by,
+    recording_config,
+    true_values,
+)
 from alidade.pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
@@ -170,7 +177,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
     """A session and the true values of its parameters (rad, rad/s, s; the bias is its mean over the session)."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(NUISANCE, scenario, rng_of_sensors)
     motion = simulate_motion(scenario, effects, rng)
     image_t, cRt = targets(scenario, motion, rng)
     noise = scenario.noise
@@ -291,7 +298,7 @@ def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraIn
     """The pictures behind the LOS errors of `simulate_los` with the same seed; drawn one by one as they are taken."""
     rng = np.random.default_rng(seed)
     rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(known(NUISANCE, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(NUISANCE, scenario, rng_of_sensors)
     motion = simulate_motion(scenario, effects, rng)
     stamps, cRt = targets(scenario, motion, rng)
     if scenario.losses:
@@ -344,10 +351,7 @@ def los_config(scenario: LosScenario, images: bool = False) -> str:
     noise = {name: value for name, value in scenario.noise.model_dump().items() if value > 0.0}
     if images:
         noise = {name: value for name, value in noise.items() if name not in ("los_error", "los_roll")}
-    config: dict[str, object] = {"method": "los", "noise": noise, "priors": scenario.priors}
-    if scenario.sensors is not None:
-        config["sensors"] = scenario.model_dump()["sensors"]
-    return dump_yaml(config)
+    return recording_config("los", scenario, noise)
 
 
 def _slew(scenario: LosScenario, t: Array) -> Array:
@@ -454,8 +458,7 @@ def _truth(scenario: LosScenario, motion: LosMotion) -> dict[str, float]:
     if scenario.latitude_deg is not None:
         # To a target on the earth the earth rate looks like a bias.
         bias = bias + _earth(scenario, motion.gyro_t)
-    truth |= {f"gyro_bias_{axis}": float(b) for axis, b in zip("xyz", bias, strict=True)}
-    return {**truth, **motion.effects}
+    return {**truth, **by_axis(gyro_bias=bias), **motion.effects}
 
 
-SIMULATOR = Simulator(scenario=LosScenario, simulate=simulated, default_with_images="los_images")
+SIMULATOR = Simulator(scenario=LosScenario, simulate=simulated, default_with_images="los_images", has_camera=True)

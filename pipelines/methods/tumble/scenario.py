@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
-from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
-from alidade.pipelines.simulation.sensors import Warming
+from alidade.pipelines.simulation.sensors import Warming, recording_config
 
 # 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
 EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
@@ -75,5 +74,4 @@ def tumble_config(scenario: TumbleScenario) -> str:
         noise["accel_density"] = scenario.accelerometer.density
     if scenario.gyro is not None:
         noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
-    config: dict[str, Any] = {"method": "tumble", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
-    return dump_yaml(config)
+    return recording_config("tumble", scenario, noise, date="2026-11-20")

@@ -24,7 +24,7 @@ from alidade.pipelines.methods.tumble.scenario import (
     tumble_config,
 )
 from alidade.pipelines.simulation.motion import sample_times
-from alidade.pipelines.simulation.sensors import drift, measured
+from alidade.pipelines.simulation.sensors import by_axis, drift, measured
 from alidade.pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
@@ -35,13 +35,8 @@ _STEP = 1e-3
 _FIELD, _LATITUDE = np.array([0.0, 2.2e-5, -4.2e-5]), np.deg2rad(45.0)
 
 
-def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simulated:
-    """Data and the true values of the parameters.
-
-    Raises InputError when pictures are asked for, or there is no sensor.
-    """
-    if images:
-        raise InputError("tumble has no camera: leave out --images")
+def simulated(scenario: TumbleScenario, seed: int, _images: bool = False) -> Simulated:
+    """Data and the true values of the parameters. Raises InputError when there is no sensor."""
     if scenario.magnetometer is None and scenario.accelerometer is None:
         raise InputError("tumble: magnetometer or accelerometer is needed, or both")
     rng = np.random.default_rng(seed)
@@ -182,7 +177,7 @@ def _gyro(
         exact = exact + _force(motion, beside, g, t) @ G.T
     names = (*(f"gyro_scale_{a}" for a in "xyz"), *(f"gyro_skew_{a}" for a in ("xy", "xz", "yz")))
     truth = dict(zip(names, S.tolist(), strict=True))
-    truth |= {f"gyro_bias_{a}": float(x) for a, x in zip("xyz", bias, strict=True)}
+    truth |= by_axis(gyro_bias=bias)
     truth["gyro_filter"] = rate_hz**-2 / 24.0  # a point's beside that of a mean over an interval
     if beside is not None:
         truth |= {f"gyro_g_{a}{c}": float(G[i, j]) for i, a in enumerate("xyz") for j, c in enumerate("xyz")}
