@@ -443,7 +443,9 @@ class Session:
     ) -> tuple[Estimate, Problem]:
         problem = self.problem()
         if solver == "published":
-            return self.method.published(self.data, self.config, problem), problem
+            start = time.perf_counter()
+            estimate = self.method.published(self.data, self.config, problem)
+            return replace(estimate, seconds={"solve": time.perf_counter() - start}), problem
         if all(q.prior_sigma == 0.0 for q in problem.quantities):
             raise InputError("priors: every parameter is fixed (0), so that there is nothing to calibrate; free one")
         if solver == "incremental":

@@ -10,7 +10,6 @@ Mounts are taken as exact.
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from dataclasses import dataclass
 
@@ -109,7 +108,6 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
     Raises:
         InputError: there is no camera or no reference, or too few poses.
     """
-    start = time.perf_counter()
     poses = static_poses(data, config)
     k, nRb = attitudes(data, config, poses)
     nominal = nominal_vectors(data, config, nRb)
@@ -140,7 +138,6 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
         message=_coverage(nRb),
         residuals=residuals,
         attitudes=Attitudes(poses.span[k].mean(axis=1), nRb),
-        seconds={"solve": time.perf_counter() - start},
     )
 
 

@@ -10,7 +10,6 @@ have been.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -97,7 +96,6 @@ def published_estimate(data: IndexerData, config: Config, problem: Problem) -> E
 
     The publication gives no accuracy; the covariance is what gyro noise alone does to the eight components.
     """
-    start = time.perf_counter()
     found = thin_shell(data)
     density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
     known = {q.name for q in problem.quantities}
@@ -112,7 +110,6 @@ def published_estimate(data: IndexerData, config: Config, problem: Problem) -> E
         covariance=_covariance(found, density),
         converged=not any(found.flat) and not any(found.at_edge),
         message="; ".join(notes) or "one sweep",
-        seconds={"solve": time.perf_counter() - start},
     )
 
 

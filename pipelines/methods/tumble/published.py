@@ -8,7 +8,6 @@ those of the measurements, which biases it where noise is not small; there is no
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -71,7 +70,6 @@ def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Es
     """
     from alidade.pipelines.methods.tumble.model import prepare
 
-    start = time.perf_counter()
     names: list[str] = []
     values: list[Array] = []
     blocks: list[Array] = []
@@ -99,7 +97,6 @@ def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Es
         covariance=covariance[np.ix_(known, known)],
         converged=True,
         message="an ellipsoid by linear least squares",
-        seconds={"solve": time.perf_counter() - start},
     )
 
 
