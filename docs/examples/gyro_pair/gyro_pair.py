@@ -7,42 +7,21 @@ integrated over one window are conjugate, dB(d) = bRa dA aRb, exactly, with neit
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from alidade.factors import so3
-from alidade.factors.model import ROT3, Array, Model, Residuals
-from alidade.factors.preintegration import GyroPath, Increments
-from alidade.pipelines.diagnostics.checklist import ChecklistItem, turned
-from alidade.pipelines.diagnostics.cross_validation import Validation, rms
-from alidade.pipelines.diagnostics.fault_models import AXES, FaultModel
-from alidade.pipelines.display.drawing import swaying
-from alidade.pipelines.display.figure import COLORS, Figure, Plot
-from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameter_problem import parameter_problem
-from alidade.pipelines.estimation.parameters import ParameterSpec, scalar
-from alidade.pipelines.estimation.problem import Estimate, Problem
-from alidade.pipelines.files import dump_yaml
-from alidade.pipelines.methods import Guidance, Method, Report, Scenario, Simulator
-from alidade.pipelines.methods.formula import Formula
-from alidade.pipelines.methods.noise import stated
-from alidade.pipelines.noises import NoiseSpec
-from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.checks import check_overlap
-from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.shapes import Numbers, Vectors
-from alidade.pipelines.recording.streams import StreamReader, imu_series
-from alidade.pipelines.recording.topics import Topic
-from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from alidade.pipelines.simulation.scenario import ScenarioPart, sways
-from alidade.pipelines.simulation.simulated import Simulated
+# isort: off
+from alidade.plugin import (
+    AXES, COLORS, ROT3, Array, ChecklistItem, Config, Estimate, EulerMotion, FaultModel, Figure, Formula, Guidance,
+    GyroPath, Increments, InputError, Level, Method, Model, Motion, NoiseSpec, Numbers, ParameterSpec, Plot,
+    Problem, Recording, Report, Residuals, Scenario, ScenarioPart, Simulated, Simulator, StreamReader, Swing,
+    Topic, Validation, Vectors, apply, by_axis, check_overlap, imu_series, messages, nanoseconds, pair,
+    parameter_problem, recording_config, rms, sample_times, scalar, so3, stated, swaying, sways, turned,
+)  # fmt: skip
 
 MAX_OFFSET_S = 0.5  # the time offset is searched for within this
 WINDOW_S, WINDOW_SAMPLES = 0.1, 20  # windows that are compared are at least this long: short against turns
@@ -56,9 +35,7 @@ PARAMETERS = (
 )
 FORMULAS = (
     Formula("gyro b to gyro a", "aRb", "Exp(rotation)", ()),
-    Formula(
-        "reading of gyro a, its bias included, rad/s in a", "gyro_a", "aRb * (gyro_b - bias_difference)", ("gyro_b",)
-    ),
+    Formula("rate in a, gyro a's bias in it, rad/s", "gyro_a", "aRb * (gyro_b - bias_difference)", ("gyro_b",)),
     Formula("time of that reading on gyro a's clock, s", "time", "stamp + time_offset", ("stamp",)),
 )
 
@@ -76,9 +53,10 @@ class GyroPairData:
     b_density: float | None = None
     dropped: dict[str, int] = field(default_factory=dict)
 
-    def densities(self, config: Config) -> tuple[float, float]:
-        """White noise of a and b: of the config, else of the messages, else the default."""
-        return stated("gyro_density", config, self.a_density).stated, stated(B_DENSITY, config, self.b_density).stated
+    def variance(self, config: Config) -> float:
+        """White noise of both rates, (rad/s)^2/Hz: of the config, else of the messages, else the default."""
+        a, b = stated("gyro_density", config, self.a_density), stated(B_DENSITY, config, self.b_density)
+        return a.stated**2 + b.stated**2
 
 
 def read(recording: Recording, config: Config) -> GyroPairData:
@@ -113,93 +91,68 @@ class ConjugateRotation(Model):
     stacked: ClassVar = ("time", "start", "turns", "sigma")
 
     def __call__(self, aRb: Array, offset: Array, difference: Array) -> Residuals:
-        """Residual Log((bRa dA aRb)^T dB) / sigma, (n, 3)."""
-        begin, end = self.start + offset[:, 0], self.time + offset[:, 0]
-        dA = self.a.increments(begin, end)
-        predicted = so3.compose(so3.inverse(aRb), dA.wxyz, aRb)
-        correction = np.einsum("nij,nj->ni", self.turns.bias_jacobian, difference - self.b.bias_hat)
-        error = so3.log(so3.multiply(so3.inverse(predicted), so3.multiply(self.turns.wxyz, so3.exp(correction))))
-        weight = (1.0 / self.sigma)[:, None]
+        """Residual (Log dB(difference) - bRa Log dA) / sigma, (n, 3); Log of a conjugate is the rotated Log."""
+        begin = self.start + offset[:, 0]
+        dA = self.a.increments(begin, self.time + offset[:, 0])
+        turned_a, turned_b, bRa = so3.log(dA.wxyz), so3.log(self.turns.wxyz), so3.inverse(aRb)
+        by_bias = so3.right_jacobian_inverse(turned_b) @ self.turns.bias_jacobian
+        predicted, weight = so3.rotate(bRa, turned_a), 1.0 / self.sigma[:, None]
+        error = turned_b + np.einsum("nij,nj->ni", by_bias, difference - self.b.bias_hat) - predicted
 
         def jacobians() -> tuple[Array, ...]:
-            by_predicted = -so3.right_jacobian_inverse(-error) * weight[..., None]
-            by_dB = so3.right_jacobian_inverse(error) * weight[..., None]
             # A later window gains the rate at its end and loses the one at its start.
             drift = dA.rate - so3.rotate(so3.inverse(dA.wxyz), self.a.rate(begin))
-            return (
-                by_predicted @ (np.eye(3) - so3.matrix(so3.inverse(predicted))),
-                by_predicted @ so3.rotate(so3.inverse(aRb), drift)[..., None],
-                by_dB @ so3.right_jacobian(correction) @ self.turns.bias_jacobian,
-            )
+            by_time = -so3.matrix(bRa) @ so3.right_jacobian_inverse(turned_a) @ drift[..., None]
+            by_rotation = np.cross(predicted[:, None, :], np.eye(3)).swapaxes(1, 2)
+            return tuple(weight[..., None] * each for each in (-by_rotation, by_time, by_bias))
 
         return error * weight, jacobians
 
 
-def align(data: GyroPairData) -> dict[str, Array]:
-    """Cross-correlation of the norms of the rates, then Kabsch's rotation (Furgale, Rehder, Siegwart, IROS 2013)."""
-    step = min(float(np.median(np.diff(t))) for t in (data.a_t, data.b_t))
-    grid = np.arange(max(data.a_t[0], data.b_t[0]) + MAX_OFFSET_S, min(data.a_t[-1], data.b_t[-1]) - MAX_OFFSET_S, step)
-    a, b = np.linalg.norm(data.a_gyro, axis=1), np.interp(grid, data.b_t, np.linalg.norm(data.b_gyro, axis=1))
-    shifts = step * np.arange(-int(MAX_OFFSET_S / step), int(MAX_OFFSET_S / step) + 1)
-    fit = np.array([np.corrcoef(np.interp(grid + shift, data.a_t, a), b)[0, 1] for shift in shifts])
-    best = int(np.clip(np.argmax(fit), 1, len(fit) - 2))
-    left, top, right = fit[best - 1 : best + 2]
-    offset = float(shifts[best] + 0.5 * step * (left - right) / (left - 2.0 * top + right))
-    a, b = rates_at(data, offset)
-    aRb = so3.align(a - a.mean(axis=0), b - b.mean(axis=0))
-    return {
-        "rotation": aRb,
-        "time_offset": np.array([offset]),
-        "bias_difference": (b - so3.rotate(so3.inverse(aRb), a)).mean(axis=0),
-    }
-
-
-def rates_at(data: GyroPairData, offset: float) -> tuple[Array, Array]:
-    """Rates (n, 3) of both gyros at the moments of b's samples, each in its own frame."""
-    at = data.b_t + offset
-    inside = (at >= data.a_t[0]) & (at <= data.a_t[-1])
-    return np.stack([np.interp(at[inside], data.a_t, each) for each in data.a_gyro.T], axis=1), data.b_gyro[inside]
-
-
-def published(data: GyroPairData, config: Config, problem: Problem) -> Estimate:
-    """The two stages of `align` as a solver; the covariance is the Cramer-Rao bound of each by itself, rates white."""
-    start, found = time.perf_counter(), align(data)
-    step, lag, offset = float(np.median(np.diff(data.b_t))), 20, float(found["time_offset"][0])
-    variance = sum(density**2 for density in data.densities(config)) / step
-    a, b = rates_at(data, offset)
-    rate, slope = b - b.mean(axis=0), np.diff(np.linalg.norm(a, axis=1)[::lag]) / (lag * step)
-    tangent = np.linalg.inv(np.eye(3) / np.pi**2 + ((rate**2).sum() * np.eye(3) - rate.T @ rate) / variance)
-    phi = so3.log(found["rotation"])
-    covariance = np.zeros((7, 7))
-    covariance[:3, :3] = so3.right_jacobian_inverse(phi) @ tangent @ so3.right_jacobian_inverse(phi).T
-    covariance[3, 3] = 1.0 / (1.0 / MAX_OFFSET_S**2 + lag * (slope**2).sum() / variance)
-    covariance[4:, 4:] = variance / len(b) * np.eye(3)
-    return Estimate(
-        solver="published",
-        names=tuple(q.name for q in problem.quantities),
-        values=np.concatenate([phi, [offset], found["bias_difference"]]),
-        covariance=covariance,
-        converged=abs(offset) < MAX_OFFSET_S,
-        message="cross-correlation, then singular values",
-        seconds={"solve": time.perf_counter() - start},
-    )
-
-
 def windows(data: GyroPairData) -> tuple[Array, Array]:
-    """Starts and ends (n,), s by b's stamps, of adjoining windows that gyro a covers for any offset.
-
-    They end between two samples of b, so that neighbours share next to none. Raises InputError when they are too few.
-    """
+    """Starts and ends (n,), s by b's stamps, of windows between samples of b. Raises InputError for too few."""
     steps = [float(np.median(np.diff(t))) for t in (data.a_t, data.b_t)]
     stride = int(np.ceil(max(WINDOW_S, WINDOW_SAMPLES * max(steps)) / steps[1]))
     edges = 0.5 * (data.b_t[1:] + data.b_t[:-1])[::stride]
     inside = (edges[:-1] >= data.a_t[0] + MAX_OFFSET_S) & (edges[1:] <= data.a_t[-1] - MAX_OFFSET_S)
     if inside.sum() < MIN_WINDOWS:
-        raise InputError(
-            f"the gyros have {int(inside.sum())} windows of {stride * steps[1]:.2g} s in common, {MAX_OFFSET_S:g} s "
-            f"from the ends of gyro_a's record; at least {MIN_WINDOWS} are needed: record longer, or check the clocks"
-        )
+        text = f"the gyros have {int(inside.sum())} windows of {stride * steps[1]:.2g} s in common, {MIN_WINDOWS} are"
+        raise InputError(f"{text} needed {MAX_OFFSET_S:g} s from the ends: record longer, or check the clocks")
     return edges[:-1][inside], edges[1:][inside]
+
+
+def rates(data: GyroPairData, offset: float) -> list[Array]:
+    """Starts of windows (n,), s, and mean rates (n, 3), rad/s, of gyros a and b, each in its own frame."""
+    start, stop = windows(data)
+    turns_a = GyroPath(data.a_t, data.a_gyro).increments(start + offset, stop + offset)
+    turns_b = GyroPath(data.b_t, data.b_gyro).increments(start, stop)
+    return [start, *(so3.log(turns.wxyz) / turns.duration[:, None] for turns in (turns_a, turns_b))]
+
+
+def align(data: GyroPairData) -> dict[str, Array]:
+    """Cross-correlation of the norms of the rates, then Kabsch's rotation (Furgale, Rehder, Siegwart, IROS 2013)."""
+    a_ns, b_ns = nanoseconds(data.a_t, 0), nanoseconds(data.b_t, 0)
+    pairing = pair(a_ns, data.a_gyro, b_ns, GyroPath(data.b_t, data.b_gyro).attitude(data.b_t))
+    offset = 0.0 if pairing is None else float(np.clip(pairing.offset_s, -MAX_OFFSET_S, MAX_OFFSET_S))
+    _, a, b = rates(data, offset)
+    aRb = so3.align(a - a.mean(axis=0), b - b.mean(axis=0))
+    difference = (b - so3.rotate(so3.inverse(aRb), a)).mean(axis=0)
+    return {"rotation": aRb, "time_offset": np.array([offset]), "bias_difference": difference}
+
+
+def published(data: GyroPairData, config: Config, problem: Problem) -> Estimate:
+    """The two stages of `align` as a solver; the covariance is the Cramer-Rao bound of each by itself, rates white."""
+    found = align(data)
+    offset, phi, difference = found["time_offset"], so3.log(found["rotation"]), found["bias_difference"]
+    start, a, b = rates(data, float(offset[0]))
+    length, J = float(start[1] - start[0]), so3.right_jacobian_inverse(phi)
+    variance, rate = data.variance(config) / length, b - b.mean(axis=0)
+    tangent = np.linalg.inv(np.eye(3) / np.pi**2 + ((rate**2).sum() * np.eye(3) - rate.T @ rate) / variance)
+    slope = np.diff(np.linalg.norm(a, axis=1)) / length
+    of_time = 1.0 / (1.0 / MAX_OFFSET_S**2 + (slope**2).sum() / variance)
+    covariance = block_diag(J @ tangent @ J.T, of_time, variance / len(b) * np.eye(3))
+    values, names = np.concatenate([phi, offset, difference]), tuple(q.name for q in problem.quantities)
+    return Estimate("published", names, values, covariance, bool(abs(offset[0]) < MAX_OFFSET_S), "two stages")
 
 
 def problem(data: GyroPairData, config: Config) -> Problem:
@@ -208,19 +161,17 @@ def problem(data: GyroPairData, config: Config) -> Problem:
     a, b = GyroPath(data.a_t, data.a_gyro), GyroPath(data.b_t, data.b_gyro, guess["bias_difference"])
     turns = b.increments(start, stop)
     unseen = turns.unseen + a.increments(start + guess["time_offset"], stop + guess["time_offset"]).unseen
-    variance = sum(density**2 for density in data.densities(config)) * turns.duration + unseen
-    model = ConjugateRotation(stop, start, turns, np.sqrt(variance), a, b)
+    model = ConjugateRotation(stop, start, turns, np.sqrt(data.variance(config) * turns.duration + unseen), a, b)
     noises = (Level(stated("gyro_density", config, data.a_density, ("increment",))),)
-    fields = {"advice": advice, "dropped": data.dropped, "noises": noises}
-    return parameter_problem("gyro_pair", PARAMETERS, config, guess, "increment", model, **fields)
+    more = {"advice": advice, "dropped": data.dropped, "noises": noises}
+    return parameter_problem("gyro_pair", PARAMETERS, config, guess, "increment", model, **more)
 
 
 def advice(weights: Mapping[str, float]) -> Motion:
     """The motion that makes a weak direction observable."""
-    strong = [name for name, weight in weights.items() if abs(weight) > 0.3]
-    if any(name.startswith("rotation") for name in strong):
-        why = "the rotation needs motion about two axes"
-        return Motion("turn the body about one axis, then about another", swaying("xy", "body"), why)
+    strong = [name.rstrip("_xyz") for name, weight in weights.items() if abs(weight) > 0.3]
+    if "rotation" in strong:
+        return Motion("turn the body about one axis, then another", swaying("xy", "body"), "a rotation needs two axes")
     if "time_offset" in strong:
         return Motion("turn the body back and forth within a second", why="the time offset needs changing rates")
     return Motion("record longer", why="the bias difference is not determined yet")
@@ -239,36 +190,28 @@ def variations(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
         yield f"the body: {words}", {**scenario, "motion": motion}
 
 
-def rates(data: GyroPairData, values: Mapping[str, float]) -> tuple[Array, Array, Array]:
-    """Starts of windows (n,), s, and mean rates (n, 3), rad/s in b: by gyro b, and predicted from gyro a."""
-    start, stop = windows(data)
-    rotation, difference = (
-        np.array([values.get(f"{name}_{axis}", 0.0) for axis in "xyz"]) for name in ("rotation", "bias_difference")
-    )
-    offset = values.get("time_offset", 0.0)
-    a, b = GyroPath(data.a_t, data.a_gyro), GyroPath(data.b_t, data.b_gyro)
-    by_a, by_b = (
-        so3.log(turns.wxyz) / turns.duration[:, None]
-        for turns in (a.increments(start + offset, stop + offset), b.increments(start, stop))
-    )
-    return start, by_b, so3.rotate(so3.inverse(so3.exp(rotation)), by_a) + difference
+def compared(data: GyroPairData, values: Mapping[str, float]) -> tuple[Array, Array, Array]:
+    """Starts of windows (n,), s, and mean rates (n, 3), rad/s in a: by gyro a, and by gyro b as the formulas say."""
+    start, by_a, by_b = rates(data, values.get("time_offset", 0.0))
+    return start, by_a, apply(FORMULAS, values, {"gyro_b": by_b})["gyro_a"]
 
 
 def validate(data: GyroPairData, _: Config, values: Mapping[str, float]) -> list[Validation]:
-    """Rate of b minus that predicted from a, without and with a calibration."""
-    start, by_b, before = rates(data, {})
-    return [Validation("rate of gyro b against gyro a's", "rad/s", start, by_b - before, by_b - rates(data, values)[2])]
+    """Rate of a minus that by gyro b, without and with a calibration."""
+    start, a, uncalibrated = compared(data, {})
+    late, calibrated = compared(data, values)[1:]
+    return [Validation("rate of gyro a against gyro b's", "rad/s", start, a - uncalibrated, late - calibrated)]
 
 
 def figures(data: GyroPairData, calibration: Any) -> list[Plot]:
     """Both gyros' rates in one frame."""
-    start, by_b, predicted = rates(data, calibration.values)
-    both = Figure("rate in b, deg/s")
+    start, *both = compared(data, calibration.values)
+    out = Figure("rate in a, deg/s")
     for i, axis in enumerate("xyz"):
-        both.points(start, np.rad2deg(by_b[:, i]), f"gyro b {axis}", COLORS[i], 3)
-        both.line(start, np.rad2deg(predicted[:, i]), f"from gyro a {axis}", COLORS[i])
-    left = np.rad2deg(rms(by_b - predicted))
-    return [Plot("Both gyros in one frame", f"Mean rates over windows; difference {left:.3g} deg/s RMS.", both)]
+        out.points(start, np.rad2deg(both[0][:, i]), f"gyro a {axis}", COLORS[i], 3)
+        out.line(start, np.rad2deg(both[1][:, i]), f"from gyro b {axis}", COLORS[i])
+    left = np.rad2deg(rms(both[0] - both[1]))
+    return [Plot("Both gyros in one frame", f"Mean rates over windows; difference {left:.3g} deg/s RMS.", out)]
 
 
 class Gyro(ScenarioPart):
@@ -296,10 +239,8 @@ class GyroPairScenario(ScenarioPart):
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
 
-def simulate(scenario: GyroPairScenario, seed: int, images: bool = False) -> Simulated:
-    """Exact mean rates over each sample interval, constant biases, white noise. Raises InputError for pictures."""
-    if images:
-        raise InputError("gyro_pair has no camera: leave out --images")
+def simulate(scenario: GyroPairScenario, seed: int, _images: bool = False) -> Simulated:
+    """Exact mean rates over each sample interval, constant biases, white noise."""
     rng, aRb, samples, biases = np.random.default_rng(seed), so3.exp(np.deg2rad(scenario.rotation_deg)), [], []
     for gyro, aRg, late in ((scenario.gyro_a, so3.identity(), 0.0), (scenario.gyro_b, aRb, scenario.time_offset_s)):
         t = sample_times(scenario.duration_s, gyro.rate_hz, gyro.phase)
@@ -308,13 +249,11 @@ def simulate(scenario: GyroPairScenario, seed: int, images: bool = False) -> Sim
         rate = so3.log(so3.multiply(so3.inverse(attitude[:-1]), attitude[1:])) * gyro.rate_hz
         biases.append(np.deg2rad(gyro.bias_deg_s) * rng.standard_normal(3))
         samples.append((t, rate + biases[-1] + gyro.density * np.sqrt(gyro.rate_hz) * rng.standard_normal(rate.shape)))
-    vectors = {"rotation": so3.log(aRb), "bias_difference": biases[1] - so3.rotate(so3.inverse(aRb), biases[0])}
-    truth = {f"{name}_{axis}": float(x) for name, v in vectors.items() for axis, x in zip("xyz", v, strict=True)}
-    (a_t, a_gyro), (b_t, b_gyro) = samples
+    truth = by_axis(rotation=so3.log(aRb), bias_difference=biases[1] - so3.rotate(so3.inverse(aRb), biases[0]))
     densities = scenario.gyro_a.density, scenario.gyro_b.density
-    data = GyroPairData(1_795_176_000_000_000_000, a_t, a_gyro, b_t, b_gyro, *densities)
-    config = dump_yaml({"method": "gyro_pair", "priors": scenario.priors})
-    return Simulated(data, truth | {"time_offset": scenario.time_offset_s}, config)
+    data = GyroPairData(1_795_176_000_000_000_000, *samples[0], *samples[1], *densities)
+    truth |= {"time_offset": scenario.time_offset_s}
+    return Simulated(data, truth, recording_config("gyro_pair", scenario, {}))
 
 
 METHOD = Method(

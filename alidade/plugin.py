@@ -1,0 +1,50 @@
+"""What methods of other distributions are written with; docs/howto/write-a-method.md goes through an example.
+
+from alidade.plugin import Method, ParameterSpec, parameter_problem
+"""
+
+from alidade.factors import so3
+from alidade.factors.model import ROT3, Array, Model, Residuals
+from alidade.factors.preintegration import GyroPath, Increments
+from alidade.pipelines.diagnostics.checklist import ChecklistItem, turned
+from alidade.pipelines.diagnostics.cross_validation import Validation, rms
+from alidade.pipelines.diagnostics.fault_models import AXES, DataFault, ExactInput, FaultModel, ScaleFactor
+from alidade.pipelines.diagnostics.use import Use
+from alidade.pipelines.display.drawing import swaying
+from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.display.table import Column, Table
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameter_problem import parameter_problem
+from alidade.pipelines.estimation.parameters import ParameterSpec, scalar
+from alidade.pipelines.estimation.problem import ChainLayout, Estimate, Factor, Parameter, Problem, Step
+from alidade.pipelines.methods import Correction, Guidance, Method, Report, Scenario, Simulator, deferred
+from alidade.pipelines.methods.formula import Formula, apply
+from alidade.pipelines.methods.noise import stated
+from alidade.pipelines.noises import NoiseSpec
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.checks import check_overlap, nanoseconds
+from alidade.pipelines.recording.pairing import pair
+from alidade.pipelines.recording.recording import Recording
+from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.streams import StreamReader, imu_series
+from alidade.pipelines.recording.topics import IMU, MAG, Setting, Topic, wanted
+from alidade.pipelines.settings import Config, MethodSection
+from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from alidade.pipelines.simulation.scenario import ScenarioPart, sways
+from alidade.pipelines.simulation.sensors import by_axis, recording_config
+from alidade.pipelines.simulation.simulated import Simulated
+
+# fmt: off
+__all__ = [
+    "AXES", "COLORS", "IMU", "MAG", "ROT3", "Array", "ChainLayout", "ChecklistItem", "Column", "Config",
+    "Correction", "Covariances", "DataFault", "Estimate", "EulerMotion", "ExactInput", "Factor", "FaultModel",
+    "Figure", "Formula", "Guidance", "GyroPath", "Increments", "InputError", "Level", "Method", "MethodSection",
+    "Model", "Motion", "NoiseSpec", "Numbers", "Parameter", "ParameterSpec", "Plot", "Problem", "Quaternions",
+    "Recording", "Report", "Residuals", "ScaleFactor", "Scenario", "ScenarioPart", "Setting", "Simulated",
+    "Simulator", "Step", "StreamReader", "Swing", "Table", "Topic", "Use", "Validation", "Vectors", "apply",
+    "by_axis", "check_overlap", "deferred", "imu_series", "messages", "nanoseconds", "pair", "parameter_problem",
+    "recording_config", "rms", "sample_times", "scalar", "so3", "stated", "swaying", "sways", "turned", "wanted",
+]
+# fmt: on
