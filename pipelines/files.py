@@ -9,6 +9,7 @@ All raise InputError.
 from __future__ import annotations
 
 import os
+import re
 import stat
 import sys
 from io import StringIO
@@ -24,6 +25,8 @@ MAX_RESULT_BYTES = 1 << 28
 # Values and keys of a YAML file, and the same with its aliases written out: pure Python reads 8,000 a second.
 MAX_YAML_NODES, MAX_EXPANDED_NODES = 50_000, 500_000
 MAX_YAML_DEPTH = 50
+# Words that YAML takes for something else.
+_YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 
 
 def require_regular(path: Path) -> None:
@@ -54,14 +57,27 @@ def read_bytes(path: Path, most: int) -> bytes:
     return data
 
 
-def dump_yaml(content: object, width: int = 80) -> str:
+def dump_yaml(content: object, width: int = 80, is_sorted: bool = True) -> str:
     """YAML text of mappings, lists and scalars; mappings and lists of scalars alone stand on one line of that width."""
     from ruamel.yaml import YAML
 
-    yaml, text = YAML(typ="safe", pure=True), StringIO()
-    yaml.default_flow_style, yaml.width = None, width
+    yaml: Any = YAML(typ="safe", pure=True)
+    text = StringIO()
+    yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = None, width, is_sorted
     yaml.dump(content, text)
     return text.getvalue()
+
+
+def flow_yaml(value: object) -> str:
+    """A scalar, a list or a mapping in one line of YAML."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{flow_yaml(str(key))}: {flow_yaml(one)}' for key, one in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(flow_yaml, value))}]"
+    if not isinstance(value, str):
+        return f"{value:g}" if isinstance(value, float) else str(value).lower()
+    plain = re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_/. ^-]*", value) and value.lower() not in _YAML_WORDS
+    return value if plain else '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:

@@ -13,6 +13,7 @@ import numpy as np
 
 from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
 from alidade.pipelines.recording.pairing import INTERVAL, MAX_MOUNT, Pairing, pair
@@ -59,7 +60,7 @@ class Suggestion:
     def yaml(self) -> str:
         """The `topics:` section to paste."""
         given = {key: source.model_dump() for key, source in self.topics.items()}
-        return "\n".join(["topics:", *(f"  {key}: {_flow(value)}" for key, value in given.items())])
+        return "\n".join(["topics:", *(f"  {key}: {flow_yaml(value)}" for key, value in given.items())])
 
 
 def suggestions(recording: Recording, config: Config, only: Sequence[str] | None = None) -> tuple[Suggestion, ...]:
@@ -392,15 +393,6 @@ def _is_ambiguous(alike: dict[str, float]) -> bool:
 def _is_other_gyro(topic: Topic, there: list[str]) -> bool:
     """Whether a topic of a gyro has but one that is left to serve."""
     return len(there) == 1 and messages.IMU in topic.types and not _is_attitude(topic)
-
-
-def _flow(value: object) -> str:
-    """A name, a list or a mapping in one line of YAML."""
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{key}: {_flow(one)}' for key, one in value.items())}}}"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_flow, value))}]"
-    return "true" if value is True else str(value)
 
 
 def _short(recording: Recording, name: str) -> str:

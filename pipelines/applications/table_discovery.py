@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
@@ -50,7 +51,6 @@ _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
 _UNNAMED = {"accel": ("m/s^2", "g"), "field": ("uT",)}
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
 _QUATERNION = re.compile(r"(q|quat|orientation|rot|attitude)\w*w$|^w$")
-_YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 # Unix time of the years 1985 to 2128, s.
 _UNIX_S = (0.5e9, 5e9)
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
@@ -83,10 +83,10 @@ class Columns:
         lines = ["columns:"]
         for topic, table in self.columns.items():
             given = {k: v for k, v in table.model_dump(exclude_defaults=True).items() if v is not None}
-            lines.append(f"  {topic}: {_flow(given)}")
+            lines.append(f"  {topic}: {flow_yaml(given)}")
         if self.topics:
             lines.append("topics:")
-            lines += [f"  {key}: {_flow(source.model_dump())}" for key, source in self.topics.items()]
+            lines += [f"  {key}: {flow_yaml(source.model_dump())}" for key, source in self.topics.items()]
         return "\n".join(lines)
 
 
@@ -365,18 +365,3 @@ def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
 def _free(topic: str, path: Path, taken: Mapping[str, TableTopic]) -> str:
     """The topic's name, with the table's where another table has made one of that name."""
     return topic if topic not in taken else f"{topic}/{re.sub(r'[^a-z0-9]+', '_', path.stem.lower())}"
-
-
-def _flow(value: object) -> str:
-    """In one line of YAML."""
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{_word(str(key))}: {_flow(one)}' for key, one in value.items())}}}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_flow, value))}]"
-    return f"{value:g}" if isinstance(value, float) else _word(str(value))
-
-
-def _word(text: str) -> str:
-    """Quoted where YAML would take it for something else."""
-    plain = re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_/. ^-]*", text) and text.lower() not in _YAML_WORDS
-    return text if plain else '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

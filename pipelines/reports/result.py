@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import metadata
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +27,7 @@ from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
@@ -319,15 +319,7 @@ class Calibration(SensorValues):
     @property
     def config_text(self) -> str:
         """The config in force, YAML; what is as by default is left out."""
-        from ruamel.yaml import YAML
-
-        yaml: Any = YAML(typ="safe", pure=True)
-        yaml.default_flow_style = None
-        yaml.sort_base_mapping_type_on_output = False
-        yaml.width = 80
-        text = StringIO()
-        yaml.dump(self.config.model_dump(mode="json", exclude_defaults=True), text)
-        return text.getvalue()
+        return dump_yaml(self.config.model_dump(mode="json", exclude_defaults=True), is_sorted=False)
 
     @property
     def formulas(self) -> Sequence[Formula]:

@@ -92,7 +92,7 @@ def test_validate(command: Command, folder: Path, tmp_path: Path) -> None:
     command(folder, "calibrate", "s.mcap", "--out", str(tmp_path), "--quiet")
     calibration = str(tmp_path / "calibration.yaml")
     done = command(folder, "validate", "s.mcap", "--calibration", calibration, "--out", str(tmp_path), "--quiet")
-    assert "rate of gyro b against gyro a's" in done.out
+    assert "rate of gyro a against gyro b's" in done.out
     assert (tmp_path / "validation.html").exists()
 
 

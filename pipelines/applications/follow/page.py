@@ -27,9 +27,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from pydantic_core import to_json
+
 from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, MAX_CONNECTIONS, Attempts, Gate
 from alidade.pipelines.applications.follow.guidance import WAITING, View
-from alidade.pipelines.applications.follow.protocol import to_json
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.result import Calibration
@@ -182,7 +183,7 @@ class LivePage:
         with self._lock:
             for changed in (*new, more):
                 self._state |= changed
-            self._event = (self._event[0] + 1, to_json(self._state))
+            self._event = (self._event[0] + 1, to_json(self._state, inf_nan_mode="null").decode())
 
     def _notes(self) -> list[str]:
         return [sentence for at, sentence in self._noted if time.monotonic() - at < _FRESH]

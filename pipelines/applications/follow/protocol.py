@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import struct
 from typing import Any, NoReturn
 
@@ -32,19 +31,6 @@ def read_message(text: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise RefusedError("no JSON object")
     return content
-
-
-def to_json(content: Any) -> str:
-    """JSON text of dicts, lists and scalars; null in place of NaN and infinities, which JSON has no numbers for."""
-    return json.dumps(_finite(content), allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_id(value: Any) -> int:

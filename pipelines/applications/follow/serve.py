@@ -16,6 +16,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, NamedTuple
 
+from pydantic_core import to_json
+
 from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Gate
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.protocol import (
@@ -25,7 +27,6 @@ from alidade.pipelines.applications.follow.protocol import (
     RefusedError,
     read_id,
     read_message,
-    to_json,
     websockets,
 )
 from alidade.pipelines.errors import InputError
@@ -151,7 +152,7 @@ class LiveServer:
         number = self._advertise(topic, schema, metadata)
         with self._changed:
             before = self._last[number].number if number in self._last else 0
-            self._last[number] = _Last(before + 1, at, to_json(message).encode())
+            self._last[number] = _Last(before + 1, at, to_json(message, inf_nan_mode="null"))
             self._changed.notify_all()
 
     # -- one client: this thread listens, another one sends
