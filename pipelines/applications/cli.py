@@ -217,17 +217,18 @@ def calibrate(
 
     from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.joint import calibrate_together
-    from alidade.pipelines.applications.session import OpenOptions
+    from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.errors import InputError
     from alidade.pipelines.recording.opening import describe_recordings, group_recordings
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
-    options = OpenOptions(method, config, strict, auto_topics, auto_columns, prior)
+    how = {"auto_topics": auto_topics, "auto_columns": auto_columns, "prior": prior}
 
     def read(where: "Where") -> "Session":
-        return replace(options.read(where), engine=engine.value, attitude_rate=attitude_rate.value)
+        session = open_session(where, method, config, strict, **how)
+        return replace(session, engine=engine.value, attitude_rate=attitude_rate.value)
 
     recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
@@ -280,7 +281,7 @@ def compare(
     """
     from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.comparison import compared
-    from alidade.pipelines.applications.session import OpenOptions
+    from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.comparison_report import comparison_report
     from alidade.pipelines.reports.whole import require_room
@@ -288,7 +289,7 @@ def compare(
     require_room(out)
     kept = parse_window(window)
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
-        opened = OpenOptions(method, config, strict, auto_topics, prior=prior).read(session)
+        opened = open_session(session, method, config, strict, auto_topics=auto_topics, prior=prior)
         comparison = compared(opened, kept, halves=out is not None)
         written = None if out is None else comparison.write(out)
     if as_json:
@@ -575,7 +576,7 @@ def demo(
     """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.comparison import Comparison
-    from alidade.pipelines.applications.session import calibrate as run
+    from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.methods import simulate as simulated
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.comparison_report import comparison_report
@@ -588,7 +589,7 @@ def demo(
     with progress.shown(quiet):
         with progress.doing("simulating"):
             simulated("head", "head_mounts", 1, session, False)
-        calibrations = run(session, ["published", "batch", "incremental"])
+        calibrations = open_session(session).calibrations(["published", "batch", "incremental"])
         for calibration in progress.track(calibrations, "writing", len(calibrations)):
             write_results(out / calibration.estimate.solver, calibration)
     terminal.print_report(comparison_report(Comparison(tuple(calibrations))))

@@ -118,7 +118,19 @@ class Session:
         prior: Path | None = None,
         auto_columns: bool = False,
     ) -> Session:
-        """Read and check a recording (arguments and exceptions as `OpenOptions` has them)."""
+        """Read and check a recording.
+
+        Args:
+            recording: opened.
+            method_name: None: the config's, or the only one that the recording can serve.
+            config_file: overrides the recording's own config key by key; a YAML file or a Config.
+            auto_topics: use the topics that `alidade info` proposes where those of the method are absent.
+            prior: an earlier calibration of the device, result.json or calibration.yaml.
+            auto_columns: use the columns of tables that `alidade info` proposes where the config describes none.
+
+        Raises:
+            InputError: recording, config or prior cannot be used.
+        """
         recording, config = configured(recording, config_file)
         if auto_columns:
             recording, config = with_columns(recording, config)
@@ -485,50 +497,24 @@ class Session:
             return None
 
 
-@dataclass(frozen=True)
-class OpenOptions:
-    """How a recording is read.
+def open_session(
+    path: Where, method: str | None = None, config: Path | Config | None = None, strict: bool = False, **more: Any
+) -> Session:
+    """Read a recording: a file, a folder of parts, a pattern, or a list of parts; `more` as `Session.read` has it.
 
-    Attributes:
-        method: its name; None: the config's, or the only one that the recording can serve.
-        config: overrides the recording's own config key by key; a YAML file or a Config.
-        strict: refuse a recording of which anything is lost.
-        auto_topics: use the topics that `alidade info` proposes where those of the method are absent.
-        auto_columns: use the columns of tables that `alidade info` proposes where the config describes none.
-        prior: an earlier calibration of the device, result.json or calibration.yaml.
+    With `strict` one of which anything is lost is refused. Raises InputError.
     """
-
-    method: str | None = None
-    config: Path | Config | None = None
-    strict: bool = False
-    auto_topics: bool = False
-    auto_columns: bool = False
-    prior: Path | None = None
-
-    def read(self, path: Where) -> Session:
-        """Read a recording: a file, a folder of parts, a pattern, or a list of parts.
-
-        Raises:
-            InputError: recording, config or prior cannot be used.
-        """
-        start = time.perf_counter()
-        with progress.doing("reading"):
-            session = Session.read(
-                open_recording(path, self.strict),
-                self.method,
-                self.config,
-                self.auto_topics,
-                self.prior,
-                self.auto_columns,
-            )
-        return replace(session, read_s=time.perf_counter() - start)
+    start = time.perf_counter()
+    with progress.doing("reading"):
+        session = Session.read(open_recording(path, strict), method, config, **more)
+    return replace(session, read_s=time.perf_counter() - start)
 
 
 def calibrate(
     path: Where, solvers: Sequence[str], method: str | None = None, config: Path | Config | None = None
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of a recording (exceptions as of `Session.calibrate`)."""
-    return OpenOptions(method, config).read(path).calibrations(solvers)
+    return open_session(path, method, config).calibrations(solvers)
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:

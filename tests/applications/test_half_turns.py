@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.applications.joint import calibrate_together
-from alidade.pipelines.applications.session import OpenOptions, Session
+from alidade.pipelines.applications.session import Session, open_session
 from alidade.pipelines.applications.validate import validate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.recording import HeadData
@@ -42,7 +42,7 @@ def test_two_recordings_of_one_half_turn_agree(recordings: list[Path], tmp_path:
     assert held.verdict == "holds", held.sentence
     prior = Session.read(open_recording(recordings[1]), None, None, prior=tmp_path / "first" / "calibration.yaml")
     believed = prior.calibrate()
-    joint = calibrate_together([partial(OpenOptions().read, path) for path in recordings])
+    joint = calibrate_together([partial(open_session, path) for path in recordings])
     for calibration in (believed, joint):
         assert calibration.status in ("calibrated", "weak")
         vector = np.array([calibration.parameters[f"helmet_mount_{a}"].value for a in "xyz"])

@@ -244,9 +244,9 @@ def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Recording
 
 
 def _calibration(path: Path, settings: Settings, config: Path | None, prior: Path | None) -> Calibration:
-    from alidade.pipelines.applications.session import OpenOptions
+    from alidade.pipelines.applications.session import open_session
 
-    session = OpenOptions(settings.method, config, prior=prior).read(path)
+    session = open_session(path, settings.method, config, prior=prior)
     return session.calibrate(settings.solver, settings.window, report=False)
 
 

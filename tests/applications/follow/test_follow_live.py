@@ -17,7 +17,7 @@ import pytest
 from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.sources import Source, StandardInput, source_of
-from alidade.pipelines.applications.session import OpenOptions
+from alidade.pipelines.applications.session import open_session
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.growing import GrowingFiles
@@ -141,7 +141,7 @@ def test_ninety_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
     calibration, late, upto = follow_live(kind, whole, config, tmp_path)
     print(f"{kind}: median delay {np.median(late):.3f} s, 95 % below {np.percentile(late, 95):.3f} s")
     assert upto[-1] > 89.0
-    finished = OpenOptions().read(whole).calibrate("incremental")
+    finished = open_session(whole).calibrate("incremental")
     for name, p in finished.parameters.items():
         assert calibration.parameters[name].value == pytest.approx(p.value, abs=1e-3 * p.sigma), name
 
