@@ -7,7 +7,6 @@ Everything wrong in a config is an InputError that names the key and the source 
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -28,6 +27,8 @@ from alidade.pipelines.settings import (
     Sensors,
     Sheet,
     SigmaOrZero,
+    first_error,
+    section_in,
     sensor_sheets,
 )
 
@@ -60,7 +61,7 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     try:
         config = model().model_validate(_merge(base, more))
     except ValidationError as error:
-        said, text = first_error(error)
+        said, text = first_error(error, model())
         where = str(override) if _has(more, said) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: {text}") from error
     known = {topic.key for name in methods.names() for topic in methods.method(name).topics}
@@ -69,14 +70,6 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
         raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
     config = config.of(str(override) if override is not None else f"attachment {ATTACHMENT}")
     return config if gaussian_prior is None else config.with_prior(gaussian_prior)
-
-
-def first_error(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
-    """Where a config is wrong, and a sentence about it."""
-    # An unknown key explains more than what follows from it.
-    first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
-    path = tuple(part for part in first["loc"] if not str(part).startswith("["))
-    return path[:-1] if first["type"] == "missing" else path, _explain(path, first)
 
 
 @cache
@@ -143,34 +136,6 @@ def _has(content: Any, path: tuple[int | str, ...]) -> bool:
     return True
 
 
-def _explain(path: tuple[int | str, ...], error: Any) -> str:
-    key = ".".join(str(part) for part in path)
-    if error["type"] == "extra_forbidden":
-        return f"unknown key {key}{nearest(str(path[-1]), _known_at(path[:-1]))}"
-    given = error["input"]
-    shown = "" if error["type"] == "missing" or isinstance(given, dict) else f", not {reprlib.repr(given)}"
-    text = "is missing" if error["type"] == "missing" else error["msg"].removeprefix("Value error, ")
-    return f"{key}: {text.replace('Input should be', 'must be')}{shown}"
-
-
-def _known_at(path: tuple[int | str, ...]) -> list[str]:
-    """The keys of the section at the path."""
-    section: type[BaseModel] = model()
-    for key in path:
-        field = section.model_fields.get(str(key))
-        found = _section_in(field.annotation) if field else None
-        section = found or section  # the id of a tag leads to no section of its own
-    return list(section.model_fields)
-
-
-def _section_in(annotation: Any) -> type[BaseModel] | None:
-    """The section that a field of this type holds, alone or by key."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    arguments = getattr(annotation, "__args__", ())
-    return next((found for found in map(_section_in, arguments) if found), None)
-
-
 @cache
 def _sections() -> frozenset[str]:
     """Keys that have keys under them, at any depth."""
@@ -178,7 +143,7 @@ def _sections() -> frozenset[str]:
     def inside(section: type[BaseModel]) -> set[str]:
         found = set()
         for key, field in section.model_fields.items():
-            deeper = _section_in(field.annotation)
+            deeper = section_in(field.annotation)
             if deeper is not None or getattr(field.annotation, "__origin__", None) is dict:
                 found |= {key, *(inside(deeper) if deeper else ())}
         return found

@@ -8,6 +8,7 @@ config.section(IndexerConfig)       # what is said for one method
 from __future__ import annotations
 
 import datetime
+import reprlib
 from collections.abc import Collection, Iterable
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
@@ -21,6 +22,7 @@ from pydantic import (
     Field,
     PlainValidator,
     PrivateAttr,
+    ValidationError,
     field_validator,
     model_serializer,
 )
@@ -388,3 +390,33 @@ def first_given(*values: float | None) -> float:
         if value is not None:
             return value
     raise ValueError("no value given, not even a default")
+
+
+def first_error(error: ValidationError, model: type[BaseModel]) -> tuple[tuple[int | str, ...], str]:
+    """Where content that a model rejects is wrong first, and a sentence about it."""
+    # An unknown key explains more than what follows from it.
+    first: Any = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
+    path = tuple(part for part in first["loc"] if not str(part).startswith("["))
+    key, given = ".".join(map(str, path)) or "the whole", first["input"]
+    if first["type"] == "extra_forbidden":
+        return path, f"unknown key {key}{nearest(str(path[-1]), _known_at(model, path[:-1]))}"
+    if first["type"] == "missing":
+        return path[:-1], f"{key}: is missing"
+    text = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    return path, f"{key}: {text}{'' if isinstance(given, dict) else f', not {reprlib.repr(given)}'}"
+
+
+def _known_at(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
+    """The keys of the section at the path."""
+    for key in path:
+        field = model.model_fields.get(str(key))
+        model = (section_in(field.annotation) if field else None) or model  # the id of a tag leads to none of its own
+    return list(model.model_fields)
+
+
+def section_in(annotation: Any) -> type[BaseModel] | None:
+    """The section that a field of this type holds, alone or by key."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    arguments = getattr(annotation, "__args__", ())
+    return next((found for found in map(section_in, arguments) if found), None)

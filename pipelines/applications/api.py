@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.config import first_error, load_config
+from alidade.pipelines.config import load_config
 from alidade.pipelines.config import model as _config_model
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import AttitudeRate, EngineName
@@ -35,6 +35,7 @@ from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.shapes import Array, Rows, as_dates, rows_by_name
 from alidade.pipelines.settings import Config as _BaseConfig
+from alidade.pipelines.settings import first_error
 from alidade.pipelines.simulation.simulated import Simulated
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ class Config(_Model):
         try:
             super().__init__(**{**(keys or {}), **more})
         except ValidationError as error:
-            raise InputError(f"config: {first_error(error)[1]}") from error
+            raise InputError(f"config: {first_error(error, type(self))[1]}") from error
 
     def __repr__(self) -> str:
         """What was set."""
@@ -424,15 +425,13 @@ def _check_seed(seed: object) -> None:
 
 
 def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel | None, images: bool) -> BaseModel:
-    from alidade.pipelines.simulation.scenario import explain
-
     if isinstance(given, BaseModel):
         return given
     if isinstance(given, Mapping):
         try:
             return method.scenario.model_validate(dict(given))
         except ValidationError as error:
-            raise InputError(f"scenario: {explain(error.errors()[0], method.scenario)}") from error
+            raise InputError(f"scenario: {first_error(error, method.scenario)[1]}") from error
     return method.settings(None if given is None else str(given), images)
 
 

@@ -31,6 +31,7 @@ from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
 from alidade.pipelines.reports.result_json import Result, read_result
 from alidade.pipelines.reports.whole import write_whole
+from alidade.pipelines.settings import first_error
 from alidade.pipelines.solvers.joint import RECORDING
 
 FILES = ("certificate.html", "certificate.pdf", "certificate.json")
@@ -170,11 +171,7 @@ def _read_fields(path: Path | None) -> Fields:
     try:
         return Fields.model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the whole"
-        if first["type"] == "extra_forbidden":
-            raise InputError(f"{path}: unknown key {where}{nearest(where, list(Fields.model_fields))}") from error
-        raise InputError(f"{path}: {where}: {first['msg']}") from error
+        raise InputError(f"{path}: {first_error(error, Fields)[1]}") from error
 
 
 def _earlier(path: Path, method: str) -> dict[str, float]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
 
-from alidade.pipelines.errors import InputError, nearest, nearest_three
+from alidade.pipelines.errors import InputError, nearest_three
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.settings import first_error
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -47,7 +46,7 @@ def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | N
     try:
         return model.model_validate({} if content is None else content)
     except ValidationError as error:
-        raise InputError(f"{path}: {explain(error.errors()[0], model)}") from error
+        raise InputError(f"{path}: {first_error(error, model)[1]}") from error
 
 
 def shipped(folder: Path | None = None) -> dict[str, Path]:
@@ -70,20 +69,6 @@ def _find(name_or_path: str | Path, folder: Path | None) -> Path:
     if str(name_or_path) in known:
         return known[str(name_or_path)]
     raise InputError(f"no scenario file {name_or_path}; {nearest_three(str(name_or_path), sorted(known))}")
-
-
-def explain(error: ErrorDetails, model: type[BaseModel]) -> str:
-    """One line about the first thing pydantic rejected of a scenario."""
-    where = ".".join(str(part) for part in error["loc"])
-    if error["type"] != "extra_forbidden":
-        return f"{where or 'the scenario'}: {error['msg']} (got {reprlib.repr(error['input'])})"
-    return f"unknown key {where}{nearest(str(error['loc'][-1]), _keys(model))}"
-
-
-def _keys(model: type[BaseModel]) -> list[str]:
-    """The keys of the model and of the models inside it."""
-    schema = model.model_json_schema()
-    return [key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", {})]
 
 
 def sways(
