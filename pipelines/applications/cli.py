@@ -9,10 +9,9 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from enum import StrEnum
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 from typer.core import TyperGroup
@@ -81,36 +80,13 @@ def _complete_scenario(incomplete: str) -> list[str]:
     return [name for known in methods.scenarios().values() for name in known if name.startswith(incomplete)]
 
 
-class Solver(StrEnum):
-    """The solvers of `calibrate`."""
-
-    batch = "batch"
-    incremental = "incremental"
-    published = "published"
-
-
 _Solver = Annotated[
-    Solver,
+    Literal["batch", "incremental", "published"],
     typer.Option(
         help="batch: the whole recording at once; incremental: step by step, as live; published: the algorithm of the "
         "publication that the method is from."
     ),
 ]
-
-
-class Engine(StrEnum):
-    """Linear solvers of batch."""
-
-    auto = "auto"
-    chain = "chain"
-    gtsam = "gtsam"
-
-
-class Rate(StrEnum):
-    """When attitudes are reported."""
-
-    vision = "vision"
-    gyro = "gyro"
 
 
 _METHODS = (
@@ -187,7 +163,7 @@ def calibrate(
     sessions: RecordingPaths,
     method: _MethodName = None,
     config: ConfigFile = None,
-    solver: _Solver = Solver.batch,
+    solver: _Solver = "batch",
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for the results [default: RECORDING-SOLVER].")] = None,
     strict: _Strict = False,
@@ -197,11 +173,13 @@ def calibrate(
     prior: _Prior = None,
     no_check: _NoCheck = False,
     engine: Annotated[
-        Engine, typer.Option(help="Linear algebra of batch: chain elimination, or the library gtsam.")
-    ] = Engine.auto,
+        Literal["auto", "chain", "gtsam"],
+        typer.Option(help="Linear algebra of batch: chain elimination, or the library gtsam."),
+    ] = "auto",
     attitude_rate: Annotated[
-        Rate, typer.Option(help="Times of the attitudes in attitude.tum: of the pictures, or of all gyro samples.")
-    ] = Rate.vision,
+        Literal["vision", "gyro"],
+        typer.Option(help="Times of the attitudes in attitude.tum: of the pictures, or of all gyro samples."),
+    ] = "vision",
     time_limit: _TimeLimit = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Print all tables of the report: parameters by name, findings, diagnostics.")
@@ -228,14 +206,14 @@ def calibrate(
 
     def read(where: "Where") -> "Session":
         session = open_session(where, method, config, strict, **how)
-        return replace(session, engine=engine.value, attitude_rate=attitude_rate.value)
+        return replace(session, engine=engine, attitude_rate=attitude_rate)
 
-    recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver.value)
+    recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver)
     if len(recordings) > 1:
-        if solver != Solver.batch:
-            raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
-        if engine != Engine.auto:
-            raise InputError(f"--engine {engine.value}: with several recordings each uses the engine that fits it")
+        if solver != "batch":
+            raise InputError(f"--solver {solver}: several recordings are calibrated together by batch alone")
+        if engine != "auto":
+            raise InputError(f"--engine {engine}: with several recordings each uses the engine that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {describe_recordings(recordings)}")
@@ -251,7 +229,7 @@ def calibrate(
             calibration = calibrate_together([partial(read, each) for each in recordings], by_itself)
         else:
             session = read(recordings[0])
-            (calibration,) = session.calibrations([solver.value], parse_window(window), check=not no_check)
+            (calibration,) = session.calibrations([solver], parse_window(window), check=not no_check)
         with progress.doing("writing"):
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
@@ -644,7 +622,7 @@ def fleet(
     recordings: Annotated[list[str], typer.Argument(metavar="FILES", help="Paths or patterns, 'recordings/*.mcap'.")],
     method: _MethodName = None,
     config: ConfigFile = None,
-    solver: _Solver = Solver.batch,
+    solver: _Solver = "batch",
     window: _Window = "1",
     names: Annotated[str | None, typer.Option(help="Unit and date in the file names, '{unit}_{date}*'.")] = None,
     prior: Annotated[
@@ -666,7 +644,7 @@ def fleet(
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import fleet_json
 
-    settings = Settings.of(method, config, solver.value, parse_window(window), prior)
+    settings = Settings.of(method, config, solver, parse_window(window), prior)
     with progress.shown(quiet or as_json):
         found = run_fleet(recordings, settings, out, scheduler, jobs, names)
     if as_json:
