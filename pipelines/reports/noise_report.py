@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -18,6 +18,7 @@ from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
 from alidade.pipelines.display.figure import AXES, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.reports.html import render_html
+from alidade.pipelines.reports.plain_json import plain_json
 from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
 from alidade.pipelines.reports.result import software_versions
 from alidade.pipelines.reports.whole import write_whole
@@ -127,16 +128,15 @@ def noise_json(study: NoiseStudy) -> str:
     """noise.json: everything, SI; null where a number is not determined or has no bound."""
     values, text = section(study)
     content = {
-        "schema": "alidade.noise/1",
         "recording": study.recording,
         "duration_s": study.duration_s,
         "noise": values,
         "section": text,
         "sensors": [_sensor_json(sensor) for sensor in study.sensors],
-        "notes": list(study.notes),
+        "notes": study.notes,
         "software": software_versions(),
     }
-    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+    return plain_json("noise", content) + "\n"
 
 
 def noise_report(study: NoiseStudy) -> Report:
@@ -273,32 +273,19 @@ def _sensor_json(sensor: SensorNoise) -> dict[str, Any]:
             {
                 "axis": axis,
                 "coefficients": [
-                    {
-                        "name": c.name,
-                        "meaning": _COEFFICIENTS[c.name],
-                        "unit": _UNITS[sensor.kind][c.name][0],
-                        "value": c.value,
-                        "sigma": c.sigma,
-                        "low": c.low,
-                        "high": c.high if math.isfinite(c.high) else None,
-                        "needed_s": c.needed_s,
-                    }
+                    {**asdict(c), "meaning": _COEFFICIENTS[c.name], "unit": _UNITS[sensor.kind][c.name][0]}
                     for c in noise.fit.coefficients
                 ],
-                "band_hz": list(noise.fit.band_hz),
+                "band_hz": noise.fit.band_hz,
                 "misfit": noise.fit.misfit,
                 "lines": [
                     {"hz": x.hz, "amplitude": x.amplitude, "resolution_hz": x.resolution_hz} for x in noise.lines
                 ],
                 "allan": [
-                    {"tau_s": tau, "deviation": d, "low": low, "high": high if math.isfinite(high) else None, "dof": n}
-                    for tau, d, low, high, n in zip(
-                        *(
-                            x.tolist()
-                            for x in (noise.curve.tau, noise.curve.deviation, noise.low, noise.high, noise.dof)
-                        ),
-                        strict=True,
-                    )
+                    dict(zip(("tau_s", "deviation", "low", "high", "dof"), row, strict=True))
+                    for row in np.stack(
+                        [noise.curve.tau, noise.curve.deviation, noise.low, noise.high, noise.dof], axis=1
+                    ).tolist()
                 ],
             }
             for axis, noise in sensor.axes.items()
