@@ -20,17 +20,7 @@ import zstandard
 from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Statistics,
-)
+from mcap.records import Attachment, AttachmentIndex, Chunk, ChunkIndex, DataEnd, Footer, Header, McapRecord, Statistics
 from numpy.typing import NDArray
 
 from alidade.pipelines import progress

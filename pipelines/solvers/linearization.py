@@ -28,14 +28,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.model import (
-    Block,
-    Model,
-    Residuals,
-    dimension,
-    stack_models,
-    stacking_key,
-)
+from alidade.factors.model import Block, Model, Residuals, dimension, stack_models, stacking_key
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import Array, ChainSystem, Index
 from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Values, insert_value

@@ -12,15 +12,7 @@ from alidade.factors.earth import earth_rate
 from alidade.factors.model import Array, Block, Model, dimension, retract
 from alidade.factors.tags import TagAttitudeFactor
 from alidade.factors.testing import assert_jacobians
-from alidade.factors.triad import (
-    AccelFactor,
-    GyroStaticFactor,
-    MagFactor,
-    TriadPriorFactor,
-    calibration,
-    parts,
-    triad,
-)
+from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor, TriadPriorFactor, calibration, parts, triad
 from alidade.factors.turns import GyroRotationFactor
 from tests.support.numerics import assert_rows_are_independent
 

@@ -15,12 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import (
-    Attitudes,
-    ChiSquare,
-    History,
-    Residuals,
-)
+from alidade.pipelines.estimation.problem import Attitudes, ChiSquare, History, Residuals
 from alidade.pipelines.recording.messages import definition
 from alidade.pipelines.reports import write
 from alidade.pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration

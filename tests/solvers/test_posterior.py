@@ -21,13 +21,7 @@ from alidade.pipelines.solvers.error_budget import (
 )
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Linearization
-from alidade.pipelines.solvers.posterior import (
-    Reported,
-    chi_square,
-    expected_squares,
-    leverages,
-    sqrt_information,
-)
+from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
 from alidade.pipelines.solvers.weak_directions import WeakDirections
 from tests.support.problems import SCENARIOS, problem

@@ -17,13 +17,7 @@ from typing import TYPE_CHECKING, Any
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.fleet import require_extra
-from alidade.pipelines.applications.fleet.engine import (
-    Killed,
-    answer_interruption,
-    cluster,
-    completed,
-    source_version,
-)
+from alidade.pipelines.applications.fleet.engine import Killed, answer_interruption, cluster, completed, source_version
 from alidade.pipelines.applications.fleet.histories import packed
 from alidade.pipelines.applications.fleet.recordings import Recording, as_date, from_metadata, from_name, local
 from alidade.pipelines.applications.fleet.store import (

@@ -20,13 +20,7 @@ import numpy as np
 
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.fleet import require_extra, statistics
-from alidade.pipelines.applications.fleet.engine import (
-    Killed,
-    answer_interruption,
-    cluster,
-    completed,
-    source_version,
-)
+from alidade.pipelines.applications.fleet.engine import Killed, answer_interruption, cluster, completed, source_version
 from alidade.pipelines.applications.fleet.store import (
     ParameterError,
     RunResult,

@@ -18,11 +18,7 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.methods.place import field_at, place_topics, read_place
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.checks import (
-    SLOWEST_GYRO_S,
-    check_overlap,
-    nanoseconds,
-)
+from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, check_overlap, nanoseconds
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series, white_covariance

@@ -35,13 +35,7 @@ from alidade.pipelines.methods.cube.recording import (
 )
 from alidade.pipelines.methods.cube.static_poses import StaticPoses, static_poses, turn
 from alidade.pipelines.methods.cube.uses import uses
-from alidade.pipelines.methods.formula import (
-    Formula,
-    apply,
-    matrix_text,
-    temperature_text,
-    vector_text,
-)
+from alidade.pipelines.methods.formula import Formula, apply, matrix_text, temperature_text, vector_text
 from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.methods.temperature import FIRST
 from alidade.pipelines.methods.triads import (

@@ -12,13 +12,7 @@ from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.cube.recording import (
-    CubeConfig,
-    CubeData,
-    computed_once,
-    noise_densities,
-    nominal,
-)
+from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, computed_once, noise_densities, nominal
 from alidade.pipelines.methods.static_intervals import find_static_intervals
 from alidade.pipelines.recording.checks import count
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
 from alidade.pipelines.gaussian_prior import GaussianPrior
-from alidade.pipelines.methods.cube.recording import (
-    TAG_DETECTIONS,
-    CubeConfig,
-    CubeData,
-    RefinedCamera,
-    Sightings,
-)
+from alidade.pipelines.methods.cube.recording import TAG_DETECTIONS, CubeConfig, CubeData, RefinedCamera, Sightings
 from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.recording.checks import clean, count
 from alidade.pipelines.recording.recording import Recording

@@ -15,10 +15,7 @@ from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.noise import typical
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.checks import (
-    check_overlap,
-    nanoseconds,
-)
+from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series

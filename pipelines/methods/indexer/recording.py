@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.checks import (
-    check_overlap,
-    nanoseconds,
-    unit_quaternions,
-)
+from alidade.pipelines.recording.checks import check_overlap, nanoseconds, unit_quaternions
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series

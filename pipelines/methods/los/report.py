@@ -28,14 +28,7 @@ from alidade.pipelines.methods.los.initial_values import (
     los_error,
     select_pictures,
 )
-from alidade.pipelines.methods.los.parameters import (
-    ANGLES,
-    DELAY,
-    ONCE_PER_TURN,
-    SCALE,
-    SENSITIVITY,
-    TIME_OFFSET,
-)
+from alidade.pipelines.methods.los.parameters import ANGLES, DELAY, ONCE_PER_TURN, SCALE, SENSITIVITY, TIME_OFFSET
 from alidade.pipelines.methods.los.recording import JOINTS, LosData
 from alidade.pipelines.methods.los.uses import uses
 from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE

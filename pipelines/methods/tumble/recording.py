@@ -12,12 +12,7 @@ from alidade.pipelines.estimation.parameters import accel_square, temperature_sl
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import place_topics, read_place
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.checks import (
-    check_overlap,
-    clean,
-    nanoseconds,
-    too_fast,
-)
+from alidade.pipelines.recording.checks import check_overlap, clean, nanoseconds, too_fast
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, is_there, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
