@@ -19,7 +19,7 @@ from alidade.factors.gyro import PLATFORM, Derivatives, by_platform_errors, carr
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
 
-# Numbers of the pictures' errors: time offset, clock skew, angle scale, filter.
+# Numbers of the pictures' errors, columns of their block in this order: time offset, clock skew, angle scale, filter.
 PICTURE = 4
 # rad, beyond which a scale of angles fades out.
 FADE = np.deg2rad(150.0)
@@ -163,7 +163,7 @@ class VisionAttitudeFactor(Model):
             nothing = np.zeros((len(at), 3))
             return nothing, nothing, nothing
         acceleration, jerk = self.helmet.acceleration(at)
-        filter_ = picture[:, 3:]
+        filter_ = picture[:, 3:4]
         return filter_ * acceleration, acceleration, filter_ * jerk
 
     def _times(self, picture: Array) -> tuple[Array, Array]:

@@ -52,11 +52,9 @@ from alidade.pipelines.recording.sources import TopicSource, along, inverted, jo
 from alidade.pipelines.recording.stamps import check_clock, jitter_ns, stamp_notes
 from alidade.pipelines.recording.table_topics import TableTopic, described
 
-# Topics whose first stamp may start a session. Positions and intrinsics may be stamped long before it.
-SENSOR_STAMPED_TYPES = {
-    *(messages.IMU, messages.MAGNETIC_FIELD, messages.JOINT_STATE, messages.VECTOR, messages.QUATERNION, messages.POSE),
-    *(messages.COMPRESSED_IMAGE, messages.IMAGE, messages.TAG_DETECTIONS),
-    *(messages.PLAIN_POSE, messages.TRANSFORM, messages.ODOMETRY, messages.TWIST, messages.ACCEL),
+# Topics whose first stamp may start a session. Positions, intrinsics and static frames may be stamped long before it.
+SENSOR_STAMPED_TYPES = {*messages.SENSORS} - {
+    *(messages.NAV_SAT_FIX, messages.CAMERA_INFO, messages.TF, messages.TEMPERATURE)
 }
 # Topics, and pairs of frames, that an error message names.
 MAX_NAMED = 30
@@ -376,7 +374,7 @@ class Recording:
 
     def _part(self, topic: str, which: str) -> series.VectorSeries:
         """The rates or accelerations on a topic that holds either."""
-        info = self._require(topic, messages.IMU, messages.VECTOR, messages.TWIST, messages.ACCEL)
+        info = self._require(topic, *messages.RATES, messages.ACCEL)
         if info.type != messages.IMU:
             return self._series(series.VectorSeries, topic)
         imu = self._series(series.ImuSeries, topic)

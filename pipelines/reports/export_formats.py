@@ -24,7 +24,7 @@ def exported(saved: SavedCalibration, form: str) -> str:
         InputError: there is no such format for the calibration.
     """
     has_triad = any(f"{name}_k11" in saved.parameters for name in TRIADS)
-    formats = {**(triad_export.FORMATS if has_triad else {}), **(_TRANSFORMS if saved.transforms else {})}
+    formats = {**(triad_export.FORMATS if has_triad else {}), **(MOUNT_FORMATS if saved.transforms else {})}
     if not formats:
         raise InputError(f"this calibration of {saved.method} holds nothing that another program could be given")
     if form not in formats:
@@ -75,7 +75,7 @@ def _row(transform: SavedTransform) -> str:
     return " ".join(f"{x:.4g}" for x in transform.covariance)
 
 
-_TRANSFORMS: Mapping[str, Callable[[SavedCalibration], str]] = {"tf": _tf, "urdf": _urdf}
+MOUNT_FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {"tf": _tf, "urdf": _urdf}
 
 
 def ros_parameters(saved: SavedCalibration, names: Collection[str]) -> str:

@@ -61,6 +61,7 @@ VISION_FILTER = scalar(
     "Low-pass of vision: half the second moment of its impulse response, less the gyro's.",
     "camera.filter",
 )
+# Behind the time offset, in the order of the factor's columns (factors.attitude.PICTURE).
 PICTURES = (CLOCK_SKEW, VISION_SCALE, VISION_FILTER)
 NUISANCE = (
     *(*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE),

@@ -8,14 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
+from typer.testing import CliRunner
 
+import alidade
 from alidade.factors import so3
+from alidade.pipelines.applications.cli import app
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.printing import print_cube, tag_size
 from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.reports.calibration import SavedCalibration
-from alidade.pipelines.reports.export_formats import exported
+from alidade.pipelines.reports.export_formats import MOUNT_FORMATS, exported
+from alidade.pipelines.reports.triad_export import FORMATS
 
 RNG = np.random.default_rng(1)
 BIAS = {"accel": 0.3, "gyro": 0.02, "mag": 2e-5}
@@ -257,6 +261,13 @@ def test_wrong_format_and_method() -> None:
         exported(saved, "yaml")
     with pytest.raises(InputError, match="this calibration of head holds nothing"):
         exported(_calibration({}, {}, "head"), "px4")
+
+
+def test_command_and_python_name_every_format() -> None:
+    shown = CliRunner().invoke(app, ["export", "-h"], env={"COLUMNS": "200"}).output
+    for form in (*FORMATS, *MOUNT_FORMATS):
+        assert form in shown
+        assert form in str(alidade.export.__doc__)
 
 
 def test_without_magnetometer_nothing_is_said_about_one() -> None:
