@@ -42,7 +42,6 @@ from alidade.pipelines.estimation.problem import (
     Problem,
     Quantity,
     SqrtInformation,
-    Step,
 )
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
@@ -107,7 +106,7 @@ class Alone:
         )
         problem = replace(
             calibration.problem,
-            steps=_no_steps,
+            steps=lambda _: iter(()),
             steps_after=None,
             continuation=None,
             attitudes=None,
@@ -147,10 +146,6 @@ class Alone:
         """Its data."""
         with self.data.open("rb") as stream:
             return pickle.load(stream)  # written above, into a folder of our own
-
-
-def _no_steps(_: int) -> Iterator[Step]:
-    return iter(())
 
 
 def calibrate_together(

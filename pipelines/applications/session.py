@@ -620,11 +620,6 @@ def _check_sheets(method: Method, config: Config) -> None:
     """Raise InputError when something is stated that the method has no use for: it would be ignored in silence."""
     if "vision" in config.model_fields_set and "vision_attitude" not in {topic.key for topic in method.topics}:
         raise InputError(f"vision: method {method.name} has no use for it; it reads no attitudes by vision")
-    _check_figures(method, config)
-
-
-def _check_figures(method: Method, config: Config) -> None:
-    """Raise InputError when a figure is stated that the method has no use for: it would be ignored in silence."""
     for name in sorted(config.sensors.model_fields_set):
         sheet, figures = getattr(config.sensors, name), method.data_sheets.get(name, [])
         useless = [each for each in sorted(sheet.model_fields_set - {*figures}) if getattr(sheet, each) != 0.0]
