@@ -200,7 +200,7 @@ def test_unknown_key_names_the_nearest(tmp_path: Path) -> None:
     [
         ("duration_s: -1\n", "duration_s"),
         ("duration_s: [1\n", "YAML"),
-        ("- 1\n- 2\n", "the scenario"),
+        ("- 1\n- 2\n", "the whole"),
         ("vision_outages_s: [[20, 10]]\n", "start before end"),
     ],
 )
