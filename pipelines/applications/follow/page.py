@@ -32,7 +32,7 @@ from pydantic_core import to_json
 from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, MAX_CONNECTIONS, Attempts, Gate
 from alidade.pipelines.applications.follow.guidance import WAITING, View
 from alidade.pipelines.display.units import human_unit, to_digits_of
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import InputError, printable
 from alidade.pipelines.reports.result import Calibration
 
 if TYPE_CHECKING:
@@ -50,6 +50,8 @@ _RETRY = 1000
 _POINTS = 60
 # Sentences kept, and for how long, s.
 _NOTES, _FRESH = 3, 30.0
+# Letters of a sentence.
+_MAX_NOTE = 2000
 # Machines beyond every network (RFC 5737, RFC 3849): what would be sent there goes out by the address that others see.
 # Nothing is sent.
 _ELSEWHERE = {socket.AF_INET: ("192.0.2.1", 9), socket.AF_INET6: ("2001:db8::1", 9)}
@@ -95,7 +97,7 @@ class LivePage:
         self._token, self._key = _token(), secrets.token_urlsafe(32)
         self._gate, self._attempts = Gate(), Attempts()
         self._histories: dict[str, list[tuple[float, float]]] = {}
-        self._state: dict[str, Any] = {"name": name, "notes": [], "over": None}
+        self._state: dict[str, Any] = {"name": printable(name), "notes": [], "over": None}
         self._noted: list[tuple[float, str]] = []  # when, and what
         self._lock = threading.Lock()  # sources speak from threads of their own
         self._event = (0, "")  # number and text of the last one
@@ -166,7 +168,7 @@ class LivePage:
 
     def say(self, sentence: str) -> None:
         """A sentence that stays for a while."""
-        self._noted = [*self._noted, (time.monotonic(), sentence)][-_NOTES:]
+        self._noted = [*self._noted, (time.monotonic(), printable(sentence, _MAX_NOTE))][-_NOTES:]
         self._tell(notes=self._notes())
 
     def end(self, calibration: Calibration) -> None:
