@@ -454,7 +454,7 @@ def plan(
     Exit code 3 if the motion falls short of the requirements.
     """
     from alidade.pipelines import progress
-    from alidade.pipelines.applications.planning import make_plan, requirements, write_scenario
+    from alidade.pipelines.applications.planning import make_plan, requirements
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import plan_json
@@ -464,7 +464,7 @@ def plan(
     with progress.shown(quiet or as_json):
         planned = make_plan(method, scenario, config, requirements(require or []))
     if out is not None:
-        write_scenario(out, planned)
+        write_file(out, planned.scenario_text)
     if page is not None:
         write_file(page, render_html(plan_report(planned)))
     if as_json:

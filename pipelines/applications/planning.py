@@ -124,7 +124,7 @@ class Plan:
     def scenario_text(self) -> str:
         """The best motion as a scenario file, what is as by default left out."""
         model = methods.method(self.method).scenario
-        return scenario_yaml(model.model_validate(self.best.scenario).model_dump(exclude_defaults=True))
+        return dump_yaml(model.model_validate(self.best.scenario).model_dump(exclude_defaults=True))
 
 
 def make_plan(
@@ -237,19 +237,6 @@ def requirements(given: Sequence[str]) -> dict[str, float]:
             raise InputError(f"--require {word}: NAME=SIGMA is needed, sigma a number above zero in SI units")
         found[name] = sigma
     return found
-
-
-def write_scenario(path: Path, plan: Plan) -> None:
-    """Write the best motion as a scenario file. Raises InputError when it cannot be written."""
-    try:
-        path.write_text(plan.scenario_text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
-
-
-def scenario_yaml(scenario: Scenario) -> str:
-    """The text of a scenario file."""
-    return dump_yaml(scenario)
 
 
 def _candidates(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alidade.pipelines.applications.planning import Prediction, make_plan, predict, requirements, write_scenario
+from alidade.pipelines.applications.planning import Prediction, make_plan, predict, requirements
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
@@ -101,7 +101,7 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
     assert 'title="Boresight in elevation' in page
     assert plan.best.sigmas["delta_px"] < 0.1 * plan.now.sigmas["delta_px"]
     better = tmp_path / "better.yaml"
-    write_scenario(better, plan)
+    better.write_text(plan.scenario_text)
     again = predict("los", load_scenario(LosScenario, better).model_dump(), None, {})
     assert again.sigmas == pytest.approx(plan.best.sigmas)
 
@@ -136,7 +136,7 @@ def test_the_next_best_poses_of_a_cube_are_named_and_mend_the_plan(tmp_path: Pat
     (step,) = plan.steps
     assert re.match(r"(one|6) more poses?: [+-][xyz] \(tag (1[6-9]|2[01])\) up, [+-][xyz] to the north", step.change)
     assert step.gain > 5.0
-    write_scenario(tmp_path / "better.yaml", plan)
+    (tmp_path / "better.yaml").write_text(plan.scenario_text)
     better = load_scenario(CubeScenario, tmp_path / "better.yaml")
     assert [str(each) for each in better.attitudes] == step.change.split(": ")[1].split("; then ")
     again = predict("cube", better.model_dump(), None, {})
