@@ -6,7 +6,7 @@ from alidade.plugin import Method, ParameterSpec, parameter_problem
 from alidade.factors import so3
 from alidade.factors.model import ROT3, Array, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
-from alidade.pipelines.diagnostics.checklist import ChecklistItem, turned
+from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
 from alidade.pipelines.diagnostics.cross_validation import Validation, rms
 from alidade.pipelines.diagnostics.fault_models import AXES, DataFault, ExactInput, FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.use import Use
@@ -34,17 +34,18 @@ from alidade.pipelines.settings import Config, MethodSection
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from alidade.pipelines.simulation.scenario import ScenarioPart, sways
 from alidade.pipelines.simulation.sensors import by_axis, recording_config
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 
 # fmt: off
 __all__ = [
-    "AXES", "COLORS", "IMU", "MAG", "ROT3", "Array", "ChainLayout", "ChecklistItem", "Column", "Config",
-    "Correction", "Covariances", "DataFault", "Estimate", "EulerMotion", "ExactInput", "Factor", "FaultModel",
-    "Figure", "Formula", "Guidance", "GyroPath", "Increments", "InputError", "Level", "Method", "MethodSection",
-    "Model", "Motion", "NoiseSpec", "Numbers", "Parameter", "ParameterSpec", "Plot", "Problem", "Quaternions",
-    "Recording", "Report", "Residuals", "ScaleFactor", "Scenario", "ScenarioPart", "Setting", "Simulated",
-    "Simulator", "Step", "StreamReader", "Swing", "Table", "Topic", "Use", "Validation", "Vectors", "apply",
-    "by_axis", "check_overlap", "deferred", "imu_series", "messages", "nanoseconds", "pair", "parameter_problem",
-    "recording_config", "rms", "sample_times", "scalar", "so3", "stated", "swaying", "sways", "turned", "wanted",
+    "AXES", "COLORS", "EPOCH_NS", "IMU", "MAG", "ROT3", "Array", "ChainLayout", "ChecklistItem", "Column",
+    "Config", "Correction", "Covariances", "DataFault", "Estimate", "EulerMotion", "ExactInput", "Factor",
+    "FaultModel", "Figure", "Formula", "Guidance", "GyroPath", "Increments", "InputError", "Level", "Method",
+    "MethodSection", "Model", "Motion", "NoiseSpec", "Numbers", "Parameter", "ParameterSpec", "Plot", "Problem",
+    "Quaternions", "Recording", "Report", "Residuals", "ScaleFactor", "Scenario", "ScenarioPart", "Setting",
+    "Simulated", "Simulator", "Step", "StreamReader", "Swing", "Table", "Topic", "Use", "Validation", "Vectors",
+    "apply", "by_axis", "check_overlap", "deferred", "imu_series", "messages", "nanoseconds", "pair",
+    "parameter_problem", "recording_config", "rms", "sample_times", "scalar", "so3", "stated", "swayed",
+    "swaying", "sways", "turned", "wanted",
 ]
 # fmt: on

@@ -6,6 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+# 2026-11-20 12:00 UTC: simulated recordings start here; and the year of that day for the field model.
+EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulated:

@@ -16,11 +16,11 @@ from scipy.linalg import block_diag
 
 # isort: off
 from alidade.plugin import (
-    AXES, COLORS, ROT3, Array, ChecklistItem, Config, Estimate, EulerMotion, FaultModel, Figure, Formula, Guidance,
-    GyroPath, Increments, InputError, Level, Method, Model, Motion, NoiseSpec, Numbers, ParameterSpec, Plot,
-    Problem, Recording, Report, Residuals, Scenario, ScenarioPart, Simulated, Simulator, StreamReader, Swing,
-    Topic, Validation, Vectors, apply, by_axis, check_overlap, imu_series, messages, nanoseconds, pair,
-    parameter_problem, recording_config, rms, sample_times, scalar, so3, stated, swaying, sways, turned,
+    AXES, COLORS, EPOCH_NS, ROT3, Array, ChecklistItem, Config, Estimate, EulerMotion, FaultModel, Figure, Formula,
+    Guidance, GyroPath, Increments, InputError, Level, Method, Model, Motion, NoiseSpec, Numbers, ParameterSpec, Plot,
+    Problem, Recording, Report, Residuals, Scenario, ScenarioPart, Simulated, Simulator, StreamReader, Swing, Topic,
+    Validation, Vectors, apply, by_axis, check_overlap, imu_series, messages, nanoseconds, pair, parameter_problem,
+    recording_config, rms, sample_times, scalar, so3, stated, swaying, swayed, sways, turned,
 )  # fmt: skip
 
 MAX_OFFSET_S = 0.5  # the time offset is searched for within this
@@ -178,10 +178,8 @@ def advice(weights: Mapping[str, float]) -> Motion:
 
 
 def checklist(data: GyroPairData, _: Config) -> list[ChecklistItem]:
-    """Turns about the axes of a, two of which are enough."""
-    angles = np.rad2deg(turned(data.a_t, data.a_gyro))
-    have = ", ".join(f"{axis} {angle:.0f} deg" for axis, angle in zip("xyz", angles, strict=True))
-    return [ChecklistItem("turns", have, "" if (angles >= 20).sum() >= 2 else "turn the body by 20 deg about two axes")]
+    """Turns about the axes of a."""
+    return swayed("body", turned(data.a_t, data.a_gyro), np.deg2rad(20.0), "turn the body about its", "body")
 
 
 def variations(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
@@ -249,9 +247,8 @@ def simulate(scenario: GyroPairScenario, seed: int, _images: bool = False) -> Si
         rate = so3.log(so3.multiply(so3.inverse(attitude[:-1]), attitude[1:])) * gyro.rate_hz
         biases.append(np.deg2rad(gyro.bias_deg_s) * rng.standard_normal(3))
         samples.append((t, rate + biases[-1] + gyro.density * np.sqrt(gyro.rate_hz) * rng.standard_normal(rate.shape)))
+    data = GyroPairData(EPOCH_NS, *samples[0], *samples[1], scenario.gyro_a.density, scenario.gyro_b.density)
     truth = by_axis(rotation=so3.log(aRb), bias_difference=biases[1] - so3.rotate(so3.inverse(aRb), biases[0]))
-    densities = scenario.gyro_a.density, scenario.gyro_b.density
-    data = GyroPairData(1_795_176_000_000_000_000, *samples[0], *samples[1], *densities)
     truth |= {"time_offset": scenario.time_offset_s}
     return Simulated(data, truth, recording_config("gyro_pair", scenario, {}))
 
@@ -268,10 +265,7 @@ METHOD = Method(
     noise=(B_DENSITY,),
     problem=problem,
     published=published,
-    faults=FaultModel(
-        streams={"a_t": ("a_gyro",), "b_t": ("b_gyro",)},
-        signs={"a_gyro": ("gyro a", AXES), "b_gyro": ("gyro b", AXES)},
-    ),
+    faults=FaultModel({f"{g}_t": (f"{g}_gyro",) for g in "ab"}, {f"{g}_gyro": (f"gyro {g}", AXES) for g in "ab"}),
     simulator=Simulator(scenario=GyroPairScenario, simulate=simulate),
     guidance=Guidance(checklist=checklist, variations=variations),
     report=Report(formulas=lambda *_: FORMULAS, figures=figures, validate=validate),

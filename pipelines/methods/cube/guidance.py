@@ -20,10 +20,11 @@ from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.cube.faces import SIDES, Resting, Side
 from alidade.pipelines.methods.cube.parameters import FOCAL, is_stated
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData
-from alidade.pipelines.methods.cube.scenario import YEAR, CubeScenario
+from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.cube.simulation import attitudes
 from alidade.pipelines.methods.cube.static_poses import static_poses
 from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.simulated import YEAR
 
 # Poses that determine the twelve numbers of a triad, and those of published practice: each of six faces thrice.
 _FEWEST_POSES, _POSES_A_FACE = 4, 3

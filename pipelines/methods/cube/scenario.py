@@ -11,8 +11,6 @@ from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
 from alidade.pipelines.simulation.sensors import Warming, recording_config
 
-# 2026-11-20 12:00 UTC, and the year of that day for the field model.
-EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
 # BRC of a camera that looks along x of the reference, z up.
 FORWARD = (-0.5, 0.5, -0.5, 0.5)
 

@@ -34,9 +34,7 @@ from alidade.pipelines.methods.cube.parameters import (
 )
 from alidade.pipelines.methods.cube.recording import CubeData, Sightings
 from alidade.pipelines.methods.cube.scenario import (
-    EPOCH_NS,
     FORWARD,
-    YEAR,
     CubeCamera,
     CubeScenario,
     Magnetometer,
@@ -49,7 +47,7 @@ from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from alidade.pipelines.simulation.sensors import by_axis, drift, measured, true_values
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.simulated import EPOCH_NS, YEAR, Simulated
 from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]

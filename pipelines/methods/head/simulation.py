@@ -36,13 +36,11 @@ from alidade.pipelines.simulation.sensors import (
     recording_config,
     true_values,
 )
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 
-# 2026-11-20 12:00 UTC: simulated sessions start here.
-EPOCH_NS = 1_795_176_000_000_000_000
 Fraction = Annotated[float, Field(ge=0.0, lt=1.0)]
 Vector = tuple[float, float, float]
 

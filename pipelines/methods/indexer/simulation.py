@@ -32,12 +32,10 @@ from alidade.pipelines.simulation.sensors import (
     recording_config,
     true_values,
 )
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 
 Array = NDArray[np.float64]
 
-# 2026-11-20 12:00 UTC: simulated sessions start here.
-EPOCH_NS = 1_795_176_000_000_000_000
 ARCSEC = np.deg2rad(1.0 / 3600.0)
 
 Vector = tuple[float, float, float]

@@ -40,12 +40,10 @@ from alidade.pipelines.simulation.sensors import (
     recording_config,
     true_values,
 )
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 
 Array = NDArray[np.float64]
 
-# 2026-11-20 12:00 UTC: simulated sessions start here.
-EPOCH_NS = 1_795_176_000_000_000_000
 
 # Gyro samples that are simulated at once.
 _BLOCK = 100_000

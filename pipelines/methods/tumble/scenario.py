@@ -9,9 +9,6 @@ from pydantic import Field
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
 from alidade.pipelines.simulation.sensors import Warming, recording_config
 
-# 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
-EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
-
 
 class TumbledMagnetometer(ScenarioPart):
     """The magnetometer, with the iron about it."""

@@ -15,8 +15,6 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.methods.tumble.scenario import (
-    EPOCH_NS,
-    YEAR,
     TumbledAccelerometer,
     TumbledGyro,
     TumbledMagnetometer,
@@ -25,7 +23,7 @@ from alidade.pipelines.methods.tumble.scenario import (
 )
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.sensors import by_axis, drift, measured
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.simulated import EPOCH_NS, YEAR, Simulated
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.first_guess import first_guess
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.methods.tumble.ring import ring
-from alidade.pipelines.methods.tumble.scenario import EPOCH_NS, TumbleScenario
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 
