@@ -299,7 +299,7 @@ def test_what_cannot_be_corrected_is_one_line_and_leaves_nothing(tmp_path: Path)
 def test_a_method_that_corrects_nothing_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_session(tmp_path / "s.mcap", sensors())
     tumble = methods.method("tumble")
-    without = dataclasses.replace(tumble, report=dataclasses.replace(tumble.report, corrections=()))
+    without = dataclasses.replace(tumble, report=methods.Report())
     monkeypatch.setattr(methods, "method", lambda _: without)
     with pytest.raises(InputError, match="method tumble corrects no sensor's readings"):
         door.apply(tmp_path / "s.mcap", saved("tumble", triad("mag")), tmp_path / "c.mcap")
