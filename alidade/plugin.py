@@ -8,10 +8,10 @@ from alidade.factors.model import ROT3, Array, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
 from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
 from alidade.pipelines.diagnostics.cross_validation import Validation, rms
-from alidade.pipelines.diagnostics.fault_models import AXES, DataFault, ExactInput, FaultModel, ScaleFactor
+from alidade.pipelines.diagnostics.fault_models import DataFault, ExactInput, FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.use import Use
 from alidade.pipelines.display.drawing import swaying
-from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.display.figure import AXES, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.advice import Motion

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from alidade.pipelines.display.drawing import swaying
+from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import Array
 
 # A turn within this time, s, counts as motion about an axis.
 _STRETCH = 5.0
-_AXES = "xyz"
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def swayed(name: str, turned: Array, enough: float, what: str, who: str) -> list
     `what` to do comes before the axis; `who` is to be turned, in a word.
     """
     found = []
-    for axis, angle in zip(_AXES, turned, strict=True):
+    for axis, angle in zip(AXES, turned, strict=True):
         wanted = f"{what} {axis} by {np.rad2deg(enough):.0f} deg and more"
         short = bool(angle < enough)
         found.append(

@@ -11,8 +11,6 @@ import numpy as np
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.settings import Config
 
-AXES = ("x", "y", "z")
-
 
 @dataclass(frozen=True)
 class ScaleFactor:

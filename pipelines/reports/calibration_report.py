@@ -261,7 +261,7 @@ def _use_card(found: UseBands) -> Card:
     )
     captions = ("Before calibration", "After calibration: 95 % band" if use.signed else "After calibration: 95 % bound")
     curves = Curves(tuple(zip(captions, (plain, applied), strict=True)), tuple(legend))
-    condition = Text(f"{use.condition[:1].upper()}{use.condition[1:]}.")
+    condition = Text(f"{sentences.capital(use.condition)}.")
     return Card(
         (
             Text(" ".join(parts), soft=False),
@@ -657,7 +657,7 @@ def _recording(c: Calibration) -> tuple[Block, ...]:
         )
         for t in c.facts.topics
     )
-    notes = tuple(Text(f"{note[:1].upper()}{note[1:]}.") for note in c.facts.notes)
+    notes = tuple(Text(f"{sentences.capital(note)}.") for note in c.facts.notes)
     lost = tuple(f"{reason}: {count}" for reason, count in c.dropped.items())
     left_out = (Card((Bullets(lost),), "Left out"),) if lost else ()
     return (Table("", "", columns, rows, style="", most_rows=None), *notes, *left_out)

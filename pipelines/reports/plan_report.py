@@ -10,6 +10,7 @@ from alidade.pipelines.display.units import human_unit, rounded
 from alidade.pipelines.reports.budget import limits
 from alidade.pipelines.reports.calibration_report import direction_blocks
 from alidade.pipelines.reports.report import Code, Plots, Report, Section, Summary, Text
+from alidade.pipelines.reports.sentences import capital
 
 # Bars of the plot end at so many times the requirement.
 _MAX_RATIO = 3.0
@@ -66,9 +67,7 @@ def _summary(plan: Plan) -> Summary:
         text = f"This motion, {duration:.0f} s of it, determines everything as accurately as required."
         return Summary(question, "yes", "good", text, (), ("Record it.",))
     short = ", ".join(f"{name} by a factor of {rounded(ratio)}" for name, ratio in plan.now.missing.items())
-    steps = [
-        f"{step.change[:1].upper()}{step.change[1:]} ({step.gain:.1f} nats of what is missing)." for step in plan.steps
-    ]
+    steps = [f"{capital(step.change)} ({step.gain:.1f} nats of what is missing)." for step in plan.steps]
     if not steps:
         steps = ["None of the changes tried determines what is missing; a tighter prior would."]
     elif plan.best.missing:

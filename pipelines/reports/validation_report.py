@@ -16,6 +16,7 @@ from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
+from alidade.pipelines.reports.sentences import capital
 from alidade.pipelines.reports.whole import write_page
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def _plot(validation: Validation) -> Plot:
     for name, errors, color in (("before", validation.before, BEFORE), ("after", validation.after, COLORS[0])):
         out.points(validation.time, factor * np.linalg.norm(errors, axis=1), name, color, 3)
     caption = "Length of the error over time, before and after compensation."
-    return Plot(f"{validation.name[:1].upper()}{validation.name[1:]}", caption, out)
+    return Plot(capital(validation.name), caption, out)
 
 
 def _unit(validation: Validation) -> tuple[str, float]:

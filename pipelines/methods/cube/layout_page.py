@@ -14,6 +14,7 @@ from alidade.pipelines.display.units import to_digits_of
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.reports.plain_json import plain_json
 from alidade.pipelines.reports.report import Block, Bullets, Plots, Report, Section, Summary, Tone
+from alidade.pipelines.reports.sentences import capital
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.layout import Layout
@@ -93,7 +94,7 @@ def layout_json(layout: Layout) -> str:
 
 def layout_report(layout: Layout, recordings: Sequence[str]) -> Report:
     """The report of a layout."""
-    steps = tuple(f"{step[:1].upper()}{step[1:]}." for step in advice(layout))
+    steps = tuple(f"{capital(step)}." for step in advice(layout))
     tone: Tone = "warn" if steps else "good"
     apply = "Use the section `cube: tags` that was written, in the config of recordings of this cube."
     answer = "in part" if layout.unplaced else "yes"

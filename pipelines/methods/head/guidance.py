@@ -10,7 +10,8 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
-from alidade.pipelines.diagnostics.fault_models import AXES, DataFault, FaultModel
+from alidade.pipelines.diagnostics.fault_models import DataFault, FaultModel
+from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.head.recording import VISION_ATTITUDE, HeadData
 from alidade.pipelines.settings import Config

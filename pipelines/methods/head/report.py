@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
-from alidade.pipelines.display.figure import COLORS, PALE, Figure, Plot
+from alidade.pipelines.display.figure import AXES, COLORS, PALE, Figure, Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Findings
@@ -75,9 +75,6 @@ def findings(data: HeadData, config: Config, _: Estimate) -> Findings:
     return {} if data.head_force is not None else fixed_without_force(SENSITIVITY, config, config.topic(HEAD_IMU))
 
 
-_AXES = "xyz"
-
-
 def head_plots(data: HeadData, calibration: Calibration) -> list[Plot]:
     """Attitude bRv with what vision says of it, and their differences; nothing without a trajectory."""
     attitudes = calibration.estimate.attitudes
@@ -105,9 +102,9 @@ def _from_vision(data: HeadData, calibration: Calibration, attitudes: Attitudes)
 def _attitude(attitudes: Attitudes, seen: Attitudes) -> Plot:
     out = Figure("rotation vector of bRv, deg", height=360)
     fused, vision = _vectors(attitudes.wxyz), _vectors(seen.wxyz)
-    for i, axis in enumerate(_AXES):
+    for i, axis in enumerate(AXES):
         out.points(seen.time, vision[:, i], f"vision {axis}", COLORS[i], 3, alpha=0.45)
-    for i, axis in enumerate(_AXES):
+    for i, axis in enumerate(AXES):
         out.line(attitudes.time, fused[:, i], f"fused {axis}", COLORS[i])
     return Plot(
         "Attitude of the helmet on the platform",
@@ -120,7 +117,7 @@ def _difference(attitudes: Attitudes, seen: Attitudes) -> Plot:
     delta = _delta(attitudes, seen)
     spread = robust_sigma(delta)
     out = Figure("vision minus fused, deg")
-    for i, axis in enumerate(_AXES):
+    for i, axis in enumerate(AXES):
         out.points(seen.time, delta[:, i], axis, COLORS[i], 3)
     out.y_range = (-6.0 * max(spread, 1e-3), 6.0 * max(spread, 1e-3))
     return Plot(
@@ -150,7 +147,7 @@ def _against_truth(data: HeadData, calibration: Calibration, attitudes: Attitude
 
 def _camera_mount_unknown(calibration: Calibration) -> bool:
     verdicts = calibration.verdicts
-    return any(verdicts.get(f"camera_mount_{axis}") in ("weak", "unobservable") for axis in _AXES)
+    return any(verdicts.get(f"camera_mount_{axis}") in ("weak", "unobservable") for axis in AXES)
 
 
 def _constant_turn(truth: Attitudes, attitudes: Attitudes) -> Array:

@@ -11,8 +11,9 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
-from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, FaultModel
+from alidade.pipelines.diagnostics.fault_models import ExactInput, FaultModel
 from alidade.pipelines.display.drawing import BEHIND, Drawing
+from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.indexer.recording import IndexerData

@@ -15,7 +15,7 @@ from alidade.factors import so3
 from alidade.factors.gyro import symmetric
 from alidade.factors.indexer import IndexerAverageFactor, mounting
 from alidade.pipelines.diagnostics.cross_validation import Validation
-from alidade.pipelines.display.figure import COLORS, Figure, Plot
+from alidade.pipelines.display.figure import AXES, COLORS, Figure, Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import Correction, Report
@@ -74,7 +74,6 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
 
 
 _ARCSEC = np.rad2deg(1.0) * 3600.0
-_AXES = "xyz"
 
 
 def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
@@ -112,7 +111,7 @@ def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | Non
         for half in found:
             in_t = so3.rotate(mounting(theta), half.rate) / np.linalg.norm(half.rate) * _ARCSEC
             for axis in (1, 2) if half.axis == "outer" else (0, 1):
-                labels.append(f"{half.position} {_AXES[axis]}t")
+                labels.append(f"{half.position} {AXES[axis]}t")
                 across.append(float(in_t[axis]))
         out.x_labels = tuple(labels)
         out.bars(across, name, color, (len(rows), 2))
@@ -129,7 +128,7 @@ def _misfit(turning: list[Group], values: dict[str, float]) -> Plot:
     """Mean gyro less prediction over each turn or move, as an angle of the axis."""
     out = Figure("gyro less encoders, arcsec")
     time, error = misfit(turning, values)
-    for i, axis in enumerate(_AXES):
+    for i, axis in enumerate(AXES):
         out.points(time, error[:, i] * _ARCSEC, f"{axis}t", COLORS[i], 6)
     return Plot(
         "Misfit by turn",

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
-from alidade.pipelines.diagnostics.fault_models import AXES, FaultModel
+from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.settings import Config
