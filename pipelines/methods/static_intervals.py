@@ -1,8 +1,16 @@
-"""Static intervals, when a device stood still: a variance test on its gyro and accelerometer."""
+"""Static intervals of a device: where the scatter of its readings over half a second is that of a rest.
+
+After Tedaldi, Pretto, Menegatti, "A robust and easy to implement method for IMU calibration without external
+equipments", ICRA 2014, which tests the accelerometer; a turn about the vertical shows in the gyro alone. The threshold
+between rest and motion is Otsu's, in the logarithm of the scatter ("A threshold selection method from gray-level
+histograms", IEEE Trans. SMC 1979): a hand that holds a device still makes ten times the noise of the sensors, one that
+turns it a hundred times.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,28 +19,25 @@ from alidade.pipelines.errors import InputError
 
 Array = NDArray[np.float64]
 
-# The test looks at this much time about each sample, s; half of it keeps a pose's ends clear of the motion.
-_SPAN = 0.5
-# Shorter intervals, s, are turning points of a motion.
-_SHORTEST = 0.5
-# The scatter over the span is below the first many times the noise somewhere in an interval, and below the second all
-# through it: a hand's tremor does not end a rest.
-_QUIET, _STILL = 3.0, 6.0
-# A motion starts slower than the test can see: this much, s, is cut off at both ends.
-_MARGIN = 0.25
+# The test looks at this much time about each sample, s.
+_SPAN = 0.25
+# Shorter intervals, s, are turning points of a motion; so are those below the second in which readings scatter by more
+# than the third times what they differ by from one to the next, over sqrt(2): 1 for white noise, 2 in a hand at rest,
+# beyond 5 where it turns back.
+_SHORTEST, _BRIEF, _WHITE = 0.25, 1.0, 2.0
+# Scatter over the noise floor that is rest whatever else the recording shows.
+_STILL = 6.0
+# Share of the variance of the logarithms that two classes explain: 3/4 in a uniform distribution, 0.85 and more in
+# recordings with rests, 0.55 to 0.67 in motion without.
+_SEPARATED = 0.75
+# A motion starts slower than the test can see: this share of an interval, between these limits, s, is cut off at both
+# ends.
+_SLOW_SHARE, _SLOW = 0.2, (0.125, 0.45)
 # ... and more where the sum of what the readings differ by from the quietest half of the interval, from there on, comes
 # out beyond the first many of its sigmas: back to where it was last within the second.
 _MOVED, _UNMOVED = 5.0, 1.0
-# What stays below that is slow all the same: this share of a long interval, up to s, is cut off at least.
-_SLOW_SHARE, _SLOW = 0.1, 0.4
 # Samples whose means show whether noise is white, and how many such means it takes.
 _TOGETHER, _FEWEST_BLOCKS, _TINY = 8, 4, np.finfo(float).tiny
-# Brief rests, of a second and less, are looked for with this share of span, margin and shortest; there readings scatter
-# by less than so many times what they differ by from one to the next, over sqrt(2): 1 for white noise, beyond 5 where
-# a hand turns back.
-_BRIEF, _WHITE = 0.5, 2.0
-# Of a triad, nine numbers at rest, fewer static poses than this are too few for brief ones to be left out.
-_FEWEST_POSES = 9
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
 # A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, when what
@@ -45,126 +50,130 @@ _REWEIGHTINGS = 20
 _GAP_SAMPLES = 5.0
 
 
-def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float, accel_sigma: float) -> Array:
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Readings of one sensor at common stamps.
+
+    Attributes:
+        values: (N, 3).
+        sigma: stated noise of one sample, per axis.
+        tremor: largest scatter over half a second that is a hand holding still, in the unit of the values.
+    """
+
+    values: Array
+    sigma: float
+    tremor: float
+
+
+# Scatter over half a second of a hand that holds a device, rad/s and m/s^2: 95 % of the MPU-6050 recording of
+# tomisuarez2/ImuCalibration lie below .04 and .13.
+GYRO_TREMOR, ACCEL_TREMOR = 0.05, 0.2
+
+
+def find_static_intervals(t: Array, accel: Stream, gyro: Stream | None = None, *others: Stream) -> Array:
     """Beginnings and ends, (P, 2) s, of the static intervals, each at a sample's stamp.
 
-    After Tedaldi, Pretto, Menegatti, "A robust and easy to implement method for IMU calibration without external
-    equipments", ICRA 2014, which tests the accelerometer; a turn about the vertical shows in the gyro alone.
+    Without a gyro a steady turn about what a sensor feels passes for a rest.
 
     Args:
         t: (N,) s.
-        gyro: (N, 3) rad/s.
-        accel: (N, 3) m/s^2.
-        gyro_sigma, accel_sigma: stated noise of one sample, per axis.
+        accel: m/s^2.
+        gyro: rad/s.
+        others: more sensors that have to be quiet.
 
     Raises:
         InputError: there is none.
     """
-    (runs, scatter, floor), share = _runs_or_brief_ones(t, [(gyro, gyro_sigma), (accel, accel_sigma)], _FEWEST_POSES)
-    interval = float(np.median(np.diff(t)))
-    ends = [_unmoved(run, [(gyro, float(floor[0])), (accel, float(floor[1]))], interval) for run in runs]
-    runs = np.array([run for run in ends if t[run[1]] - t[run[0]] >= share * _SHORTEST], dtype=np.intp).reshape(-1, 2)
-    means, forces = (
-        np.array([values[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3) for values in (gyro, accel)
-    )
-    still = _turns_not(means, forces, runs[:, 1] - runs[:, 0] + 1, floor[0])
-    if len(runs) and not still.any():
+    streams = [accel, *others] if gyro is None else [gyro, accel, *others]
+    runs, scatter, floor = _quiet_runs(t, streams)
+    if not len(runs):
+        raise InputError(
+            f"no static pose: in the quietest {_SPAN:g} s the readings scatter by "
+            f"{', '.join(f'{least:.2g}' for least in scatter.min(axis=1))}, noise stated is "
+            f"{', '.join(f'{each.sigma:.2g}' for each in streams)} ({'' if gyro is None else 'gyro, rad/s; '}"
+            "accelerometer, m/s^2); let the device stand still for a few seconds in each pose, or state its noise in "
+            "the config"
+        )
+    if gyro is None:
+        return np.asarray(t[runs])
+    rates, forces = (np.array([each.values[a : b + 1].mean(axis=0) for a, b in runs]) for each in (gyro, accel))
+    still = _turns_not(rates, forces, runs[:, 1] - runs[:, 0] + 1, floor[0])
+    if not still.any():
         raise InputError(
             f"no static pose: the device is quiet in {len(runs)} intervals, but the gyro's mean rates in them lie up "
-            f"to {np.ptp(means, axis=0).max():.2g} rad/s apart: either it turns steadily in them, or gravity shifts "
+            f"to {np.ptp(rates, axis=0).max():.2g} rad/s apart: either it turns steadily in them, or gravity shifts "
             "its gyro by far more than a usual one's (g-sensitivity)"
         )
-    if not len(runs):
-        least = scatter.min(axis=1)
-        raise InputError(
-            f"no static pose: in the quietest {_SPAN:g} s the gyro scatters by {least[0]:.2g} rad/s and the "
-            f"accelerometer by {least[1]:.2g} m/s^2, noise stated is {gyro_sigma:.2g} and {accel_sigma:.2g}; let the "
-            "cube stand still for a few seconds in each pose, or state the device's noise in the config"
-        )
-    return t[runs[still]]
+    return np.asarray(t[runs[still]])
 
 
-def quiet_intervals(t: Array, streams: Sequence[tuple[Array, float]], fewest: int) -> Array:
-    """Beginnings and ends, (P, 2) s, of intervals in which vectors (N, 3) are quiet, each with its noise; maybe none.
-
-    For a device without a gyro: a steady turn about what a sensor feels does not show in it. Where that finds fewer
-    than `fewest`, brief ones count in which the first vectors scatter by white noise: at turning points they do not.
-    """
-    return np.asarray(t[_runs_or_brief_ones(t, streams, fewest)[0][0]])
-
-
-def _runs_or_brief_ones(
-    t: Array, streams: Sequence[tuple[Array, float]], fewest: int
-) -> tuple[tuple[NDArray[np.intp], Array, Array], float]:
-    """Quiet runs as `_quiet_runs` has them and their share of what is usual: brief ones where others are too few."""
-    usual = _quiet_runs(t, streams)
-    if len(usual[0]) >= fewest:
-        return usual, 1.0
-    brief = _quiet_runs(t, streams, _BRIEF)
-    if len(brief[0]) >= fewest and _is_white(streams[0][0], brief[0]):
-        return brief, _BRIEF
-    return usual, 1.0
-
-
-def _is_white(values: Array, runs: NDArray[np.intp]) -> bool:
-    """Whether vectors (N, 3) scatter in runs (P, 2) about as much as they differ from one sample to the next."""
-    within = [values[first : last + 1] for first, last in runs]
-    scatter = np.median([np.sqrt(each.var(axis=0).mean()) for each in within])
-    steps = np.median([np.sqrt(0.5 * (np.diff(each, axis=0) ** 2).mean()) for each in within])
-    return bool(scatter < _WHITE * steps)
-
-
-def _quiet_runs(
-    t: Array, streams: Sequence[tuple[Array, float]], share: float = 1.0
-) -> tuple[NDArray[np.intp], Array, Array]:
+def _quiet_runs(t: Array, streams: Sequence[Stream]) -> tuple[NDArray[np.intp], Array, Array]:
     """First and last sample of each quiet run (P, 2), and for each stream its scatter (N,) and the floor of that.
-
-    `share` is what the test looks at, cuts off and takes for shortest, over what is usual.
 
     Raises InputError when the record is shorter than what is looked at.
     """
     interval = float(np.median(np.diff(t)))
-    half = max(2, round(0.5 * share * _SPAN / interval))
+    half = max(2, round(0.5 * _SPAN / interval))
     if len(t) < 2 * half + 1:
         raise InputError(f"the device's record is {t[-1] - t[0]:.3g} s long, shorter than one static pose")
-    scatter = np.stack([_scatter(values, half) for values, _ in streams])
-    stated = np.array([sigma for _, sigma in streams])
+    scatter = np.stack([_scatter(each.values, half) for each in streams])
+    stated = np.array([each.sigma for each in streams])
     low, high = _FLOOR_LIMITS
     floor = np.clip(np.quantile(scatter, _FLOOR_SHARE, axis=1), low * stated, high * stated)
-    quiet, still = (np.all(scatter < limit * floor[:, None], axis=0) for limit in (_QUIET, _STILL))
+    split = [min(_split(own), each.tremor) for own, each in zip(scatter, streams, strict=True)]
+    still = np.all(scatter < np.maximum(_STILL * floor, split)[:, None], axis=0)
     dense = np.diff(t) < _GAP_SAMPLES * interval
     still &= np.append(dense, True) & np.append(True, dense)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
-    counted = np.append(0, np.cumsum(quiet & still))
-    edges = edges[counted[edges[:, 1]] > counted[edges[:, 0]]]
-    margin = round(share * _MARGIN / interval)
-    runs = edges + np.array([margin, -1 - margin])
-    runs = runs[runs[:, 1] > runs[:, 0]]
-    return runs[t[runs[:, 1]] - t[runs[:, 0]] >= share * _SHORTEST], scatter, floor
+    runs = [_unmoved(first, last - 1, streams, floor, interval) for first, last in edges.tolist()]
+    kept = [(first, last) for first, last in runs if _is_rest(streams[0].values[first : last + 1], interval)]
+    return np.array(kept, dtype=np.intp).reshape(-1, 2), scatter, floor
 
 
-def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]], interval: float) -> tuple[int, int]:
-    """First and last sample of a quiet run of vectors, each with its noise, but for ends in which motion is slow."""
-    first, last = run.tolist()
+def _is_rest(values: Array, interval: float) -> bool:
+    """Whether a quiet run of vectors (n, 3) is long enough, or brief and white."""
+    length = (len(values) - 1) * interval
+    if length < _SHORTEST or length > _BRIEF:
+        return length > _BRIEF
+    step = np.sqrt(0.5 * (np.diff(values, axis=0) ** 2).mean())
+    return bool(np.sqrt(values.var(axis=0).mean()) <= _WHITE * step)
+
+
+def _split(scatter: Array) -> float:
+    """Otsu's threshold between two classes of scatter, in the logarithm; 0 where there are none."""
+    x = np.log(np.sort(scatter[np.isfinite(scatter) & (scatter > 0.0)]))
+    lower = np.arange(1, len(x))
+    if not len(lower):
+        return 0.0
+    sums = np.cumsum(x)
+    apart = sums[:-1] / lower - (sums[-1] - sums[:-1]) / (len(x) - lower)
+    between = lower * (len(x) - lower) / len(x) ** 2 * apart**2
+    best = int(np.argmax(between))
+    return float(np.exp(x[best])) if between[best] > _SEPARATED * x.var() else 0.0
+
+
+def _unmoved(
+    first: int, last: int, streams: Sequence[Stream], floor: Array, interval: float
+) -> tuple[int, int]:
+    """First and last sample of a quiet run but for ends in which motion is slow."""
+    low, high = _SLOW
+    slow = round(min(max(_SLOW_SHARE * (last - first) * interval, low), high) / interval)
+    first, last = first + slow, last - slow
     quarter = (last - first) // 4
-    if quarter == 0:
+    if quarter <= 0:
         return first, last
-    stirring = np.sum([(_scatter(values[first : last + 1], quarter) / noise) ** 2 for values, noise in streams], axis=0)
+    sensors = [(each.values, noise) for each, noise in zip(streams, floor, strict=True)]
+    stirring = np.sum([(_scatter(values[first : last + 1], quarter) / noise) ** 2 for values, noise in sensors], axis=0)
     centre = first + quarter + int(np.argmin(stirring[quarter:-quarter]))
     middle = slice(centre - quarter, centre + quarter + 1)
     before, after = [], []
-    for values, noise in streams:
+    for values, noise in sensors:
         still = values[middle]
         mean, sigma = still.mean(axis=0), _colour(still) * np.maximum(still.std(axis=0), noise)
         before.append((values[first : middle.start] - mean)[::-1] / sigma)
         after.append((values[middle.stop : last + 1] - mean) / sigma)
     count = middle.stop - middle.start
-    rest = (last - first) * interval + 2.0 * _MARGIN
-    slow = round((max(min(_SLOW_SHARE * rest, _SLOW), _MARGIN) - _MARGIN) / interval)
-    return (
-        max(middle.start - _still_for(np.hstack(before), count), first + slow),
-        min(middle.stop - 1 + _still_for(np.hstack(after), count), last - slow),
-    )
+    return middle.start - _still_for(np.hstack(before), count), middle.stop - 1 + _still_for(np.hstack(after), count)
 
 
 def _colour(values: Array) -> float:

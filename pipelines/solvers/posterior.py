@@ -133,7 +133,8 @@ class Reported:
         """The square-root information of the free numbers from that of (last node, shared unknowns, right side)."""
         basis = self.basis
         R = np.asarray(np.linalg.qr(np.column_stack([root[:, :-1] @ basis, root[:, -1]]), mode="r"), dtype=float)
-        return ReportedRoot(basis, R, basis.shape[1] - len(self.free))
+        missing = max(0, R.shape[1] - len(R))  # rows, where there are fewer than numbers
+        return ReportedRoot(basis, np.pad(R, ((0, missing), (0, 0))), basis.shape[1] - len(self.free))
 
     def covariance(self, of_u: Array) -> Array:
         """Covariance (n, n) of all numbers from that of u (m, m); rows of fixed numbers are zero."""
@@ -148,7 +149,7 @@ class ReportedRoot:
 
     Attributes:
         basis: (c + s, p + m) moves of the last node and the shared unknowns: p that no number sees, then those of u.
-        triangle: (., p + m + 1) R in this basis, right side last.
+        triangle: (p + m + 1, p + m + 1) R in this basis, right side last.
         unseen: p.
     """
 
@@ -159,14 +160,12 @@ class ReportedRoot:
     @property
     def R(self) -> Array:
         """Square-root information (m, m) of u, everything else marginalised out."""
-        rows = self.triangle[self.unseen : -1, self.unseen : -1]
-        m = rows.shape[1]
-        return np.vstack([rows[:m], np.zeros((max(0, m - len(rows)), m))])
+        return self.triangle[self.unseen : -1, self.unseen : -1]
 
     @property
     def d(self) -> Array:
         """Right side (m,): |R du - d| is minimal at the solution."""
-        return np.asarray(self.triangle[self.unseen : self.triangle.shape[1] - 1, -1])
+        return self.triangle[self.unseen : -1, -1]
 
     def last(self, du: Array, right: float = 1.0) -> Array:
         """Moves (c + s, k) of the last node and the shared unknowns for moves (m, k) of u, the rest optimal.

@@ -13,7 +13,7 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, computed_once, noise_densities, nominal
-from alidade.pipelines.methods.static_intervals import find_static_intervals
+from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.recording.checks import count
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
@@ -257,8 +257,8 @@ def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
 @computed_once
 def static_intervals(data: CubeData, config: Config) -> Array:
     """Beginnings and ends, (P, 2) s, of the device's static intervals. Raises InputError when there is none."""
-    densities = noise_densities(data, config)
     root_rate = float(np.median(np.diff(data.imu_t))) ** -0.5
+    gyro_sigma, accel_sigma, _ = (density * root_rate for density in noise_densities(data, config))
     raw = config.section(CubeConfig).raw
-    gyro, accel = nominal(data.gyro, raw.gyro), nominal(data.accel, raw.accel)
-    return find_static_intervals(data.imu_t, gyro, accel, densities[0] * root_rate, densities[1] * root_rate)
+    gyro = Stream(nominal(data.gyro, raw.gyro), gyro_sigma, GYRO_TREMOR)
+    return find_static_intervals(data.imu_t, Stream(nominal(data.accel, raw.accel), accel_sigma, ACCEL_TREMOR), gyro)

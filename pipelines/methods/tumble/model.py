@@ -23,7 +23,12 @@ from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import sampled, stated
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
-from alidade.pipelines.methods.static_intervals import quiet_intervals
+from alidade.pipelines.methods.static_intervals import (
+    ACCEL_TREMOR,
+    GYRO_TREMOR,
+    Stream,
+    find_static_intervals,
+)
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess
 from alidade.pipelines.methods.tumble.published import FEWEST
@@ -397,15 +402,16 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
     root_rate = float(np.median(np.diff(t))) ** -0.5
     size = float(np.median(np.linalg.norm(data.accel - data.accel.mean(axis=0), axis=1))) / _GRAVITY
     unit = 1.0 if _is_si("accel", data.accel) else max(size, np.finfo(float).tiny)
-    streams = [(data.accel / unit, stated("accel_density", config).stated * root_rate)]
-    if data.mag is not None and data.mag_t is not None:
-        mag = _at(t, data.mag_t, data.mag)
-        streams.append((mag / mag.std(), 1e-3))
+    accel = Stream(data.accel / unit, stated("accel_density", config).stated * root_rate, ACCEL_TREMOR)
+    gyro, others = None, []
     if data.gyro is not None and data.gyro_t is not None:
         density = sampled(stated("gyro_density", config, data.gyro_density), data.gyro_t, data.gyro).used
-        streams.insert(0, (_at(t, data.gyro_t, data.gyro), density * root_rate))
+        gyro = Stream(_at(t, data.gyro_t, data.gyro), density * root_rate, GYRO_TREMOR)
+    if data.mag is not None and data.mag_t is not None:
+        mag = _at(t, data.mag_t, data.mag)
+        others.append(Stream(mag / mag.std(), 1e-3, 0.0))
     try:
-        found = quiet_intervals(t, streams, FEWEST)
+        found = find_static_intervals(t, accel, gyro, *others)
     except InputError:
         return None
     alone = data.gyro is None and np.diff(found).sum() > _MOSTLY * (t[-1] - t[0])

@@ -34,7 +34,7 @@ from alidade.pipelines.methods.cube.scenario import (
 )
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.static_poses import static_intervals
-from alidade.pipelines.methods.static_intervals import find_static_intervals
+from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.sensors import Warming
@@ -180,13 +180,18 @@ def test_a_magnetometer_of_unknown_field_is_left_out_and_that_is_told() -> None:
     assert not [name for name in estimate.names if name.startswith("mag")]
 
 
+def _rests(t: Array, gyro: Array, accel: Array) -> Array:
+    """Rests of a device with white noise of 1e-3 rad/s and 0.01 m/s^2."""
+    return find_static_intervals(t, Stream(accel, 0.01, ACCEL_TREMOR), Stream(gyro, 1e-3, GYRO_TREMOR))
+
+
 def test_a_rest_ends_where_a_slow_motion_begins() -> None:
     """A turn that takes seconds to gather speed is quieter than any threshold on scatter at first."""
     t, rng = np.arange(0.0, 12.0, 0.01), np.random.default_rng(3)
     rate, noise = 0.01 * np.clip(t - 6.0, 0.0, None) ** 2, 1e-3
     gyro = noise * rng.standard_normal((len(t), 3)) + rate[:, None] * (0.0, 0.6, 0.8)
     accel = 0.01 * rng.standard_normal((len(t), 3)) + (0.0, 0.0, 9.81)
-    ((start, stop),) = find_static_intervals(t, gyro, accel, noise, 0.01)
+    ((start, stop),) = _rests(t, gyro, accel)
     assert start < 0.5
     assert 5.5 < stop < 6.8
     still = gyro[(t >= start) & (t <= stop)]
@@ -202,14 +207,14 @@ def test_rests_of_a_second_are_found(rest_s: float) -> None:
     assert max(abs(z) for z in _sigmas_off(estimate, truth).values()) < 4.0
 
 
-@pytest.mark.parametrize(("length", "cut"), [(2.0, 0.5), (3.7, 0.57), (8.0, 0.65)])
+@pytest.mark.parametrize(("length", "cut"), [(2.0, 0.475), (3.7, 0.575), (8.0, 0.575)])
 def test_more_is_cut_off_a_long_rest(length: float, cut: float) -> None:
-    """A quarter of a second that the test looks at, another, and more where a rest is long enough to spare it."""
+    """An eighth of a second that the test looks at, and a fifth of the rest up to 0.45 s."""
     t, rng = np.arange(0.0, length + 6.0, 0.005), np.random.default_rng(4)
     gyro, accel = (noise * rng.standard_normal((len(t), 3)) for noise in (1e-3, 0.01))
     moves = np.abs(t - 3.0 - 0.5 * length) > 0.5 * length
     gyro[moves] += np.sin(9.0 * t[moves])[:, None] * (0.5, 0.6, 0.8)
-    ((start, stop),) = find_static_intervals(t, gyro, accel + (0.0, 0.0, 9.81), 1e-3, 0.01)
+    ((start, stop),) = _rests(t, gyro, accel + (0.0, 0.0, 9.81))
     assert (start - 3.0, 3.0 + length - stop) == pytest.approx((cut, cut), abs=0.03)
 
 

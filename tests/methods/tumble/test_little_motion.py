@@ -158,7 +158,7 @@ def test_poses_now_and_then_are_enough() -> None:
 
 
 def test_no_reading_during_a_rest_leaves_the_relative_rotation_unobservable() -> None:
-    scenario = {"rest_s": 1.5, "turn_rad_s": 1.0, "magnetometer": {"rate_hz": 0.35}, "accelerometer": {}}
+    scenario = {"rest_s": 1.5, "turn_rad_s": 1.0, "magnetometer": {"rate_hz": 0.45}, "accelerometer": {}}
     session = Session.of(TUMBLE, TUMBLE.simulate(TumbleScenario.model_validate(scenario), 3))
     assert "no reading during a rest" in " ".join(session.problem().premises)
     assert session.calibrate(report=False).status == "unobservable"
