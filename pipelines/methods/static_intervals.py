@@ -152,9 +152,7 @@ def _split(scatter: Array) -> float:
     return float(np.exp(x[best])) if between[best] > _SEPARATED * x.var() else 0.0
 
 
-def _unmoved(
-    first: int, last: int, streams: Sequence[Stream], floor: Array, interval: float
-) -> tuple[int, int]:
+def _unmoved(first: int, last: int, streams: Sequence[Stream], floor: Array, interval: float) -> tuple[int, int]:
     """First and last sample of a quiet run but for ends in which motion is slow."""
     low, high = _SLOW
     slow = round(min(max(_SLOW_SHARE * (last - first) * interval, low), high) / interval)

@@ -59,3 +59,21 @@ def test_a_gyro_that_saturates_in_silence(shared_data: Path) -> None:
         p = found.parameters[f"helmet_mount_{axis}"]
         assert abs(p.value - truth) < 3.0 * p.sigma
         assert p.sigma < np.deg2rad(3.0)
+
+
+def test_a_cube_held_in_a_hand(shared_data: Path, tmp_path: Path) -> None:
+    """MPU-6050 in counts, ten rests, nine of them in a hand that trembles six times above the noise.
+
+    Scales as published by the authors (tomisuarez2/ImuCalibration, params_acc.csv, params_gyro.csv): z of the
+    accelerometer, y and z of the gyro; of the others their rests of 20 ms and less leave the cross terms at 7 deg.
+    """
+    (tmp_path / "c.yaml").write_text(
+        "latitude_deg: 48.0\ncube: {raw: {accel: {scale: 5.985504e-4}, gyro: {scale: 1.332312e-4}}}\n"
+    )
+    (found,) = calibrate(shared_data / "suarez_mpu6050" / "cal.mcap", ["batch"], "cube", tmp_path / "c.yaml")
+    assert found.status in ("calibrated", "weak"), found.headline
+    assert len(found.tables["static_poses"]) == 10
+    for name, published in (("accel_k33", 0.97911 * 9.80665 / 16384), ("gyro_k22", 1.3292e-4), ("gyro_k33", 1.3394e-4)):
+        p = found.parameters[name]
+        assert abs(p.value - published) < 4.0 * p.sigma, name
+        assert p.sigma < 3e-3 * p.value

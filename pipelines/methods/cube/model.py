@@ -363,8 +363,8 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
     of_accel = accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms, *slopes["accel"])
     of_gyro = gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G, *slopes["gyro"])
     factors = [
-        Factor.of("accelerometer", of_accel, 1.0 / accel.sigma),
-        Factor.of("gyro at rest", of_gyro, 1.0 / gyro.sigma),
+        Factor.of("accelerometer", of_accel, poses.unrest[row, 1] / accel.sigma),
+        Factor.of("gyro at rest", of_gyro, poses.unrest[row, 0] / gyro.sigma),
     ]
     if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
         mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))

@@ -56,6 +56,7 @@ class StaticPoses:
         span: (P, 2) s, beginning and end.
         gyro, accel: (P, 3) rad/s, m/s^2.
         duration: (P,) s, time that gyro and accelerometer are averaged over.
+        unrest: (P, 2) scatter of gyro and accelerometer over that of the quieter poses, at least 1: a hand's tremor.
         mag: (P, 3) T, NaN for a pose without samples, or None.
         mag_duration: (P,) s.
         celsius: (P,) mean temperatures, degrees Celsius; None where nobody measures them.
@@ -67,6 +68,7 @@ class StaticPoses:
     gyro: Array
     accel: Array
     duration: Array
+    unrest: Array
     mag: Array | None
     mag_duration: Array
     celsius: Array | None
@@ -99,7 +101,9 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
     celsius = None
     if data.temperature is not None:
         celsius = _means(data.imu_t, data.temperature.above(0.0, data.imu_t)[:, None], span)[0][:, 0]
-    return StaticPoses(span, gyro, accel, duration, mag, mag_duration, celsius, tags, dropped)
+    raws = (data.gyro, data.accel)
+    unrest = np.stack([_unrest(data.imu_t, values, span) for values in raws], axis=1)
+    return StaticPoses(span, gyro, accel, duration, unrest, mag, mag_duration, celsius, tags, dropped)
 
 
 def turn(data: CubeData, start: float, stop: float) -> slice:
@@ -117,6 +121,13 @@ def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
     means: Array = (sums[last] - sums[first]) / np.maximum(number, 1)[:, None] + centre
     means[number == 0] = np.nan
     return means, np.asarray(number * np.median(np.diff(t)))
+
+
+def _unrest(t: Array, values: Array, span: Array) -> Array:
+    """Scatter (P,) of vectors within each span over that of the quieter quarter of spans, at least 1."""
+    rows = np.searchsorted(t, span)
+    scatter = np.sqrt([values[first : last + 1].var(axis=0).mean() for first, last in rows])
+    return np.maximum(scatter / max(float(np.quantile(scatter, 0.25)), np.finfo(float).tiny), 1.0)
 
 
 def _seen_tags(

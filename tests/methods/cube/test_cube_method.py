@@ -180,7 +180,7 @@ def test_a_magnetometer_of_unknown_field_is_left_out_and_that_is_told() -> None:
     assert not [name for name in estimate.names if name.startswith("mag")]
 
 
-def _rests(t: Array, gyro: Array, accel: Array) -> Array:
+def _rests(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
     """Rests of a device with white noise of 1e-3 rad/s and 0.01 m/s^2."""
     return find_static_intervals(t, Stream(accel, 0.01, ACCEL_TREMOR), Stream(gyro, 1e-3, GYRO_TREMOR))
 
