@@ -374,6 +374,14 @@ def test_halves_of_a_recording_agree_and_those_of_two_do_not(head: Case) -> None
     assert changed.step == pytest.approx(0.02, rel=0.3)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_corners_of_a_pose_held_out_are_predicted_by_the_turn_to_it(seed: int) -> None:
+    """Alone that leaves the place open, and the attitude to some milliradians, tens of sigmas of a corner."""
+    cube = method("cube")
+    session = Session.of(cube, cube.simulate(CubeScenario(poses=20, static_s=1.5, imu_rate_hz=50.0), seed))
+    assert held_out_residuals(session.problem())["tags"] == pytest.approx(1.0, abs=0.3)
+
+
 def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows() -> None:
     # A fifth of 900 pictures: the robust sigma of their 540 numbers is known to 5 %.
     find, data, config = head_of(60.0)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
-from alidade.pipelines.methods.tumble.simulation import SIMULATOR
 
 Array = np.ndarray
+TUMBLE = method("tumble")
+TUMBLED: dict[str, Any] = {"attitudes": 20, "magnetometer": None, "accelerometer": {}, "gyro": {}}
 GYRO_NOISE, ACCEL_NOISE = 1.5e-3, 0.035
 
 
@@ -50,8 +54,7 @@ def test_what_trembles_more_than_a_hand_is_no_rest() -> None:
 @pytest.mark.parametrize("beside", [True, False])
 @pytest.mark.parametrize("rest_s", [1.0, 1.5, 3.0])
 def test_rests_of_a_tumbled_device(rest_s: float, beside: bool) -> None:
-    scenario = {"attitudes": 20, "rest_s": rest_s, "magnetometer": None, "accelerometer": {}, "gyro": {}}
-    data = SIMULATOR.simulate(TumbleScenario.model_validate(scenario), 2).data
+    data = TUMBLE.simulate(TumbleScenario(**TUMBLED, rest_s=rest_s), 2).data
     gyro = Stream(data.gyro, 1e-3, GYRO_TREMOR) if beside else None
     assert len(find_static_intervals(data.accel_t, Stream(data.accel, 0.015, ACCEL_TREMOR), gyro)) == 20
 
@@ -59,8 +62,7 @@ def test_rests_of_a_tumbled_device(rest_s: float, beside: bool) -> None:
 @pytest.mark.parametrize("turn_rad_s", [0.4, 1.5])
 def test_motion_without_rests_has_none(turn_rad_s: float) -> None:
     """Between attitudes that it goes through without a stop a device turns more slowly, not less."""
-    scenario = {"attitudes": 20, "turn_rad_s": turn_rad_s, "magnetometer": None, "accelerometer": {}, "gyro": {}}
-    data = SIMULATOR.simulate(TumbleScenario.model_validate(scenario), 1).data
+    data = TUMBLE.simulate(TumbleScenario(**TUMBLED, turn_rad_s=turn_rad_s), 1).data
     try:
         found = find_static_intervals(
             data.accel_t, Stream(data.accel, 0.015, ACCEL_TREMOR), Stream(data.gyro, 1e-3, GYRO_TREMOR)
