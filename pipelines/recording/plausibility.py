@@ -40,6 +40,10 @@ HELD = ": repeats the reading before, used once"
 _MAX_NUMBER = 1e100
 # A topic holds readings where more than this share of the rows repeats the row before; least number of rows tested.
 _HELD, _MIN_HELD = 0.4, 100
+# A dead band has at least this share of the samples at its value, and beside it a gap of more than so many steps.
+_DEAD, _GAP = 0.05, 5.0
+# Share of the steps between neighbouring values that are the device's: where readings are dense.
+_DENSE = 0.1
 
 
 def implausible(kind: str, values: Array) -> str:
@@ -168,3 +172,21 @@ def measured_once(topic: str, values: Array, dropped: dict[str, int]) -> NDArray
         return everything
     count(dropped, f"{topic}{HELD}", int(repeats.sum()))
     return np.flatnonzero(~repeats)
+
+
+def dead_band(values: Array) -> Array:
+    """Half width (N, k) of the dead band that each of some readings (N, k) lies in; 0 of those in none.
+
+    Within a dead band a device reports one value. That is the value of many samples, and the gap to the next ones on
+    either side is far larger than the device's step.
+    """
+    return np.stack([_dead_band(column) for column in values.T], axis=1)
+
+
+def _dead_band(values: Array) -> Array:
+    found, counts = np.unique(values, return_counts=True)
+    most, steps = int(np.argmax(counts)), np.diff(found)
+    width = 0.0
+    if 0 < most < len(steps) and counts[most] > _DEAD * len(values):
+        width = float(steps[most - 1 : most + 1].min())
+    return np.where(values == found[most], width if width > _GAP * np.quantile(steps, _DENSE) else 0.0, 0.0)

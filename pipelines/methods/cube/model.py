@@ -63,6 +63,7 @@ from alidade.pipelines.methods.cube.static_poses import SeenTags, StaticPoses, s
 from alidade.pipelines.methods.cube.tags import layout_prior, tag_place_key
 from alidade.pipelines.methods.cube.wandering import GaussMarkovDeviation, deviation_key, sum_key
 from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
+from alidade.pipelines.recording.plausibility import dead_band
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -72,6 +73,10 @@ if TYPE_CHECKING:
 _NO_FIELD = (
     "The magnetometer is not calibrated, for the field is not known where nobody says where it was: give latitude_deg "
     "and longitude_deg in the config, or record /reference/fix."
+)
+_DEAD_BAND = (
+    "The gyro has a dead band: within {:.2g} deg/s it reads one value. Its offset is known from the turns alone; "
+    "switch the dead band off in the device and record again."
 )
 # Sigmas of priors as good as none, m on the cube's place in the camera and rad on an attitude that no gyro leads to:
 # these only make the new variables of a step determined without its measurements.
@@ -94,12 +99,22 @@ def problem(data: CubeData, config: Config) -> Problem:
         attitudes=partial(_trajectory, model),
         advice=advice,
         dropped=model.dropped,
-        premises=(_NO_FIELD,) if model.poses.mag is not None and model.field is None else (),
+        premises=_premises(model),
         noises=tuple(noises(data, config).values()),
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=ChainLayout(states="xdepR" if model.reference.moves else "xdep"),
     )
     return graph if layout is None or data.camera is None else with_priors(graph, [layout])
+
+
+def _premises(model: Model) -> tuple[str, ...]:
+    """Sentences about what the recording lacks."""
+    band = float(np.rad2deg(model.dead_band.max()))
+    lacking = {
+        _NO_FIELD: model.poses.mag is not None and model.field is None,
+        _DEAD_BAND.format(band): band > 0.0,
+    }
+    return tuple(sentence for sentence, lacks in lacking.items() if lacks)
 
 
 def _steps(model: Model, _: int) -> Iterator[Step]:
@@ -209,6 +224,7 @@ class Model:
     gravity: float  # m/s^2
     earth_rate: Array  # (3,) rad/s in n, as far as the heading is known
     unknown_rate: float  # rad/s per axis, what of the earth rate that leaves out
+    dead_band: Array  # (N, 3) rad/s, half width of the gyro's that a sample lies in
     field: Array | None  # (3,) T in n, by the model
     density: tuple[float, ...]  # of gyro, accelerometer and magnetometer
     deviation: GaussMarkovDeviation
@@ -224,6 +240,14 @@ class Model:
         gyro, accel = nominal(self.data.gyro[rows], raw.gyro), nominal(self.data.accel[rows], raw.accel)
         t, warming = self.data.imu_t[rows], self.data.temperature
         return Turning(t, gyro, accel, None if warming is None else warming.above(warming.first, t))
+
+    def rate_error(self, start: float, stop: float) -> float:
+        """Sigma of the mean rate from one moment to another beyond noise, rad/s per axis.
+
+        That of the earth rate left out, and of rates within the gyro's dead band, uniform in it.
+        """
+        dead = self.dead_band[turn(self.data, start, stop)].mean(axis=0).max() / np.sqrt(3.0)
+        return float(np.hypot(self.unknown_rate, dead))
 
     def temperature_rise(self, sensor: str, k: int) -> Array | None:
         """Mean temperature in pose k above the first, (1,) K; None where a sensor's offset ignores it."""
@@ -264,6 +288,7 @@ def prepare(data: CubeData, config: Config) -> Model:
         gravity=float(gravity(data.latitude, data.height)),
         earth_rate=earth * np.array([1.0, 1.0, 1.0] if heading_known else [0.0, 0.0, 1.0]),
         unknown_rate=0.0 if heading_known else float(np.hypot(*earth[:2]) * np.sqrt(0.5)),
+        dead_band=dead_band(nominal(data.gyro, config.section(CubeConfig).raw.gyro)),
         field=field,
         density=tuple(known[name].used if name in known else 0.0 for name in DENSITIES),
         deviation=GaussMarkovDeviation.over(poses, known["gyro_bias_walk"].used),
@@ -356,7 +381,7 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
     slopes = {name: [] if temperature_rises[name] is None else [key] for name, key in SLOPE_KEYS.items()}
     accel_sigma = accel_density / np.sqrt(duration)
     accel = AccelFactor(time, poses.accel[row], accel_sigma, model.gravity, curved, temperature_rises["accel"])
-    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.unknown_rate**2)
+    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.rate_error(*poses.span[k]) ** 2)
     gravity = model.gravity if feels else None
     gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, gravity, temperature_rises["gyro"])
     terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
@@ -432,7 +457,7 @@ def turn_factor(model: Model, k: int) -> Factor:
     samples, feels = model.samples(k), model.parameters.sensitivity is not None
     t = samples.t
     duration = float(t[-1] - t[0])
-    sigma = np.sqrt([model.density[0] ** 2 * duration + (model.unknown_rate * duration) ** 2])
+    sigma = np.sqrt([model.density[0] ** 2 * duration + (model.rate_error(t[0], t[-1]) * duration) ** 2])
     accel = [samples.accel] if feels else None
     slopes = model.parameters.slopes
     # What an accelerometer drifts by alone is nothing beside a gyro that does not.

@@ -127,7 +127,8 @@ def _unrest(t: Array, values: Array, span: Array) -> Array:
     """Scatter (P,) of vectors within each span over that of the quieter quarter of spans, at least 1."""
     rows = np.searchsorted(t, span)
     scatter = np.sqrt([values[first : last + 1].var(axis=0).mean() for first, last in rows])
-    return np.maximum(scatter / max(float(np.quantile(scatter, 0.25)), np.finfo(float).tiny), 1.0)
+    quiet = float(np.quantile(scatter, 0.25))
+    return np.maximum(scatter / quiet, 1.0) if quiet else np.ones(len(scatter))
 
 
 def _seen_tags(

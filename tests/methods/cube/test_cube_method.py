@@ -207,6 +207,21 @@ def test_rests_of_a_second_are_found(rest_s: float) -> None:
     assert max(abs(z) for z in _sigmas_off(estimate, truth).values()) < 4.0
 
 
+@pytest.mark.parametrize("resolution", [0.0, np.deg2rad(1.0 / 131.0)])
+def test_rests_within_a_dead_band_do_not_measure_the_offset(resolution: float) -> None:
+    """Within 0.3 deg/s the gyro reads zero, also of a device that counts; its offset is known from the turns alone."""
+    options = {"camera": None, "reference": None, "magnetometer": None}
+    data, truth, config = _simulated(1, errors=Errors(gyro_bias=2e-3), **options)
+    stepped = np.round(data.gyro / resolution) * resolution if resolution else data.gyro
+    dead = replace(data, gyro=np.where(np.abs(stepped) < np.deg2rad(0.3), 0.0, stepped))
+    built, estimate, _ = _solved(dead, config)
+    assert "The gyro has a dead band: within 0.3" in " ".join(built.premises)
+    assert max(_sigmas_off(estimate, truth).values()) < 4.0
+    sigmas = dict(zip(estimate.names, estimate.sigmas, strict=True))
+    assert 2e-4 < sigmas["gyro_b1"] < 2e-3
+    assert not problem(replace(data, gyro=stepped), config).premises
+
+
 @pytest.mark.parametrize(("length", "cut"), [(2.0, 0.475), (3.7, 0.575), (8.0, 0.575)])
 def test_more_is_cut_off_a_long_rest(length: float, cut: float) -> None:
     """An eighth of a second that the test looks at, and a fifth of the rest up to 0.45 s."""
