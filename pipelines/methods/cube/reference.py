@@ -13,8 +13,10 @@ from alidade.pipelines.methods.cube.recording import REFERENCE_IMU, CubeConfig, 
 from alidade.pipelines.methods.cube.static_poses import StaticPoses
 from alidade.pipelines.settings import Config
 
-# Messages that scatter by more than this many times their stated variance are those of a reference that moved.
+# Messages that scatter by more than this many times their variance are those of a reference that moved.
 _MOVES = 2.0
+# rad^2; no message is better.
+_LEAST_VARIANCE = 1e-12
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -60,11 +62,9 @@ def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Ar
     BRC = np.array(config.section(CubeConfig).camera_rotation)
     wxyz = data.reference_wxyz
     whole, scatter = _mean(wxyz)
-    n = len(wxyz)
-    stated = data.reference_cov
-    moves = n > 1 and stated is not None and float(_squares(scatter, stated)) > _MOVES
-    if not moves:
-        about_n = stated.mean(axis=0) / n if stated is not None else np.cov(scatter.T) / n + 1e-12 * np.eye(3)
+    noise = data.reference_cov if data.reference_cov is not None else _noise(scatter)
+    if _squares(scatter, noise) <= _MOVES:
+        about_n = noise.mean(axis=0) / len(wxyz)
         return Reference(np.tile(whole, (len(poses), 1)), _on_the_right(whole, about_n, len(poses)), False, BRC)
     means, covariances = [], []
     for start, stop in poses.span:
@@ -76,9 +76,19 @@ def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Ar
             )
         mean, _ = _mean(wxyz[rows])
         means.append(mean)
-        assert stated is not None
-        covariances.append(_on_the_right(mean, stated[rows].mean(axis=0) / rows.sum(), 1)[0])
+        covariances.append(_on_the_right(mean, noise[rows].mean(axis=0) / rows.sum(), 1)[0])
     return Reference(np.array(means), np.array(covariances), True, BRC)
+
+
+def _noise(errors: Array) -> Array:
+    """Covariance (N, 3, 3) of attitude errors (N, 3) whose noise nobody states, by their successive differences.
+
+    Those of a motion are small: von Neumann, "Distribution of the ratio of the mean square successive difference to the
+    variance", Ann. Math. Stat. 1941.
+    """
+    steps = np.diff(errors, axis=0)
+    covariance = steps.T @ steps / (2.0 * max(len(steps), 1)) + _LEAST_VARIANCE * np.eye(3)
+    return np.tile(covariance, (len(errors), 1, 1))
 
 
 def _mean(wxyz: Array) -> tuple[Array, Array]:

@@ -256,9 +256,12 @@ def test_poses_near_iron_are_left_out() -> None:
     assert max(_sigmas_off(estimate, truth, "mag").values()) < 4.0
 
 
-def test_a_reference_that_moves_has_an_attitude_at_each_pose() -> None:
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_a_reference_that_moves_has_an_attitude_at_each_pose(is_stated: bool) -> None:
     """A reference that turns about the camera's axis leaves the picture as it is but for a turn of its corners."""
     data, truth, config = _simulated(12, poses=12)
+    if not is_stated:
+        data = replace(data, reference_cov=None)
     moved = _turned_with_camera(data)
     standing, moving = ({k for step in problem(d, config).steps(1) for k in step.initial.keys()} for d in (data, moved))
     assert len(moving) == len(standing) + 11
