@@ -23,8 +23,8 @@ class TagAttitudeFactor(Model):
     seen at (Px, Py) / Pz. All tags seen in one pose share nRb and p, so they settle the attitude together. Blocks: nRb
     (rotations), p (3; origin of b in C, m), nRB (rotations), said (3, rad about East, North and Up: correction of what
     the reference says as nRB), correction of BRC (rotations, on the right), correction D of bRt (rotations, on the
-    right), where places are not known exactly correction of the tag's position (3, m, in b), and of a camera whose
-    intrinsics may be off by how much (3: share of the focal length, centre in px).
+    right), correction of the tag's position (3, m, in b), and of a camera whose intrinsics may be off by how much (3:
+    share of the focal length, centre in px).
 
     Attributes:
         time: (n,) s; a measurement is one tag seen in one pose.
@@ -34,7 +34,6 @@ class TagAttitudeFactor(Model):
         bRt: (n, 4) attitude of the tag in b as the layout has it.
         position: (n, 3) of the tag in b, m.
         BRC: (4,) camera mount as given.
-        placed: whether positions have corrections.
         by_lens: (n, 4, 2, 3) derivatives of `measured` by the intrinsics, which enter linearly: half a per cent of
             focal length is off by 3e-5 of that; None: the intrinsics are exact.
     """
@@ -46,7 +45,6 @@ class TagAttitudeFactor(Model):
     bRt: Array
     position: Array
     BRC: Array
-    placed: bool = False
     by_lens: Array | None = None
     shapes: ClassVar = {"measured": (4, 2), "sqrt_information": (4, 2, 2), "corners": (4, 3)}
     rows: int = 8
@@ -56,12 +54,11 @@ class TagAttitudeFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Body, its place, reference, what it says, mount, tag; with `placed` its position, with `by_lens` these."""
-        more = (3,) * (int(self.placed) + int(self.by_lens is not None))
-        return (ROT3, 3, ROT3, 3, ROT3, ROT3, *more)
+        """Body, its place, reference, what it says, mount, tag, its position; with `by_lens` these."""
+        return (ROT3, 3, ROT3, 3, ROT3, ROT3, 3, *([] if self.by_lens is None else [3]))
 
     def __call__(
-        self, nRb: Array, p: Array, nRB: Array, said: Array, mount: Array, tag: Array, *more: Array
+        self, nRb: Array, p: Array, nRB: Array, said: Array, mount: Array, tag: Array, moved: Array, *lens: Array
     ) -> Residuals:
         """Residual sqrt_information (predicted - measured), (n, 8)."""
         n = len(self.time)
@@ -69,8 +66,7 @@ class TagAttitudeFactor(Model):
         nRC = so3.compose(so3.exp(said), nRB, BRC)
         cRb = so3.multiply(so3.inverse(nRC), nRb)
         bRt = so3.multiply(self.bRt, tag)
-        position = self.position + more[0] if self.placed else self.position
-        in_body = position[:, None] + so3.rotate(bRt[:, None], self.corners)
+        in_body = (self.position + moved)[:, None] + so3.rotate(bRt[:, None], self.corners)
         turned = so3.rotate(cRb[:, None], in_body)
         P = turned + p[:, None]
         # A corner behind the camera cannot be seen: a residual that no step may leave there.
@@ -78,7 +74,7 @@ class TagAttitudeFactor(Model):
         seen = np.where(P[..., 2:] > 0.0, P[..., :2] / depth, 1e3)
         measured = self.measured
         if self.by_lens is not None:
-            measured = measured + np.einsum("nkij,nj->nki", self.by_lens, more[-1])
+            measured = measured + np.einsum("nkij,nj->nki", self.by_lens, *lens)
         error = np.einsum("nkij,nkj->nki", self.sqrt_information, seen - measured)
 
         def jacobians() -> tuple[Array, ...]:
@@ -95,7 +91,7 @@ class TagAttitudeFactor(Model):
                 camera @ (so3.matrix(so3.inverse(nRC)) @ so3.right_jacobian(-said))[:, None],
                 camera,
                 -body @ so3.matrix(bRt)[:, None] @ so3.hat(self.corners),
-                *([body] if self.placed else []),
+                body,
                 *([] if self.by_lens is None else [-self.sqrt_information @ self.by_lens]),
             )
             return tuple(block.reshape(n, 8, -1) for block in blocks)

@@ -208,6 +208,12 @@ class TargetSheet(Sheet):
     rate: SigmaOrZero | None = None  # rad/s: turn of the direction to it
 
 
+class TagsSheet(Sheet):
+    """Of tags on a body, as a drawing says where they are."""
+
+    position: SigmaOrZero | None = None  # m, each way, against the tag with the lowest id
+
+
 class Sensors(Section):
     """Data sheets of the sensors; what they do not say is as in sensors of the usual grade."""
 
@@ -222,6 +228,7 @@ class Sensors(Section):
     field: FieldSheet = FieldSheet()
     gimbal: GimbalSheet = GimbalSheet()
     target: TargetSheet = TargetSheet()
+    tags: TagsSheet = TagsSheet()
 
 
 def _ideal(kind: type[Sensors], value: object) -> object:

@@ -48,6 +48,7 @@ from alidade.pipelines.methods.cube.parameters import (
     cube_parameters,
     first_priors,
     tag_key,
+    tag_place_key,
 )
 from alidade.pipelines.methods.cube.recording import (
     DENSITIES,
@@ -60,7 +61,7 @@ from alidade.pipelines.methods.cube.recording import (
 )
 from alidade.pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
 from alidade.pipelines.methods.cube.static_poses import SeenTags, StaticPoses, static_poses, turn
-from alidade.pipelines.methods.cube.tags import layout_prior, tag_place_key
+from alidade.pipelines.methods.cube.tags import layout_prior
 from alidade.pipelines.methods.cube.wandering import GaussMarkovDeviation, deviation_key, sum_key
 from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
 from alidade.pipelines.recording.plausibility import dead_band
@@ -420,7 +421,6 @@ def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
         bRt=body.bRt[rows],
         position=body.position[rows],
         BRC=model.reference.BRC,
-        placed=bool(model.parameters.places),
         by_lens=None if model.parameters.lens is None else _by_lens(camera, seen.corners),
     )
     reference = reference_key(k if model.reference.moves else 0)
@@ -431,7 +431,7 @@ def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
         SAID_KEY,
         MOUNT_KEY,
         [tag_key(int(i)) for i in seen.ids],
-        *([[tag_place_key(int(i)) for i in seen.ids]] if tags.placed else []),
+        [tag_place_key(int(i)) for i in seen.ids],
         *([] if model.parameters.lens is None else [LENS_KEY]),
         loss=model.loss,
     )

@@ -27,7 +27,7 @@ from alidade.pipelines.estimation.parameters import (
 from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
-from alidade.pipelines.methods.cube.tags import CAMERA_NUMBERS, tag_place_names, tag_places
+from alidade.pipelines.methods.cube.tags import CAMERA_NUMBERS
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE, GYRO_SLOPE
 from alidade.pipelines.methods.triads import TRIADS, triad_names, triad_specs
@@ -61,6 +61,15 @@ TAG = ParameterSpec(
     axes=("*_x", "*_y", "*_z"),
     require=1e-2,
 )
+# A print on paper, glued by hand along a line.
+PLACE = ParameterSpec(
+    "tag_{}",
+    "m",
+    2e-4,
+    "Tag {first} position along {last}, correction of the config.",
+    "tags.position",
+    axes=("*_px", "*_py", "*_pz"),
+)
 HEADING = scalar("reference_heading", "rad", 1e-2, "Heading error of the reference.", require=1e-2, per_recording=True)
 
 # The grades of consumer MEMS sensors and of a dual-antenna reference, one sigma.
@@ -85,7 +94,7 @@ CENTRE = ParameterSpec(
     "camera_centre", "px", 3.0, "Correction of the image centre along {axis}.", "camera.centre", axes="xy"
 )
 NUISANCE = (SENSITIVITY, SQUARE, CUBE, TILT, FOCAL, CENTRE, *TEMPERATURE.values())
-PARAMETERS = (*chain.from_iterable(TRIAD_SPECS.values()), MOUNT, TAG, HEADING, *NUISANCE, FIELD)
+PARAMETERS = (*chain.from_iterable(TRIAD_SPECS.values()), MOUNT, TAG, HEADING, *NUISANCE, PLACE, FIELD)
 
 # Without a camera these are zero by definition of the body frame.
 _FRAME = ("accel_k21", "accel_k31", "accel_k32")
@@ -96,6 +105,16 @@ def tag_key(tag: int) -> int:
     return int(gtsam.symbol("T", tag))
 
 
+def tag_place_key(tag: int) -> int:
+    """Variable of the correction of a tag's position on the cube, (3,) m."""
+    return int(gtsam.symbol("L", tag))
+
+
+def of_tag(spec: ParameterSpec, tag: int) -> ParameterSpec:
+    """A spec of tags for one of them."""
+    return replace(spec, axes=tuple(axis.replace("*", str(tag)) for axis in spec.axes))
+
+
 @dataclass(frozen=True)
 class Parameters:
     """The calibration variables of a recording.
@@ -104,7 +123,7 @@ class Parameters:
         triads: name -> parameter, reported for the raw numbers as recorded.
         priors: name -> (12,) sigmas of rows of K and of b in nominal units; 0 fixed, inf free.
         rotations: mount and tags, corrections about the identity; none without a camera.
-        places: corrections of the tags' positions; none where these are exact.
+        places: corrections of the tags' positions; none without a camera.
         said: correction of what the reference says, tilt about East and North and heading; None without a camera.
         field: the earth's field in n about the model, None without a magnetometer.
         field_model: (3,) T.
@@ -204,8 +223,9 @@ def cube_parameters(
             "leave it out, or write priors: {gyro_k11: ...} and sensors: {gyro: {g_sensitivity: ...}} instead"
         )
     tags = sorted(config.section(CubeConfig).tags)
-    known = [f"tag_{tag}_{axis}" for tag in tags for axis in "xyz"]
-    check_parameters(PARAMETERS, config, [*known, *tag_place_names(config)])
+    check_parameters(
+        PARAMETERS, config, [name for tag in tags for spec in (TAG, PLACE) for name in of_tag(spec, tag).names]
+    )
 
     def nuisance(spec: ParameterSpec, fixed: bool = False) -> tuple[Quantity, ...]:
         return tuple(replace(q, nuisance=True) for q in quantities(spec, config, fixed))
@@ -224,8 +244,8 @@ def cube_parameters(
     if camera:
         rotations.append(Parameter(MOUNT_KEY, nuisance(MOUNT, not reference), rotation_vector_coordinates))
         for tag in tags:
-            own = replace(TAG, axes=tuple(axis.replace("*", str(tag)) for axis in TAG.axes))
-            rotations.append(Parameter(tag_key(tag), nuisance(own, tag == tags[0]), rotation_vector_coordinates))
+            own = nuisance(of_tag(TAG, tag), tag == tags[0])
+            rotations.append(Parameter(tag_key(tag), own, rotation_vector_coordinates))
         tilt = [q if reference else replace(q, prior_sigma=0.0) for q in quantities(TILT, config)]
         said = Parameter(SAID_KEY, (*tilt, *nuisance(HEADING, not reference)))
     field_parameter = None
@@ -237,7 +257,7 @@ def cube_parameters(
         triads=triads,
         priors=priors,
         rotations=tuple(rotations),
-        places=tag_places(config) if camera else (),
+        places=tuple(_place(tag, tag == tags[0], config) for tag in tags) if camera else (),
         said=said,
         field=field_parameter,
         field_model=field,
@@ -246,6 +266,11 @@ def cube_parameters(
         lens=_lens(config) if camera else None,
         slopes=_slopes(config) if thermometer else {},
     )
+
+
+def _place(tag: int, fixed: bool, config: Config) -> Parameter:
+    """Correction of a tag's position; that of the tag which defines the body is fixed."""
+    return Parameter(tag_place_key(tag), quantities(of_tag(PLACE, tag), config, fixed))
 
 
 def is_stated(assumption: ParameterSpec, config: Config) -> bool:

@@ -26,11 +26,13 @@ from alidade.pipelines.methods.cube.parameters import (
     CUBE,
     FOCAL,
     NUISANCE,
+    PLACE,
     SENSITIVITY,
     SQUARE,
     TEMPERATURE,
     TILT,
     is_stated,
+    of_tag,
 )
 from alidade.pipelines.methods.cube.recording import CubeData, Sightings
 from alidade.pipelines.methods.cube.scenario import (
@@ -88,7 +90,8 @@ class _World:
         self.scenario = scenario
         # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
         self.rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-        self.effects = true_values(NUISANCE, scenario, rng_of_sensors)
+        places = [of_tag(PLACE, tag) for tag in FACES if tag != min(FACES)]
+        self.effects = true_values([*NUISANCE, *places], scenario, rng_of_sensors)
         config = Config(sensors=scenario.sensors or Sensors())
         for assumption in (FOCAL, CENTRE):
             if not is_stated(assumption, config):
@@ -115,6 +118,8 @@ class _World:
         self.nRC = so3.compose(self.nRB, FORWARD, so3.exp(self.mount))
         # The lowest id defines the body frame.
         self.tags = {i: scenario.errors.tag_mount * self.rng.standard_normal(3) * (i != min(FACES)) for i in FACES}
+        zero = dict.fromkeys(of_tag(PLACE, min(FACES)).names, 0.0)
+        self.moved = {i: np.array([(zero | self.effects)[name] for name in of_tag(PLACE, i).names]) for i in FACES}
         self.K = {
             name: np.eye(3) + scenario.errors.gain * self.rng.standard_normal((3, 3))
             for name in ("accel", "gyro", "mag")
@@ -228,7 +233,8 @@ class _World:
         wxyz, normal = FACES[tag]
         cRb = so3.multiply(so3.inverse(self.nRC), self.motion.attitude(t))
         cRt = so3.compose(cRb, wxyz, so3.exp(self.tags[tag]))
-        centre = self.motion.position(t) + so3.rotate(cRb, 0.5 * self.scenario.cube.edge * np.array(normal))
+        in_body = 0.5 * self.scenario.cube.edge * np.array(normal) + self.moved[tag]
+        centre = self.motion.position(t) + so3.rotate(cRb, in_body)
         facing = -(so3.rotate(cRt, [0.0, 0.0, 1.0]) * centre).sum(axis=1) / np.linalg.norm(centre, axis=1)
         return cRt, centre, facing
 
@@ -295,6 +301,7 @@ class _World:
                 truth["reference_heading"] = self.heading
                 truth |= {name: self.effects[name] for name in TILT.names}
             truth |= by_axis(**vectors)
+            truth |= {f"tag_{i}_p{axis}": float(x) for i in FACES for axis, x in zip("xyz", self.moved[i], strict=True)}
         return truth
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.cube.recording import TAG_DETECTIONS, CubeConfig, CubeData, RefinedCamera, Sightings
 from alidade.pipelines.methods.cube.static_poses import static_intervals
@@ -156,32 +155,6 @@ def _sightings(
 _NUMBERS = ("x", "y", "z", "px", "py", "pz")
 # Of a camera, likewise.
 CAMERA_NUMBERS = ("camera_focal", "camera_centre_x", "camera_centre_y")
-# The yardstick of a tag's position, m.
-_PRIOR = 1e-3
-
-
-def tag_place_key(tag: int) -> int:
-    """Variable of the correction of a tag's position on the cube, (3,) m."""
-    return int(gtsam.symbol("L", tag))
-
-
-def tag_place_names(config: Config) -> list[str]:
-    """Names of the numbers of `tag_places`."""
-    return [quantity.name for parameter in tag_places(config) for quantity in parameter.quantities]
-
-
-def tag_places(config: Config) -> tuple[Parameter, ...]:
-    """Corrections of all tags' positions, if there is a covariance of the layout; exact where that is silent."""
-    cube = config.section(CubeConfig)
-    if cube.covariance is None:
-        return ()
-
-    def quantity(tag: int, axis: str) -> Quantity:
-        name = f"tag_{tag}_p{axis}"
-        sigma = config.prior(name, _PRIOR if tag in _known_tags(cube) else 0.0)
-        return Quantity(name, "m", sigma, _PRIOR, np.inf, nuisance=True)
-
-    return tuple(Parameter(tag_place_key(tag), tuple(quantity(tag, a) for a in "xyz")) for tag in sorted(cube.tags))
 
 
 def layout_prior(config: Config) -> GaussianPrior | None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate
@@ -17,7 +18,8 @@ from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, LayoutCovariance
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
-from alidade.pipelines.settings import Config
+from alidade.pipelines.settings import Config, Sensors, TagsSheet
+from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 
@@ -81,6 +83,38 @@ def test_tags_are_found_within_their_joint_sigmas() -> None:
         # The recording adds to what the layout knew.
         assert np.trace(covariance) < 0.9 * np.trace(_covariance())
     assert 0.6 < np.mean(squares) < 1.5
+
+
+@pytest.mark.parametrize("size", [1e-4, 1e-3])
+def test_tags_beside_where_the_drawing_has_them(size: float) -> None:
+    """A tenth of a millimetre is within what a print is glued to; of a millimetre the tag is named. K is right in both.
+
+    With exact positions K is 12 sigmas off at a tenth of a millimetre.
+    """
+    off = {"tag_18_px": size, "tag_19_py": -size, "tag_21_pz": 0.7 * size}
+    scenario = _scenario(16, 3e-3).model_copy(update={"effects": off})
+    cube = method("cube")
+    found = Session.of(cube, Simulated(*simulate_cube(scenario, 2), cube_config(scenario))).calibrate(report=False)
+    truth = simulate_cube(scenario, 2)[1]
+    errors = {n: (p.value - truth[n]) / p.sigma for n, p in found.parameters.items() if n in truth and p.sigma > 0.0}
+    assert max(map(abs, errors.values())) < 4.0
+    assert found.parameters["tag_18_px"].sigma < 1e-4
+    assert found.status == ("inconsistent" if size > 5e-4 else "calibrated")
+    if size > 5e-4:
+        assert "contradicts its data sheet" in found.headline
+        assert any(tag in found.headline for tag in off)
+
+
+def test_positions_are_exact_where_the_data_sheet_says_so() -> None:
+    data, config, _ = _session(0)
+    exact = config.model_copy(
+        update={
+            "cube": config.section(CubeConfig).model_copy(update={"covariance": None}),
+            "sensors": Sensors(tags=TagsSheet(position=0.0)),
+        }
+    )
+    sigmas = {q.name: q.prior_sigma for q in problem(data, exact).quantities}
+    assert {sigmas[f"tag_{tag}_p{axis}"] for tag in TAGS for axis in "xyz"} == {0.0}
 
 
 def test_a_prior_given_by_hand_goes_before_the_layouts() -> None:
