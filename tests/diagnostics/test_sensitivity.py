@@ -73,7 +73,7 @@ def moves(of: Session, name: str) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize(
     ("name", "exact"),
-    [("indexer", "latitude_deg"), ("cube", "latitude_deg"), ("cube", "tag_size"), ("cube", "focal_length")],
+    [("indexer", "latitude_deg"), ("cube", "latitude_deg"), ("cube", "tag_size")],
 )
 def test_an_input_that_is_off_moves_what_is_foretold(name: str, exact: str) -> None:
     foretold, found = moves(session(name), exact)
@@ -116,7 +116,7 @@ def test_the_result_has_changes_by_unit() -> None:
     made = calibration("cube")
     sensitivity = result(made).sensitivity
     assert sensitivity is not None
-    assert set(sensitivity) == {"latitude_deg", "tag_size", "focal_length"}
+    assert set(sensitivity) == {"latitude_deg", "tag_size"}
     latitude = sensitivity["latitude_deg"]
     assert (latitude.unit, latitude.step) == ("deg", 0.1)
     assert "gyro_g_xx" not in latitude.parameters
@@ -188,6 +188,6 @@ def test_the_report_tells_both() -> None:
     page = Page(report_html(calibration("cube")))
     assert "Sensitivity to fixed inputs" in page.text
     assert re.search(r"latitude_deg 0.1 deg mag_k\d\d \+\d.\d σ \(0.0", page.text)
-    assert re.search(r"tag_size 0.2 % [a-z]+_k\d\d [^<]* more by less focal_length 0.5 %", page.text)
+    assert re.search(r"tag_size 0.2 % [a-z]+_k\d\d [^<]* more by less", page.text)
     assert "Most influential measurements 20 rows" in page.text
     assert "Sensitivity to fixed inputs" not in Page(report_html(calibration("head"))).text

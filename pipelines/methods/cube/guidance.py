@@ -19,7 +19,6 @@ from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.cube.faces import SIDES, Resting, Side
-from alidade.pipelines.methods.cube.parameters import FOCAL, is_stated
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData
 from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.cube.simulation import attitudes
@@ -138,15 +137,6 @@ def _tag_size(data: CubeData, config: Config, change: float) -> tuple[CubeData, 
     return None if data.camera is None or changed is None else _as_found(data, config, *changed)
 
 
-def _focal_length(data: CubeData, config: Config, change: float) -> tuple[CubeData, Config] | None:
-    # Where it is free, its parameter has the error.
-    if data.camera is None or is_stated(FOCAL, config):
-        return None
-    K = data.camera.K * np.array([1.0 + change, 1.0 + change, 1.0])[:, None]
-    K[:2, 2] = data.camera.centre
-    return _as_found(data, config, replace(data, camera=replace(data.camera, K=K)), config)
-
-
 def _as_found(data: CubeData, config: Config, changed: CubeData, other: Config) -> tuple[CubeData, Config]:
     """Changed data and config with the static poses found in the unchanged data.
 
@@ -165,7 +155,6 @@ FAULTS = FaultModel(
     exact=(
         ExactInput("latitude_deg", "deg", 0.1, _latitude),
         ExactInput("tag_size", "1", 2e-3, _tag_size),
-        ExactInput("focal_length", "1", 5e-3, _focal_length),
     ),
     cut=False,
 )

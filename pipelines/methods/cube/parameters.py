@@ -27,7 +27,6 @@ from alidade.pipelines.estimation.parameters import (
 from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
-from alidade.pipelines.methods.cube.tags import CAMERA_NUMBERS
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE, GYRO_SLOPE
 from alidade.pipelines.methods.triads import TRIADS, triad_names, triad_specs
@@ -88,7 +87,7 @@ TILT = ParameterSpec(
     axes="en",
     per_recording=True,
 )
-# Errors of CameraInfo; fixed unless the config states a prior.
+# Errors of CameraInfo.
 FOCAL = scalar("camera_focal", "", 5e-3, "Relative correction of the focal length.", "camera.focal")
 CENTRE = ParameterSpec(
     "camera_centre", "px", 3.0, "Correction of the image centre along {axis}.", "camera.centre", axes="xy"
@@ -263,7 +262,7 @@ def cube_parameters(
         field_model=field,
         sensitivity=parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
         curvature=parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
-        lens=_lens(config) if camera else None,
+        lens=parameter(LENS_KEY, (FOCAL, CENTRE), config) if camera else None,
         slopes=_slopes(config) if thermometer else {},
     )
 
@@ -273,29 +272,10 @@ def _place(tag: int, fixed: bool, config: Config) -> Parameter:
     return Parameter(tag_place_key(tag), quantities(of_tag(PLACE, tag), config, fixed))
 
 
-def is_stated(assumption: ParameterSpec, config: Config) -> bool:
-    """Whether the config says anything of it."""
-    layout = config.section(CubeConfig).covariance
-    if layout is not None and layout.camera and set(CAMERA_NUMBERS) >= set(assumption.names):
-        return True
-    sheet = getattr(config.sensors, assumption.sheet)
-    return assumption.figure in sheet.model_fields_set or any(name in config.priors for name in assumption.names)
-
-
 def _slopes(config: Config) -> dict[str, Parameter]:
     """Slopes over temperature that are not all fixed, by sensor."""
     found = {name: parameter(SLOPE_KEYS[name], (each,), config) for name, each in TEMPERATURE.items()}
     return {name: parameter for name, parameter in found.items() if parameter is not None}
-
-
-def _lens(config: Config) -> Parameter | None:
-    """Focal length and centre, those of which nothing is stated fixed; None where that is both."""
-    free = [
-        q if is_stated(each, config) else replace(q, prior_sigma=0.0)
-        for each in (FOCAL, CENTRE)
-        for q in quantities(each, config)
-    ]
-    return Parameter(LENS_KEY, tuple(free)) if any(q.prior_sigma for q in free) else None
 
 
 def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConversion | None) -> Parameter:

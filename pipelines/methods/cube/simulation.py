@@ -31,7 +31,6 @@ from alidade.pipelines.methods.cube.parameters import (
     SQUARE,
     TEMPERATURE,
     TILT,
-    is_stated,
     of_tag,
 )
 from alidade.pipelines.methods.cube.recording import CubeData, Sightings
@@ -45,7 +44,7 @@ from alidade.pipelines.methods.cube.scenario import (
     cube_config,
 )
 from alidade.pipelines.methods.place import FIELD
-from alidade.pipelines.settings import Config, Sensors
+from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from alidade.pipelines.simulation.sensors import by_axis, drift, measured, true_values
@@ -92,10 +91,6 @@ class _World:
         self.rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
         places = [of_tag(PLACE, tag) for tag in FACES if tag != min(FACES)]
         self.effects = true_values([*NUISANCE, *places], scenario, rng_of_sensors)
-        config = Config(sensors=scenario.sensors or Sensors())
-        for assumption in (FOCAL, CENTRE):
-            if not is_stated(assumption, config):
-                self.effects |= {name: scenario.effects.get(name, 0.0) for name in assumption.names}
         self.place_rad = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
         latitude, longitude = self.place_rad
         self.field, self.heading = self._surroundings(magnetic_field(latitude, longitude, scenario.place.height, YEAR))

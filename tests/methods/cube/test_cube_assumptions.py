@@ -82,27 +82,14 @@ def test_effects_are_found_or_made_room_for() -> None:
 
 
 def test_a_camera_whose_focal_length_and_centre_are_off() -> None:
-    """0.6 % and 3 px: stated to be off, they are found, and what is calibrated is right; else they pass for noise."""
+    """0.6 % and 3 px, a sigma each of what CameraInfo is usually off by: found, and what is calibrated is right."""
     off = {"camera_focal": 6e-3, "camera_centre_x": 3.0, "camera_centre_y": -2.0}
     scenario = CubeScenario(poses=14, static_s=2.0, effects=off, camera=CubeCamera(rate_hz=8.0))
     data, truth = simulate_cube(scenario, 2)
-    taken_for_exact = solve_batch(problem(data, load_config(cube_config(scenario).encode())))
-    assert not set(off) & set(taken_for_exact.names)
-    stated = cube_config(scenario) + "sensors: {camera: {focal: 5.0e-3, centre: 3.0}}\n"
-    estimate = solve_batch(problem(data, load_config(stated.encode())))
+    estimate = solve_batch(problem(data, load_config(cube_config(scenario).encode())))
     assert max(_off(estimate, truth).values()) < 4.0
     found = dict(zip(estimate.names, zip(estimate.values, estimate.sigmas, strict=True), strict=True))
-    assert found["camera_focal"][1] < 1.5e-3
-    corners = {each.noise.name: each.scale for each in taken_for_exact.levels}["corner_px"]
-    assert corners > 1.2 * {each.noise.name: each.scale for each in estimate.levels}["corner_px"]
-
-
-def test_only_what_is_stated_of_a_lens_is_free() -> None:
-    scenario = CubeScenario(poses=4, static_s=2.0, camera=CubeCamera(rate_hz=4.0), priors={"camera_centre_x": 2.0})
-    data, _ = simulate_cube(scenario, 2)
-    config = load_config(cube_config(scenario).encode())
-    priors = {q.name: q.prior_sigma for q in problem(data, config).quantities}
-    assert (priors["camera_focal"], priors["camera_centre_x"], priors["camera_centre_y"]) == (0.0, 2.0, 3.0)
+    assert found["camera_focal"][1] < 2.5e-3
 
 
 def test_ideal_sensors_leave_mounts_tags_heading_and_field_alone_and_go_wrong() -> None:
