@@ -5,6 +5,7 @@ Frames: b cube's body, B reference, C camera, n level. Methods page, section 4.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -33,7 +34,7 @@ from alidade.pipelines.methods.cube.recording import (
     nominal,
     recorded,
 )
-from alidade.pipelines.methods.cube.static_poses import StaticPoses, static_poses, turn
+from alidade.pipelines.methods.cube.static_poses import StaticPoses, static_poses
 from alidade.pipelines.methods.cube.uses import uses
 from alidade.pipelines.methods.formula import Formula, apply, matrix_text, temperature_text, vector_text
 from alidade.pipelines.methods.place import FIELD
@@ -203,8 +204,7 @@ def _disturbed(
     if residuals is None or attitudes is None or poses.mag is None or "mag_k11" not in values:
         return []
     middle = poses.span.mean(axis=1)
-    field = np.array([values[name] for name in FIELD.names]) if FIELD.names[0] in values else local_field(data, config)
-    rows = []
+    field, rows = _field(data, config, values), []
     for time in residuals.time[~residuals.used]:
         k = int(np.argmin(np.abs(middle - time)))
         nRb = attitudes.wxyz[int(np.argmin(np.abs(attitudes.time - time)))]
@@ -326,34 +326,32 @@ def _errors(
             compensated = calibrated(name, raw, config, values, celsius=celsius)
             found.append((name, middle[k][good], raw - expected, compensated - expected))
     if "gyro_k11" in values and len(k) > 1:
-        found.insert(1, ("gyro", *_turns(data, config, poses.span[k], attitudes.wxyz, values)))
+        between = np.stack([poses.span[k[:-1], 1], poses.span[k[1:], 0]], axis=1)
+        earth = so3.exp(np.diff(between) * earth_rate(data.latitude))
+        expected = so3.compose(bRn[:-1], earth, attitudes.wxyz[1:])
+        found.insert(1, ("gyro", between[:, 1], *_turn_errors(data, config, values, between, expected)))
     return found
 
 
 def _field(data: CubeData, config: Config, values: Mapping[str, float]) -> Array:
-    names = ("field_e", "field_n", "field_u")
-    return np.array([values[n] for n in names]) if names[0] in values else local_field(data, config)
+    names = FIELD.names
+    return np.array([values[name] for name in names]) if names[0] in values else local_field(data, config)
 
 
-def _turns(
-    data: CubeData, config: Config, span: Array, nRb: Array, values: Mapping[str, float]
-) -> tuple[Array, Array, Array]:
-    """Ends of the turns, and errors (n, 3), rad, of the gyro's rotation over each, before and after calibration."""
-    assert data.latitude is not None
+def _turn_errors(
+    data: CubeData, config: Config, values: Mapping[str, float], span: Array, expected: Array
+) -> tuple[Array, Array]:
+    """Errors (n, 3), rad, of the gyro's rotations between consecutive rests, before and after calibration.
+
+    Args:
+        data, config, values: as of `calibrated_rates`.
+        span: (n, 2) s, end of the rest before and beginning of the one after.
+        expected: (n, 4) rotations.
+    """
     rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro), calibrated_rates(data, config, values)
-    time: list[float] = []
-    before: list[Array] = []
-    after: list[Array] = []
-    for i in range(1, len(span)):
-        samples = turn(data, span[i - 1, 1], span[i, 0])
-        t = data.imu_t[samples]
-        earth = so3.exp(earth_rate(data.latitude) * (t[-1] - t[0]))
-        expected = so3.compose(so3.inverse(nRb[i - 1]), earth, nRb[i])
-        for errors, rate in zip((before, after), rates, strict=True):
-            turned = GyroPath(t, rate[samples]).attitude(t[-1:])[0]
-            errors.append(so3.log(so3.multiply(so3.inverse(expected), turned)))
-        time.append(span[i, 0])
-    return np.array(time), np.array(before), np.array(after)
+    turned = (GyroPath(data.imu_t, rate).increments(*span.T).wxyz for rate in rates)
+    before, after = (so3.log(so3.multiply(so3.inverse(expected), each)) for each in turned)
+    return before, after
 
 
 def _before_and_after(name: str, time: Array, before: Array, after: Array) -> Plot:
@@ -464,22 +462,14 @@ def _turn_validation(data: CubeData, config: Config, poses: StaticPoses, values:
 
     The camera is taken to stand still; the earth's own turning, 0.1 mrad in two seconds, is not taken off.
     """
-    rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro), calibrated_rates(data, config, values)
-    time, errors = [], []
-    for k in range(1, len(poses)):
-        before, after = poses.tags[k - 1], poses.tags[k]
-        if before is None or after is None:
-            continue
-        samples = turn(data, poses.span[k - 1, 1], poses.span[k, 0])
-        seen = so3.multiply(so3.inverse(before.pose.cRb), after.pose.cRb)
-        pair = []
-        for rate in rates:
-            path = GyroPath(data.imu_t[samples], rate[samples])
-            pair.append(so3.log(so3.multiply(so3.inverse(seen), path.attitude(path.t[-1:])[0])))
-        time.append(poses.span[k, 0])
-        errors.append(pair)
-    both = np.array(errors).reshape(-1, 2, 3)
-    return Validation("turns by the gyro, against the camera", "rad", np.array(time), both[:, 0], both[:, 1])
+    pairs = [
+        (poses.span[k, 1], poses.span[k + 1, 0], so3.multiply(so3.inverse(before.pose.cRb), after.pose.cRb))
+        for k, (before, after) in enumerate(itertools.pairwise(poses.tags))
+        if before is not None and after is not None
+    ]
+    between, seen = np.array([pair[:2] for pair in pairs]).reshape(-1, 2), np.array([pair[2] for pair in pairs])
+    errors = _turn_errors(data, config, values, between, seen.reshape(-1, 4))
+    return Validation("turns by the gyro, against the camera", "rad", between[:, 1], *errors)
 
 
 def calibrated(
