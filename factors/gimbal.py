@@ -11,10 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from alidade.factors.model import Array
 
-# Motion around a picture is smoothed over this time to either side, s: long against noise, short against sway.
-SMOOTHING = 0.2
-# A central difference over this time, s, has a command's own rate to 1e-8.
-_STEP = 1e-4
+# Motion around a picture is smoothed over one of these times to either side, s: the longest that follows it. The first
+# is long against noise, the last follows swings of 10 Hz.
+WINDOWS = (0.2, 0.1, 0.05, 0.025)
+# Samples left out to choose it, and the part by which prediction errors differ by chance.
+_TRIED, _AS_GOOD = 500, 1.05
+# Of the polynomials.
+_DEGREE = 3
 # Moments whose samples are held at a time: few enough for the processor's cache.
 _TOGETHER = 500
 # Times worked on at once.
@@ -62,52 +65,93 @@ class LocalMotion:
 
     A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion
     is no larger than what noise puts into rates, and the gimbal follows the noise of the gyro that drives it. So the
-    gimbal's rate is its command at the gyro's smoothed rate, with the same noise, and what it does beyond commands.
+    gimbal moves by its commands at the gyro's smoothed rates, with the same noise, and by what it does beyond commands.
+    Both are cubics fitted over the longest time in which they predict left-out samples about as well as over any.
 
     Attributes:
-        rate, acceleration: (n, 3) of the gyro, rad/s and rad/s^2.
-        gimbal, gimbal_rate, gimbal_acceleration: (n, 2) of azimuth and elevation, rad, rad/s and rad/s^2.
+        rate: (n, 4, 3) of the gyro, coefficients by powers of the time from the stamps, rad/s^(k + 1).
+        gimbal: (n, 2) smoothed azimuth and elevation at the stamps, rad.
+        rest: (n, 3, 2) coefficients, from the first power on, of the readings less the commanded angles, rad/s^k.
+        rest_by_delay: (n, 3, 2) derivative of the rest by the encoders' delay: commands by the gyro read later, for the
+            angles that the readings were then.
+        windows: half the time over which rates and rest are smoothed, s.
         drivers: (n, d) of the gyro, see alidade.factors.gyro; None where it has none.
     """
 
     rate: Array
-    acceleration: Array
     gimbal: Array
-    gimbal_rate: Array
-    gimbal_acceleration: Array
+    rest: Array
+    rest_by_delay: Array
+    windows: tuple[float, float]
     drivers: Array | None = None
-    stacked: ClassVar = ("rate", "acceleration", "gimbal", "gimbal_rate", "gimbal_acceleration", "drivers")
+    stacked: ClassVar = ("rate", "gimbal", "rest", "rest_by_delay", "drivers")
 
     @classmethod
     def around(
-        cls, at: Array, gyro_t: Array, gyro: Array, gimbal: GimbalPath, drivers: Array | None = None
+        cls,
+        at: Array,
+        gyro_t: Array,
+        gyro: Array,
+        gimbal: GimbalPath,
+        drivers: Array | None = None,
+        windows: tuple[float, float] | None = None,
     ) -> LocalMotion:
-        """From polynomials fitted to the samples within about SMOOTHING s: of degree 2 to rates, 3 to angles."""
-        rates = _local_polynomials(at, gyro_t, gyro, 2)
-        driving = None if drivers is None else _local_polynomials(at, gyro_t, drivers, 2)[:, 0].copy()
+        """The motion around times (n,), s, of a gyro's samples (N,), (N, 3), and drivers (N, d), and of a gimbal.
+
+        Windows are chosen unless given.
+        """
         commanded = _commanded(gyro_t, gyro, gimbal)
-        on_the_way, reached = (
-            np.stack([np.interp(t, gyro_t, each) for each in commanded.T], axis=1) for t in (gimbal.t, at)
+        rest = gimbal.angles - _interpolated(gimbal.t, gyro_t, commanded[:, :2])
+        windows = windows or (_smoothing(at, gyro_t, gyro), _smoothing(at, gimbal.t, rest))
+        resting = _local_cubics(at, gimbal.t, rest, windows[1])
+        return cls(
+            _local_cubics(at, gyro_t, gyro, windows[0]),
+            _interpolated(at, gyro_t, commanded[:, :2]) + resting[:, 0],
+            resting[:, 1:].copy(),
+            _local_cubics(at, gyro_t, commanded[:, 2:], windows[1])[:, 1:].copy(),
+            windows,
+            None if drivers is None else _interpolated(at, gyro_t, drivers),
         )
-        rest = _local_polynomials(at, gimbal.t, gimbal.angles - on_the_way, 3)
-        angles, rate, acceleration = gimbal.at(at), rates[:, 0], rates[:, 1]
-        gimbal_rate = command(rate, angles) + rest[:, 1]
-        # How the command changes with the rate and with the angles.
-        ahead = command(rate + _STEP * acceleration, angles + _STEP * gimbal_rate)
-        back = command(rate - _STEP * acceleration, angles - _STEP * gimbal_rate)
-        gimbal_acceleration = (ahead - back) / (2.0 * _STEP) + 2.0 * rest[:, 2]
-        return cls(rate, acceleration, reached + rest[:, 0], gimbal_rate, gimbal_acceleration, driving)
 
     def __getitem__(self, rows: Any) -> LocalMotion:
         """The motion around some of the pictures."""
-        return LocalMotion(
-            self.rate[rows],
-            self.acceleration[rows],
-            self.gimbal[rows],
-            self.gimbal_rate[rows],
-            self.gimbal_acceleration[rows],
-            None if self.drivers is None else self.drivers[rows],
-        )
+        drivers = None if self.drivers is None else self.drivers[rows]
+        local = self.rate[rows], self.gimbal[rows], self.rest[rows], self.rest_by_delay[rows]
+        return LocalMotion(*local, self.windows, drivers)
+
+    def turned(self, begin: Array, end: Array) -> Array:
+        """Rotation vectors (n, 3), rad, of the gyro between times (n, 1) from the stamps, s."""
+        powers = np.arange(1, _DEGREE + 2)
+        return np.einsum("nk,nki->ni", (end**powers - begin**powers) / powers, self.rate)
+
+    def turning(self, at: Array) -> Array:
+        """Rates (n, 3), rad/s, of the gyro at times (n, 1) from the stamps, s."""
+        return np.einsum("nk,nki->ni", at ** np.arange(_DEGREE + 1), self.rate)
+
+    def moved(self, read: Array, late: Array, delay: Array) -> tuple[Array, Array, Array]:
+        """Angles (n, 2), rad, at times `late` (n, 1) from the stamps, and their derivatives by late and delay.
+
+        What is read at a stamp, (n, 2), the gimbal reaches `delay` (n, 1) later. From there it moves by its commands,
+        after the midpoint rule, and by what it does beyond them.
+        """
+        rest, x = self.rest - delay[..., None] * self.rest_by_delay, (late - delay)[..., None]
+        powers = np.arange(1, _DEGREE + 1)[:, None]
+        beyond, beyond_rate = (rest * x**powers).sum(axis=1), (powers * rest * x ** (powers - 1)).sum(axis=1)
+        turned, slope, x = self.turned(delay, late), self.rate[:, 1], x[..., 0]
+        start = command(turned, read) + beyond
+        middle = read + 0.5 * start
+        # Rate and angles change together within the window: x^3 / 12 of the product of both slopes.
+        reached = read + command(turned, middle) + beyond + x**2 / 12.0 * _command_change(slope, read, start)
+
+        def change(by_turned: Array, by_beyond: Array) -> Array:
+            by_start = command(by_turned, read) + by_beyond
+            by_middle = _command_change(turned, middle, 0.5 * by_start)
+            by_both = x / 12.0 * _command_change(slope, read, x * by_start + 2.0 * start)
+            return command(by_turned, middle) + by_beyond + by_middle + by_both
+
+        late_rest = (self.rest_by_delay * x[..., None] ** powers).sum(axis=1)
+        by_delay = -change(self.turning(delay), beyond_rate + late_rest)
+        return reached, change(self.turning(late), beyond_rate), by_delay
 
 
 def command(rate: Array, angles: Array) -> Array:
@@ -120,28 +164,65 @@ def command(rate: Array, angles: Array) -> Array:
     return np.stack([np.tan(angles[:, 1]) * (c * wy - s * wx) - wz, -c * wx - s * wy], axis=1)
 
 
+def _command_change(rate: Array, angles: Array, by: Array) -> Array:
+    """Change (n, 2) of the commands at carrier rates (n, 3) with changes `by` (n, 2) of the angles."""
+    s, c, tangent = np.sin(angles[:, 0]), np.cos(angles[:, 0]), np.tan(angles[:, 1])
+    ahead, right = c * rate[:, 1] - s * rate[:, 0], c * rate[:, 0] + s * rate[:, 1]
+    azimuth, elevation = by.T
+    return np.stack([elevation * ahead * (1.0 + tangent**2) - azimuth * tangent * right, -azimuth * ahead], axis=1)
+
+
+def _interpolated(at: Array, t: Array, values: Array) -> Array:
+    """Columns (n, d) at times, linear between samples (N, d)."""
+    return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
+
+
 def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
-    """Angles (n, 2), rad, through which the gimbal has been commanded since the first of the gyro's samples."""
-    out = np.zeros((len(t), 2))
+    """Angles through which the gimbal has been commanded since the first sample, and their derivative by a delay.
+
+    Returns:
+        (N, 4) rad and rad/s: azimuth, elevation, and by how much more each is with the gyro read so much later.
+    """
+    out = np.zeros((len(t), 4))
     for i in range(0, len(t) - 1, _BLOCK):
         some = slice(i, i + _BLOCK + 1)
-        rates = command(rate[some], gimbal.at(t[some]))
-        steps = 0.5 * np.diff(t[some])[:, None] * (rates[1:] + rates[:-1])
-        out[i + 1 : i + _BLOCK + 1] = out[i] + np.cumsum(steps, axis=0)
+        rates, angles = rate[some], gimbal.at(t[some])
+        middle, mean = 0.5 * (angles[1:] + angles[:-1]), 0.5 * (rates[1:] + rates[:-1])
+        steps = np.diff(t[some])[:, None] * command(mean, middle), command(np.diff(rates, axis=0), middle)
+        out[i + 1 : i + _BLOCK + 1] = out[i] + np.cumsum(np.hstack(steps), axis=0)
     return out
 
 
-def _local_polynomials(at: Array, t: Array, values: Array, degree: int) -> Array:
-    """Coefficients (n, degree + 1, d), lowest first, of polynomials about the times fitted to the samples."""
-    count = int(np.clip(2.0 * SMOOTHING / np.median(np.diff(t)), 2 * degree + 1, len(t)))
-    scale = SMOOTHING ** np.arange(degree + 1)
-    out = np.empty((len(at), degree + 1, values.shape[1]))
+def _smoothing(at: Array, t: Array, values: Array) -> float:
+    """Half width, s, of the windows: the longest in which samples (N, d) near the times are predicted about best.
+
+    Each sample by the others; of the squared errors the median, so that a few samples beside a slew do not count.
+    """
+    rows = np.clip(np.searchsorted(t, at[:: len(at) // _TRIED + 1]), 0, len(t) - 1)
+    errors = []
+    for half in WINDOWS:
+        # At its middle a cubic's own sample has 9/4 of a mean's weight.
+        others = 1.0 - 2.25 / _count(t, half)
+        missed = values[rows] - _local_cubics(t[rows], t, values, half)[:, 0]
+        errors.append(np.median(np.square(missed / others), axis=0).sum())
+    return next(half for half, error in zip(WINDOWS, errors, strict=True) if error <= _AS_GOOD * min(errors))
+
+
+def _count(t: Array, half: float) -> int:
+    """Samples in a window."""
+    return int(np.clip(np.round(2.0 * half / np.median(np.diff(t))), 2 * _DEGREE + 1, len(t)))
+
+
+def _local_cubics(at: Array, t: Array, values: Array, half: float) -> Array:
+    """Coefficients (n, 4, d), lowest first, of cubics about the times fitted to the samples (N, d) within `half` s."""
+    count, scale = _count(t, half), half ** np.arange(_DEGREE + 1)
+    out = np.empty((len(at), _DEGREE + 1, values.shape[1]))
     stamps, rows = sliding_window_view(t, count), sliding_window_view(values, count, axis=0)
     for some in np.array_split(np.arange(len(at)), len(at) // _TOGETHER + 1):
         first = np.clip(np.searchsorted(t, at[some]) - count // 2, 0, len(t) - count)
-        x = (stamps[first] - at[some, None]) / SMOOTHING
-        powers = np.ones((len(x), degree + 1, count))
-        for k in range(degree):  # by products, which cost a tenth of powers
+        x = (stamps[first] - at[some, None]) / half
+        powers = np.ones((len(x), _DEGREE + 1, count))
+        for k in range(_DEGREE):  # by products, which cost a tenth of powers
             powers[:, k + 1] = powers[:, k] * x
         transposed = np.swapaxes(powers, 1, 2)
         out[some] = np.linalg.solve(powers @ transposed, powers @ np.swapaxes(rows[first], 1, 2)) / scale[:, None]

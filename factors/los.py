@@ -147,7 +147,7 @@ class LosDirectionFactor(Model):
         motion, elapsed, tracked = self.context.motion, self.context.elapsed, self.context.tracked
         late = sight[:, 0] - sight[:, 1] * elapsed - self.context.stamp_shift
         turn, by_late, by_gyro = _carried(motion, late, bias, errors)
-        gimbal, gimbal_rate, by_encoder = self._gimbal(motion, sight[:, 5:9], late - sight[:, 9])
+        gimbal, by_time, by_delay, by_encoder = self._gimbal(motion, sight[:, 5:9], late[:, None], sight[:, 9:])
         rotation = np.stack([sight[:, 3], np.zeros_like(late), sight[:, 4]], axis=1) * tracked[:, None]
         carried = so3.multiply(tRm, turn)
         seen = so3.multiply(so3.exp(-rotation), carried)
@@ -156,43 +156,41 @@ class LosDirectionFactor(Model):
 
         def jacobians() -> tuple[Array, ...]:
             by_attitude, by_angles, by_gimbal = derivatives()
-            by_delay = -by_gimbal @ gimbal_rate[..., None]
-            by_time = by_attitude @ by_late - by_delay
+            by_bias, *by_errors = by_gyro()
+            by_exposure = by_attitude @ by_late + by_gimbal @ by_time[..., None]
             moving = -so3.matrix(so3.inverse(carried)) @ so3.right_jacobian(-rotation) * tracked[:, None, None]
             by_sight = [
-                by_time,
-                by_time * -elapsed[:, None, None],
+                by_exposure,
+                by_exposure * -elapsed[:, None, None],
                 -self.sqrt_information[:, :, :2] @ predicted[..., None],
                 by_attitude @ moving[:, :, ::2],
                 (by_gimbal[..., None] * by_encoder[:, None]).reshape(*by_gimbal.shape[:2], 4),
-                by_delay,
+                by_gimbal @ by_delay[..., None],
             ]
             return (
                 by_attitude @ so3.matrix(so3.inverse(turn)),
                 by_angles,
-                by_attitude @ by_gyro[0],
+                by_attitude @ by_bias,
                 np.concatenate(by_sight, axis=2),
-                *(by_attitude @ each for each in by_gyro[1:]),
+                *(by_attitude @ each for each in by_errors),
             )
 
         return residual, jacobians
 
-    def _gimbal(self, move: LocalMotion, encoder: Array, late: Array) -> tuple[Array, Array, Array]:
-        """Angles and their rates (n, 2) at times `late` (n,) after the stamps, and derivatives (n, 2, 2) by s and c.
+    def _gimbal(self, move: LocalMotion, encoder: Array, late: Array, delay: Array) -> tuple[Array, ...]:
+        """Angles (n, 2) at times `late` (n, 1), and derivatives by late, delay (n, 2), s and c (n, 2, 2).
 
         The errors (n, 4) are s and c of each encoder; angle + s sin(angle) + c cos(angle) = reading is solved by a step
         of fixed-point iteration and one of Newton's, which leaves s^4.
         """
-        late = late[:, None]
-        read = self.gimbal + (move.gimbal_rate + 0.5 * move.gimbal_acceleration * late) * late
+        read, by_late, by_delay = move.moved(self.gimbal, late, delay)
         s, c = encoder[:, ::2], encoder[:, 1::2]
         angle = read - s * np.sin(read) - c * np.cos(read)
         sine, cosine = np.sin(angle), np.cos(angle)
         angle = angle - (angle + s * sine + c * cosine - read) / (1.0 + s * cosine - c * sine)
         sine, cosine = np.sin(angle), np.cos(angle)
         gain = 1.0 / (1.0 + s * cosine - c * sine)
-        rate = gain * (move.gimbal_rate + move.gimbal_acceleration * late)
-        return angle, rate, -np.stack([gain * sine, gain * cosine], axis=2)
+        return angle, gain * by_late, gain * by_delay, -np.stack([gain * sine, gain * cosine], axis=2)
 
     def camera(self, angles: Array) -> Array:
         """cRm (n, 4) at the stamps and mounting angles (n, d), rad."""
@@ -254,18 +252,28 @@ class LosDirectionFactor(Model):
         return np.einsum("nij,nj->ni", self.sqrt_information, error), derivatives
 
 
-def _carried(motion: LocalMotion, late: Array, bias: Array, errors: Array | None) -> tuple[Array, Array, list[Array]]:
+def _carried(
+    motion: LocalMotion, late: Array, bias: Array, errors: Array | None
+) -> tuple[Array, Array, Callable[[], list[Array]]]:
     """Turns (n, 4) of the gyro from the stamps to times `late` (n,) after them, and how they turn on (on the right).
 
     Returns:
         The turns, and their derivatives by `late` (n, 3, 1) and by bias and errors.
     """
     late = late[:, None]
-    excess, by_excess = rate_error(bias, errors, motion.rate, motion.drivers)
-    rate = motion.rate + motion.acceleration * late - excess
-    arc = (motion.rate + 0.5 * motion.acceleration * late - excess) * late
+    turned, drivers = motion.turned(np.zeros_like(late), late), motion.drivers
+    excess, by_excess = rate_error(late * bias, errors, turned, None if drivers is None else late * drivers)
+    # Magnus' second term, of a rate that changes its direction.
+    swerve = late**2 / 12.0 * so3.cross(motion.rate[:, 0], motion.rate[:, 1])
+    arc = turned - excess + late * swerve
+    rate = motion.turning(late)
+    rate = rate - rate_error(bias, errors, rate, drivers)[0] + 3.0 * swerve
     to_end = so3.right_jacobian(arc)
-    by_gyro = [-late[..., None] * (to_end @ each) for each in by_excess()]
+
+    def by_gyro() -> list[Array]:
+        by_bias, *by_errors = by_excess()
+        return [-to_end @ (late[..., None] * by_bias), *(-to_end @ each for each in by_errors)]
+
     return so3.exp(arc), to_end @ rate[..., None], by_gyro
 
 

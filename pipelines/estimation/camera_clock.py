@@ -103,8 +103,9 @@ def guess_clock(
     prior: Array,
     sigma: float,
     missing: Callable[[float], Callable[[Array], Miss] | None],
-) -> Clock:
-    """The clock with which a recording's pictures are explained best.
+    repeated: float = 1.0,
+) -> tuple[Clock, Array]:
+    """The clock with which a recording's pictures are explained best, and all numbers (d,) that explain them so.
 
     It is that of the stamps unless pictures at one end of the recording were certainly taken at another time.
 
@@ -115,6 +116,7 @@ def guess_clock(
         prior: (d,) their inverse sigmas about zero.
         sigma: of what misses, where nothing is wrong.
         missing: of the recording's first so many seconds, what misses near some numbers; None: too little is there.
+        repeated: misses that show the same errors of the sensors, which are no noise.
     """
     until, covariance = first_span(1.0 / prior[-1]), np.diag(prior**-2.0)
     while True:
@@ -125,8 +127,9 @@ def guess_clock(
             break
         until *= _THEN
     clock, ends = Clock(begun, *x[-2:].tolist()), np.array([0.0, last])
-    significant = (np.abs(clock.late(ends)) > _SIGNIFICANT * _sigmas_at(ends, covariance[-2:, -2:])).any()
-    return clock if significant else Clock(begun)
+    sigmas = _sigmas_at(ends, repeated * covariance[-2:, -2:])
+    significant = (np.abs(clock.late(ends)) > _SIGNIFICANT * sigmas).any()
+    return clock if significant else Clock(begun), x
 
 
 def _sigmas_at(elapsed: Array, covariance: Array) -> Array:

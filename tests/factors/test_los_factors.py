@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from alidade.factors import so3
 from alidade.factors.gimbal import GimbalPath, LocalMotion, command
@@ -184,31 +185,70 @@ def test_gimbal_path_is_exact_for_cubics() -> None:
     np.testing.assert_allclose(path.at(at), np.stack([p(at) for p in angles], axis=1), atol=1e-9)
 
 
-def test_local_motion_is_that_of_smooth_paths() -> None:
-    rates, step = _rates(TIMES), 1e-4
-    np.testing.assert_allclose(MOTION.rate, rates, atol=1e-4)
-    np.testing.assert_allclose(MOTION.acceleration, (_rates(TIMES + step) - rates) / step, atol=3e-2)
-    np.testing.assert_allclose(MOTION.gimbal, _gimbal(TIMES), atol=5e-5)
-    ahead, back = _gimbal(TIMES + step), _gimbal(TIMES - step)
-    np.testing.assert_allclose(MOTION.gimbal_rate, (ahead - back) / (2.0 * step), atol=2e-4)
-    second = (ahead - 2.0 * _gimbal(TIMES) + back) / step**2
-    np.testing.assert_allclose(MOTION.gimbal_acceleration, second, atol=3e-2)
+def _driven(hz: float, delay: float, noise: float = 0.0) -> tuple[Array, GimbalPath, GimbalPath]:
+    """Gyro samples at STAMPS, swings at `hz`; the gimbal that they drive; its encoders, read `delay` s late."""
+    w, fine = 2.0 * np.pi * hz, np.arange(-0.1, 6.1, 0.001)
+    samples = 0.3 * np.cos(w * STAMPS[:, None] + np.array([0.0, 1.0, 2.0]))
+    samples += noise * np.random.default_rng(11).normal(size=samples.shape)
+    rate = np.stack([CubicSpline(STAMPS, column)(fine) for column in samples.T], axis=1)
+    angles = np.tile([0.3, 0.2], (len(fine), 1))
+    for k, middle in enumerate(0.5 * (rate[1:] + rate[:-1])):
+        half = angles[k] + 0.0005 * command(middle[None], angles[k : k + 1])[0]
+        angles[k + 1] = angles[k] + 0.001 * command(middle[None], half[None])[0]
+    gimbal = GimbalPath(fine, angles)
+    return samples, gimbal, GimbalPath(STAMPS, gimbal.at(STAMPS + delay))
+
+
+@pytest.mark.parametrize("hz", [0.2, 2.0, 5.0])
+@pytest.mark.parametrize("delay", [0.0, 2e-3])
+def test_motion_around_a_stamp_follows_swings_whatever_the_delay_of_the_encoders(hz: float, delay: float) -> None:
+    samples, gimbal, encoders = _driven(hz, delay)
+    late = np.where(np.arange(N) % 2 == 0, -0.015, 0.015)
+    sight = np.zeros((N, len(SIGHT_ERRORS)))
+    sight[:, 0], sight[:, -1] = late, delay
+    motion = LocalMotion.around(TIMES, STAMPS, samples, encoders)
+    model = LosDirectionFactor(
+        TIMES,
+        np.zeros((N, 2)),
+        np.tile(np.eye(2), (N, 1, 1)),
+        encoders.at(TIMES),
+        CORE,
+        LosContext(motion, TIMES, TIMES, np.zeros((N, 2)), np.zeros(N)),
+    )
+    tRm, angles, bias, _ = _blocks(CORE, 0.02, 0.01, 0.0)
+    predicted = -model(tRm, angles, 0.0 * bias, sight)[0]
+    w, phase = 2.0 * np.pi * hz, np.array([0.0, 1.0, 2.0])
+    turned = 0.3 / w * (np.sin(w * (TIMES + late)[:, None] + phase) - np.sin(w * TIMES[:, None] + phase))
+    exposed = LosDirectionFactor(TIMES, model.measured, model.sqrt_information, gimbal.at(TIMES + late), CORE)
+    expected = exposed.predict(so3.multiply(tRm, so3.exp(turned)), angles)[:, :2]
+    np.testing.assert_allclose(predicted, expected, atol=3e-3 * 0.3 * 0.015)
+
+
+def test_motion_is_smoothed_no_less_than_it_allows() -> None:
+    """Noise in the readings becomes the smaller rates, the longer they are fitted."""
+    noise, spread = 2e-5 * np.random.default_rng(3).normal(size=(len(STAMPS), 2)), {}
+    for hz in (0.2, 5.0):
+        samples, _, encoders = _driven(hz, 2e-3)
+        noisy = GimbalPath(STAMPS, encoders.angles + noise)
+        without, with_noise = (
+            LocalMotion.around(STAMPS[100:-100], STAMPS, samples, each) for each in (encoders, noisy)
+        )
+        spread[hz] = np.std(with_noise.rest[:, 0] - without.rest[:, 0])
+    assert 3.0 * spread[0.2] < spread[5.0]
+
+
+def test_noise_that_a_gimbal_follows_is_no_motion_of_the_line_of_sight() -> None:
+    (samples, gimbal, encoders), (clean, _, _) = _driven(0.2, 1e-3, noise=0.01), _driven(0.2, 1e-3)
+    motion = LocalMotion.around(TIMES, STAMPS, samples, encoders)
+    zero = np.zeros((N, 1))
+    rate, (_, moving, _) = motion.turning(zero), motion.moved(encoders.at(TIMES), zero, zero + 1e-3)
+    assert np.std(rate - LocalMotion.around(TIMES, STAMPS, clean, encoders).turning(zero)) > 5e-4
+    assert np.abs(moving - command(rate, gimbal.at(TIMES))).max() < 1e-4
+
+
+def test_drivers_around_a_stamp_are_those_of_its_time() -> None:
     assert MOTION.drivers is not None
     np.testing.assert_allclose(MOTION.drivers, np.tile(FORCE, (N, 1)))
-
-
-def test_the_noise_that_a_gimbal_follows_is_no_motion_of_the_line_of_sight() -> None:
-    """A gimbal driven by a noisy gyro: its smoothed rate is the command at the gyro's smoothed rate."""
-    gyro = 0.2 * _rates(STAMPS) + 0.01 * np.random.default_rng(11).normal(size=(len(STAMPS), 3))
-    angles = np.zeros((len(STAMPS), 2))
-    for k, rate in enumerate(0.5 * (gyro[1:] + gyro[:-1])):
-        middle = angles[k] + 0.0025 * command(rate[None], angles[k : k + 1])[0]
-        angles[k + 1] = angles[k] + 0.005 * command(rate[None], middle[None])[0]
-    gimbal = GimbalPath(STAMPS, angles)
-    motion = LocalMotion.around(TIMES, STAMPS, gyro, gimbal)
-    left = motion.gimbal_rate - command(motion.rate, gimbal.at(TIMES))
-    assert np.abs(motion.rate - 0.2 * _rates(TIMES)).max() > 2e-3
-    assert np.abs(left).max() < 1e-4
 
 
 def _los_rate(X: Array, gimbal: Array, w_b: Array) -> tuple[Array, float]:

@@ -103,7 +103,7 @@ def guess_picture_clock(
     first = elapsed <= first_span(1.0 / prior[-1])
     bias, mount = guess(gyro, begun + elapsed[first], carried(begun + elapsed[first], measured[first]), sigma)
     x = np.concatenate([np.zeros(3), bias, np.zeros(2)])
-    return guess_clock(begun, float(elapsed[-1]), x, prior, sigma, missing)
+    return guess_clock(begun, float(elapsed[-1]), x, prior, sigma, missing)[0]
 
 
 def _pairs(time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

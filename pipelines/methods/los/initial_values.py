@@ -183,19 +183,22 @@ def guess_picture_clock(
     parameters: tuple[Parameter, ...],
     guessed: tuple[Array, Array],
     sigma: float,
-) -> Clock:
-    """The clock with which LOS errors are carried on best, guessed anew together with mounting angles and bias.
+) -> tuple[Clock, tuple[Array, Array, float]]:
+    """The clock with which LOS errors are carried on best, with mounting angles, gyro bias and delay of the encoders.
+
+    Encoders that read late spoil the errors more than late pictures do, which the gimbal stabilises.
 
     Args:
         chains, time, measured, gyro, sigma: as `guess` has them.
         begun: the recording's first stamp, s.
         gimbal: at all times.
-        parameters: mounting angles and bias, and one whose first two numbers are offset and skew, with their priors.
+        parameters: mounting angles and bias, and alidade.factors.los.SIGHT_ERRORS, with their priors.
         guessed: mounting angles and bias to begin with.
     """
-    angles, bias, clock = parameters
+    angles, bias, sight = parameters
     names = tuple(q.name for q in angles.quantities)
-    prior = 1.0 / np.concatenate([_sigmas(angles), prior_sigmas(bias), prior_sigmas(clock)[:2]])
+    offset, skew, *_, delay = prior_sigmas(sight)
+    prior = 1.0 / np.concatenate([_sigmas(angles), prior_sigmas(bias), [delay, offset, skew]])
 
     def missing(until: float) -> Callable[[Array], Miss] | None:
         i, j = _pairs([chain[time[chain] - begun <= until] for chain in chains], time, _CLOCK_PAIRS)
@@ -204,7 +207,10 @@ def guess_picture_clock(
         elapsed, pictures = (time[i] - begun, time[j] - begun), (measured[i], measured[j])
         return lambda x: _miss_by_clock(x, names, elapsed, pictures, begun, gimbal, gyro)
 
-    return guess_clock(begun, time[-1] - begun, np.concatenate([*guessed, np.zeros(2)]), prior, sigma, missing)
+    x, last = np.concatenate([*guessed, np.zeros(3)]), float(time[-1]) - begun
+    overlap = max(1.0, min(len(time), _CLOCK_PAIRS) * _SPAN / last)
+    clock, x = guess_clock(begun, last, x, prior, sigma, missing, overlap)
+    return clock, (x[: len(names)], x[len(names) : -3], float(x[-3]))
 
 
 def _sigmas(angles: Parameter) -> Array:
@@ -221,7 +227,10 @@ def _miss_by_clock(
     gimbal: GimbalPath,
     gyro: GyroPath,
 ) -> Miss:
-    """Function `_miss` near x whose last two numbers are the clock's; the gyro's rotations are computed once."""
+    """Function `_miss` near x whose last three numbers are the encoders' delay and the clock's.
+
+    The gyro's rotations are computed once.
+    """
 
     def taken(x: Array) -> tuple[Array, Array]:
         clock = Clock(begun, *x[-2:])
@@ -231,7 +240,8 @@ def _miss_by_clock(
 
     def miss(x: Array) -> Array:
         before, after = taken(x)
-        return _miss(x[:-2], names, turns_at(before, after), (gimbal.at(before), gimbal.at(after)), *measured)
+        read = gimbal.at(before - x[-3]), gimbal.at(after - x[-3])
+        return _miss(x[:-3], names, turns_at(before, after), read, *measured)
 
     return miss
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.chi_square import gate
-from alidade.factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
+from alidade.factors.gimbal import WINDOWS, GimbalPath, LocalMotion
 from alidade.factors.los import LosContext, LosDirectionFactor
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
@@ -67,6 +67,7 @@ class _Model:
 
     chain: GyroChain  # tRm at the keyframes, which are the pictures used; a new chain for every target found
     mount: Array  # first guess of the mounting angles
+    delay: float  # and of the encoders' delay
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
@@ -99,7 +100,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         dropped=dropped,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
         continuation=partial(_continuation, config, model) if data.error_cov is None else None,
-        unsettled=max(_SETTLED if model.around is None else SMOOTHING, temperature.unsettled(data.temperature)),
+        unsettled=max(_SETTLED if model.around is None else WINDOWS[0], temperature.unsettled(data.temperature)),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.sight, model.clock.begun),
         keyframes=None if model.parameters.sight is None else Keyframes(model.clock, _NEAR),
@@ -136,11 +137,12 @@ def _prepare(
     trunk: Trunk | None = None,
     start: float = -np.inf,
     clock: Clock | None = None,
+    guessed: tuple[Array, Array, float] | None = None,
 ) -> tuple[_Model, dict[str, int]]:
     """The model of a recording, or of one that grows from a keyframe of its model until now on.
 
-    `clock` has moved the data's stamps already. Those of a recording that grows stay where they are, and so do its
-    keyframes.
+    `clock`, `guessed` with mounting angles, bias and delay, moved the data's stamps already. Those of a recording that
+    grows stay where they are, and so do its keyframes.
     """
     reference = temperature.reference(data.temperature) if before is None else before.reference
     drivers = {SENSITIVITY: data.force, GYRO_SLOPE: temperature.above(data.temperature, reference, data.gyro_t)}
@@ -149,20 +151,22 @@ def _prepare(
     driving = acting(parameters.gyro, drivers)
     noises = _noises(data, config) if before is None else before.noises
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
-    used, dropped = _Used.of(data, config, gimbal, SMOOTHING if parameters.sight else 0.0, start)
+    used, dropped = _Used.of(data, config, gimbal, WINDOWS[0] if parameters.sight else 0.0, start)
     chains, time, measured = used.chains, used.time, used.measured
-    if before is None:
+    if before is not None:
+        guessed = before.mount, before.chain.gyro.bias_hat, before.delay
+    if guessed is None:
         known = parameters.angles, parameters.bias
-        mount, bias_hat = guess(chains, time, used.angles, measured, gyro, known, used.sigma)
-        if parameters.sight is not None and clock is None:
+        guessed = *guess(chains, time, used.angles, measured, gyro, known, used.sigma), 0.0
+        if parameters.sight is not None:
             begun, by = float(data.image_t[0]), (*known, parameters.sight)
-            at = mount, bias_hat
-            guessed = guess_picture_clock(chains, time, begun, gimbal, measured, gyro, by, at, used.sigma)
-            moved = guessed.late(data.image_t - begun)
-            if np.abs(moved).max() > _NEAR:
-                return _prepare(replace(data, image_t=data.image_t + moved), config, clock=guessed)
-    else:
-        mount, bias_hat = before.mount, before.chain.gyro.bias_hat
+            found, guessed = guess_picture_clock(
+                chains, time, begun, gimbal, measured, gyro, by, guessed[:2], used.sigma
+            )
+            late = found.late(data.image_t - begun)
+            if np.abs(late).max() > _NEAR:
+                return _prepare(replace(data, image_t=data.image_t + late), config, clock=found, guessed=guessed)
+    mount, bias_hat, delay = guessed
     carried = initial_attitudes(chains, time, camera(used.angles, mount, parameters.names), measured, gyro)
     del gyro  # Another as large follows.
     chain = GyroChain.over(
@@ -177,14 +181,18 @@ def _prepare(
     )
     around, clock = None, clock or Clock(float(data.image_t[0]))
     if parameters.sight is not None:
-        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving)
-        errors = predicted_errors(chains, time, camera(motion.gimbal, mount, parameters.names), measured, chain.gyro)
+        windows = None if before is None or before.around is None else before.around.motion.windows
+        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving, windows)
+        zero = np.zeros((len(time), 1))
+        smooth = motion.moved(motion.gimbal, zero, zero + delay)[0]
+        errors = predicted_errors(chains, time, camera(smooth, mount, parameters.names), measured, chain.gyro)
         clock, watched = _watched(used, clock, before, start)
         elapsed = clock.elapsed(time)
         around = LosContext(motion, elapsed, watched, errors, clock.late(elapsed))
     model = _Model(
         chain=chain,
         mount=mount,
+        delay=delay,
         measured=measured,
         sqrt_information=_sqrt_information(used.covariance),
         angles=used.angles,
@@ -299,9 +307,12 @@ def _step(model: _Model, keyframes: range) -> Step:
     if chain.first + keyframes.start == 0:
         p = model.parameters
         step.initial.insert(p.angles.key, model.mount)
-        for errors, guessed in ((p.sight, (model.clock.offset, model.clock.skew)), (p.gyro, ())):
-            if errors is not None:
-                step.initial.insert(errors.key, np.append(guessed, np.zeros(len(errors.quantities) - len(guessed))))
+        if p.sight is not None:
+            sight = np.zeros(len(p.sight.quantities))
+            sight[:2], sight[-1] = (model.clock.offset, model.clock.skew), model.delay
+            step.initial.insert(p.sight.key, sight)
+        if p.gyro is not None:
+            step.initial.insert(p.gyro.key, np.zeros(len(p.gyro.quantities)))
         step.factors.extend(vector_prior(each, np.zeros(len(each.quantities))) for each in p.all)
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step, keyframes)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.gimbal import SMOOTHING, GimbalPath, command
+from alidade.factors.gimbal import WINDOWS, GimbalPath, command
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
@@ -99,7 +99,7 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     estimate = calibration.estimate
     values = calibration.problem.numbers(estimate)
     sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
-    margin = SMOOTHING if TIME_OFFSET.name in values else 0.0
+    margin = WINDOWS[0] if TIME_OFFSET.name in values else 0.0
     rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), margin)
     time, measured = data.image_t[rows], data.error[rows]
     chains = np.split(np.arange(len(rows)), np.flatnonzero(starts)[1:])

@@ -362,3 +362,29 @@ def test_a_walk_stated_too_loose_does_not_drive_the_time_offset_away() -> None:
     assert estimate.converged
     at = estimate.names.index("time_offset")
     assert abs(estimate.values[at] - truth["time_offset"]) < 3.0 * estimate.sigmas[at]
+
+
+@pytest.mark.parametrize(
+    ("seed", "amplitude_deg", "lowest_hz", "highest_hz"),
+    [
+        (4, 0.35, 2.0, 5.0),
+        *(pytest.param(seed, 0.35, 2.0, 5.0, marks=pytest.mark.slow) for seed in (1, 2, 3)),
+        *(pytest.param(seed, 4.0, 1.0, 2.4, marks=pytest.mark.slow) for seed in (1, 2, 3, 4)),
+    ],
+)
+def test_encoders_read_late_while_the_carrier_swings_fast(
+    seed: int, amplitude_deg: float, lowest_hz: float, highest_hz: float
+) -> None:
+    """Where motion around a picture was smoothed over .4 s, some parameter was 43 to 126 sigmas off."""
+    frequencies = np.random.default_rng(seed).uniform(lowest_hz, highest_hz, 3)
+    swings = [[Swing(amplitude_deg=amplitude_deg, frequency_hz=float(f))] for f in frequencies]
+    carrier = EulerMotion(**dict(zip(("roll", "pitch", "yaw"), swings, strict=True)))
+    scenario = LosScenario(
+        duration_s=20.0, carrier=carrier, image_rate_hz=25.0, sensors=Sensors(), effects={"encoder_delay": 1e-3}
+    )
+    data, truth = simulate_los(scenario, seed)
+    estimate = solve_batch(problem(data, _config(scenario)))
+    assert estimate.converged
+    assert _nees(estimate, truth) < quantile(1 - 1e-3, len(estimate.values))
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+    assert estimate.sigmas[estimate.names.index("encoder_delay")] < 5e-5
