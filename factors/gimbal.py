@@ -70,7 +70,8 @@ class LocalMotion:
 
     Attributes:
         rate: (n, 4, 3) of the gyro, coefficients by powers of the time from the stamps, rad/s^(k + 1).
-        gimbal: (n, 2) smoothed azimuth and elevation at the stamps, rad.
+        read: (n, 2) azimuth and elevation that the encoders read at the stamps, rad: between samples by the commands.
+        gimbal: (n, 2) these smoothed.
         rest: (n, 3, 2) coefficients, from the first power on, of the readings less the commanded angles, rad/s^k.
         rest_by_delay: (n, 3, 2) derivative of the rest by the encoders' delay: commands by the gyro read later, for the
             angles that the readings were then.
@@ -79,12 +80,13 @@ class LocalMotion:
     """
 
     rate: Array
+    read: Array
     gimbal: Array
     rest: Array
     rest_by_delay: Array
     windows: tuple[float, float]
     drivers: Array | None = None
-    stacked: ClassVar = ("rate", "gimbal", "rest", "rest_by_delay", "drivers")
+    stacked: ClassVar = ("rate", "read", "gimbal", "rest", "rest_by_delay", "drivers")
 
     @classmethod
     def around(
@@ -100,24 +102,26 @@ class LocalMotion:
 
         Windows are chosen unless given.
         """
-        commanded = _commanded(gyro_t, gyro, gimbal)
-        rest = gimbal.angles - _interpolated(gimbal.t, gyro_t, commanded[:, :2])
+        sums = _commanded(gyro_t, gyro, gimbal)
+        commanded = GimbalPath(gyro_t, sums[:, :2])
+        rest = gimbal.angles - commanded.at(gimbal.t)
         windows = windows or (_smoothing(at, gyro_t, gyro), _smoothing(at, gimbal.t, rest))
-        resting = _local_cubics(at, gimbal.t, rest, windows[1])
+        resting, reached = _local_cubics(at, gimbal.t, rest, windows[1]), commanded.at(at)
         return cls(
             _local_cubics(at, gyro_t, gyro, windows[0]),
-            _interpolated(at, gyro_t, commanded[:, :2]) + resting[:, 0],
+            reached + GimbalPath(gimbal.t, rest).at(at),
+            reached + resting[:, 0],
             resting[:, 1:].copy(),
-            _local_cubics(at, gyro_t, commanded[:, 2:], windows[1])[:, 1:].copy(),
+            _local_cubics(at, gyro_t, sums[:, 2:], windows[1])[:, 1:].copy(),
             windows,
-            None if drivers is None else _interpolated(at, gyro_t, drivers),
+            None if drivers is None else np.stack([np.interp(at, gyro_t, each) for each in drivers.T], axis=1),
         )
 
     def __getitem__(self, rows: Any) -> LocalMotion:
         """The motion around some of the pictures."""
         drivers = None if self.drivers is None else self.drivers[rows]
-        local = self.rate[rows], self.gimbal[rows], self.rest[rows], self.rest_by_delay[rows]
-        return LocalMotion(*local, self.windows, drivers)
+        local = self.read[rows], self.gimbal[rows], self.rest[rows], self.rest_by_delay[rows]
+        return LocalMotion(self.rate[rows], *local, self.windows, drivers)
 
     def turned(self, begin: Array, end: Array) -> Array:
         """Rotation vectors (n, 3), rad, of the gyro between times (n, 1) from the stamps, s."""
@@ -170,11 +174,6 @@ def _command_change(rate: Array, angles: Array, by: Array) -> Array:
     ahead, right = c * rate[:, 1] - s * rate[:, 0], c * rate[:, 0] + s * rate[:, 1]
     azimuth, elevation = by.T
     return np.stack([elevation * ahead * (1.0 + tangent**2) - azimuth * tangent * right, -azimuth * ahead], axis=1)
-
-
-def _interpolated(at: Array, t: Array, values: Array) -> Array:
-    """Columns (n, d) at times, linear between samples (N, d)."""
-    return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
 
 
 def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:

@@ -211,7 +211,7 @@ def test_motion_around_a_stamp_follows_swings_whatever_the_delay_of_the_encoders
         TIMES,
         np.zeros((N, 2)),
         np.tile(np.eye(2), (N, 1, 1)),
-        encoders.at(TIMES),
+        motion.read,
         CORE,
         LosContext(motion, TIMES, TIMES, np.zeros((N, 2)), np.zeros(N)),
     )
@@ -222,6 +222,16 @@ def test_motion_around_a_stamp_follows_swings_whatever_the_delay_of_the_encoders
     exposed = LosDirectionFactor(TIMES, model.measured, model.sqrt_information, gimbal.at(TIMES + late), CORE)
     expected = exposed.predict(so3.multiply(tRm, so3.exp(turned)), angles)[:, :2]
     np.testing.assert_allclose(predicted, expected, atol=3e-3 * 0.3 * 0.015)
+
+
+def test_a_gimbal_between_samples_moves_by_its_commands() -> None:
+    """At 20 samples/s a cubic is off by a hundred times as much."""
+    samples, gimbal, _ = _driven(2.0, 0.0)
+    sparse = GimbalPath(STAMPS[::10], gimbal.at(STAMPS[::10]))
+    motion = LocalMotion.around(TIMES, STAMPS, samples, sparse)
+    off, off_by_cubic = (np.abs(each - gimbal.at(TIMES)).max() for each in (motion.read, sparse.at(TIMES)))
+    assert off < 1e-5
+    assert off < 0.01 * off_by_cubic
 
 
 def test_motion_is_smoothed_no_less_than_it_allows() -> None:

@@ -179,11 +179,11 @@ def _prepare(
         errors=parameters.gyro,
         trunk=trunk,
     )
-    around, clock = None, clock or Clock(float(data.image_t[0]))
+    around, angles, clock = None, used.angles, clock or Clock(float(data.image_t[0]))
     if parameters.sight is not None:
         windows = None if before is None or before.around is None else before.around.motion.windows
         motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving, windows)
-        zero = np.zeros((len(time), 1))
+        angles, zero = motion.read, np.zeros((len(time), 1))
         smooth = motion.moved(motion.gimbal, zero, zero + delay)[0]
         errors = predicted_errors(chains, time, camera(smooth, mount, parameters.names), measured, chain.gyro)
         clock, watched = _watched(used, clock, before, start)
@@ -195,7 +195,7 @@ def _prepare(
         delay=delay,
         measured=measured,
         sqrt_information=_sqrt_information(used.covariance),
-        angles=used.angles,
+        angles=angles,
         around=around,
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
         parameters=parameters,
