@@ -106,7 +106,7 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
         # A default that samples do not determine is estimated from residuals.
         return Level(noise if noise.source == _DEFAULT else held)
     ratio, spread = found[0] / noise.stated, max(found[1], _TRUSTED)
-    level = _weighed(Level(held, 1.0, ratio, ratio * spread))
+    level = weighed(Level(held, 1.0, ratio, ratio * spread))
     if noise.families and level.scale < _MUCH_SMALLER:
         return replace(level, noise=noise, scale=1.0, least=level.scale)
     return level
@@ -144,7 +144,7 @@ def walked(noise: Noise, time: Array, means: Array, causes: Array) -> Level:
         return Level(noise)
     bend = float(2.0 * fit[best] - fit[best - 1] - fit[best + 1]) / _STEP**2
     ratio, spread = float(tried[best]) / noise.stated, max(bend, 1e-6) ** -0.5
-    return _weighed(Level(noise, 1.0, ratio, ratio * spread))
+    return weighed(Level(noise, 1.0, ratio, ratio * spread))
 
 
 def walking(config: Config) -> Level:
@@ -171,7 +171,7 @@ def _likelihood(means: Array, follows: Array, covariance: Array) -> float:
     return -0.5 * square - means.shape[1] * float(np.log(np.abs(diagonals)).sum())
 
 
-def _weighed(level: Level) -> Level:
+def weighed(level: Level) -> Level:
     """The level with its scale weighted between the stated and the estimated one."""
     assert level.found is not None
     assert level.sigma is not None

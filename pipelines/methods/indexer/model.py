@@ -58,7 +58,7 @@ from alidade.pipelines.methods.indexer.windows import (
     encoder_scatter,
     groups_of,
 )
-from alidade.pipelines.methods.noise import sampled, stated, walking
+from alidade.pipelines.methods.noise import sampled, stated, walking, weighed
 from alidade.pipelines.recording.topics import FIX
 from alidade.pipelines.settings import Config
 
@@ -71,6 +71,8 @@ _SLOW = 2.0
 _NO_ERROR = 1e-8
 # Accuracy of their noise as estimated from the scatter at rest, one sigma of the logarithm.
 _SCATTERED = 0.05
+# What is stated and the scatter at rest certainly differ beyond so many sigmas of the former.
+_CERTAIN = 2.0
 
 
 @dataclass(frozen=True)
@@ -137,11 +139,14 @@ def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[
 
 
 def _encoders(noise: Noise, scatter: float) -> Level:
-    """The level of the encoders' noise: as stated, else what they show at rest, if they show any (rad)."""
-    if noise.source != "default" or noise.known == 0.0 or scatter <= _NO_ERROR:
+    """The level of the encoders' noise: what they show at rest, if they show any (rad), weighed against what is stated.
+
+    A figure that is certainly another, by how well it is known, stands for more than this noise, and stays.
+    """
+    ratio = scatter / noise.stated if noise.stated > 0.0 else np.inf
+    if scatter <= _NO_ERROR or (noise.source != "default" and abs(np.log(ratio)) >= _CERTAIN * noise.known):
         return Level(noise)
-    ratio = scatter / noise.stated
-    return Level(noise, ratio, ratio, _SCATTERED * ratio)
+    return weighed(Level(noise, 1.0, ratio, _SCATTERED * ratio)) if noise.known > 0.0 else Level(noise)
 
 
 def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]:

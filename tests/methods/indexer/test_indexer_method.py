@@ -195,6 +195,22 @@ def test_errors_of_real_sensors_agree_with_the_covariance(runs: int, name: str) 
     assert quantile(0.005, dof) < np.sum(nees) < quantile(0.995, dof)
 
 
+@pytest.mark.parametrize("factor", [1.0 / 3.0, 3.0])
+def test_noise_stated_wrong_but_hardly_known_leaves_the_sigmas(factor: float) -> None:
+    """Encoder noise stated three times too large passed for slow errors: sigmas were eight times too large."""
+    scenario = _scenario("nominal")
+    data, _ = simulate_indexer(scenario, 1)
+    config = load_config(indexer_config(scenario).encode())
+    assert config.noise.gyro_density is not None
+    assert config.noise.encoder is not None
+    sigmas = []
+    for size in (1.0, factor):
+        stated = {"gyro_density": size * config.noise.gyro_density, "encoder": size * config.noise.encoder}
+        known = {"noise": config.noise.model_copy(update=stated), "noise_known": 1.0}
+        sigmas.append(solve_batch(problem(data, config.model_copy(update=known))).sigmas)
+    np.testing.assert_allclose(sigmas[1], sigmas[0], rtol=0.03)
+
+
 def test_priors_beat_sensors_beat_the_defaults() -> None:
     sensors = Sensors.model_validate({"gyro": {"scale": 3e-4}, "encoder": {"once_per_turn": None}})
     config = Config(sensors=sensors, priors={"gyro_scale_y": 0.0, "gyro_scale_z": None, "encoder_delay": 2e-3})
