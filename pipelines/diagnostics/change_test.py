@@ -167,7 +167,7 @@ def _is_material(step: StepEstimate, quantities: Sequence[Quantity]) -> bool:
 
 def _is_jump(step: StepEstimate, duration: float) -> bool:
     """Whether vision jumps by a step, be that the mount's or not."""
-    return step.agrees and step_stability(replace(step, by_motion=np.inf), duration).changed
+    return step.jumped and step.agrees and step_stability(replace(step, by_motion=np.inf), duration).changed
 
 
 def with_change(estimate: Estimate, change: Finding) -> Estimate:

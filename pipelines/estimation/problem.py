@@ -511,6 +511,7 @@ class StepEstimate:
         apart: chi-square of the difference of both steps.
         ratio: of sandwich to nominal sigmas, the largest of any direction of both, at least 1.
         ratio_by_motion: the same by motion alone.
+        jumped: whether vision jumps by three sigmas, and does not come back soon.
     """
 
     time_s: float
@@ -523,6 +524,7 @@ class StepEstimate:
     apart: float
     ratio: float
     ratio_by_motion: float
+    jumped: bool
 
     @property
     def agrees(self) -> bool:

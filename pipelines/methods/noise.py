@@ -9,6 +9,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise, Source
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.noises import NOISES, NoiseSpec
@@ -32,6 +33,8 @@ _FEWEST, _TRUSTED = 200, 0.05
 # A walk is looked for in steps of this, in the logarithm, where the bias was seen so many times.
 # ... and what was stated is contradicted by so many sigmas.
 _STEP, _FEWEST_MEANS, _SURE = 0.25, 12, 4.0
+# s over which samples at rest are averaged: one sample shows a slow motion least, longer ones what is rounded off.
+_REST_MEANS = (0.0, 0.1, 0.4)
 # How well repeatability is known, in the logarithm, where nobody states it.
 _HARDLY = 2.0
 # A walk that nobody states is no smaller than this, over the default.
@@ -110,6 +113,37 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     if noise.families and level.scale < _MUCH_SMALLER:
         return replace(level, noise=noise, scale=1.0, least=level.scale)
     return level
+
+
+def at_least_at_rest(level: Level, time: Array, gyro: Array, force: Array | None) -> Level:
+    """The level of a gyro's white noise, bounded below by what the gyro itself shows at rest.
+
+    Motion adds noise and takes none away. The bound is the least density of means over some times, less three of its
+    sigmas; of a recording without rest there is none.
+
+    Args:
+        level: of the density, rad/s/sqrt(Hz).
+        time: (n,) s.
+        gyro: (n, 3) rad/s.
+        force: (n, 3) m/s^2 of the accelerometer beside it; None: there is none.
+    """
+    if not level.noise.estimated:
+        return level
+    spans = stretches_at_rest(time, [gyro] if force is None else [gyro, force], gyro)
+    pieces = [gyro[(time >= begin) & (time <= end)] for begin, end in spans]
+    interval = float(np.median(np.diff(time)))
+    found = min((_rest_density(pieces, max(1, round(mean / interval)), interval) for mean in _REST_MEANS), default=0.0)
+    return replace(level, noise=replace(level.noise, least=found / level.noise.stated))
+
+
+def _rest_density(pieces: Sequence[Array], count: int, interval: float) -> float:
+    """Allan deviation of means of `count` samples as a density, less three of its sigmas; 0: too few."""
+    differences = [
+        np.diff(piece[: len(piece) // count * count].reshape(-1, count, 3).mean(axis=1), axis=0) for piece in pieces
+    ]
+    each = np.concatenate([np.empty((0, 3)), *differences]).ravel()
+    sure = 1.0 - 3.0 / np.sqrt(max(each.size, 1))
+    return max(sure, 0.0) * float(np.sqrt(0.5 * np.mean(each**2) * count * interval)) if each.size else 0.0
 
 
 def walked(noise: Noise, time: Array, means: Array, causes: Array) -> Level:

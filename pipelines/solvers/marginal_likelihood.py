@@ -40,7 +40,7 @@ Outliers = Mapping[int, NDArray[np.bool_]]
 # A measurement is widened to the 99.9 % gate of its innovation, and an outlier beyond so many times that.
 OUTLIER_GATES = 3.0
 # By which the variance of a measurement without a say is multiplied, where it cannot be infinite.
-_NO_SAY = 1e12
+NO_SAY = 1e12
 # Keyframes that determine levels well enough: of a longer recording half of them are the liveliest.
 ENOUGH_KEYFRAMES = 6000
 # Newton steps, none longer than this in the logarithm of a level; one that lowers -2 log L by less is the last: levels
@@ -467,7 +467,8 @@ def _maximum(
         found = chain.solved([v * f for v, f in zip(chain.variances(tried), factors, strict=True)])
         return np.inf if found is None else found.value + float(((u / known) ** 2).sum()), tried, found
 
-    u = np.log([levels[i].scale for i in free])
+    lowest = np.log([max(levels[i].noise.least, 1e-300) for i in free])
+    u = np.maximum(np.log([levels[i].scale for i in free]), lowest)
     value, tried, solution = at(u)
     if solution is None:
         raise IndeterminateStateError(UNDETERMINED)
@@ -477,7 +478,11 @@ def _maximum(
             break
         gradient, information = solution.score([_parts(chain, tried, i) for i in free], signs)
         gradient, information = gradient + u / known**2, information + np.diag(known**-2.0)
-        move = -np.linalg.solve(information, gradient)
+        # What lies at its bound, and would go below, stays.
+        moving = np.flatnonzero((u > lowest) | (gradient < 0.0))
+        move = np.zeros(len(free))
+        move[moving] = -np.linalg.solve(information[np.ix_(moving, moving)], gradient[moving])
+        move = np.maximum(move, lowest - u)
         predicted, before = -float(gradient @ move), value
         move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
         for _ in range(_HALVINGS):
@@ -508,7 +513,7 @@ def widened(
     """
     variances = chain.variances(levels)
     before = [out > 0.0 for out in _by_row(chain, rejected, 0.0)]
-    kept = [np.where(out, _NO_SAY * v, v) for out, v in zip(before, variances, strict=True)]
+    kept = [np.where(out, NO_SAY * v, v) for out, v in zip(before, variances, strict=True)]
     # Only what was rejected is judged by the residuals that the solution leaves.
     residuals = _residuals_of(chain, kept) if any(out.any() for out in before) else [r.residuals for r in chain.rows]
     limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
@@ -563,7 +568,7 @@ def sandwich_ratio(
         reported: (r, p) derivatives of the numbers.
     """
     out = _by_row(chain, rejected, 0.0)
-    variances = [np.where(o > 0.0, _NO_SAY * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
+    variances = [np.where(o > 0.0, NO_SAY * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
     nominal, robust, blocks = sandwich(chain, variances)
     above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
     ratio = np.sqrt(np.divide(above, below, out=np.ones_like(below), where=below > 0.0))

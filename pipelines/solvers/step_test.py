@@ -33,10 +33,10 @@ from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.levenberg import Solution
 from alidade.pipelines.solvers.linearization import Group, Linearization, NativeModel
 from alidade.pipelines.solvers.marginal_likelihood import (
+    NO_SAY,
     LinearChain,
     Outliers,
     Rows,
-    estimate_levels,
     maximise_likelihood,
     rejected,
     sandwich,
@@ -49,6 +49,10 @@ STEP_PRIOR = 0.35
 _MARGIN = 0.03
 # Candidates that are nearer to another one than so many keyframes are that one.
 _SAME = 2
+# s, to which motion dates a step: half the time between steps that look different to it.
+_DATED_S = 1.0
+# s within which what jumped and comes back is a glitch of the reference.
+_GLITCH_S = 2.0
 # Keyframes that are scanned at once.
 _BLOCK = 1000
 # Fall of chi-square below which no candidate is solved again: 20 are needed for a change in a minute.
@@ -80,11 +84,17 @@ class Scan:
     information: Array
 
     def best(self) -> list[int]:
-        """The candidates, at most four: the largest of both tests, of the smaller one, and where both agree."""
+        """The candidates, at most four: the two largest falls, the largest smaller test, and that where both agree.
+
+        Motion dates a step to about a second, the jump with the chain unbroken to a keyframe. The largest fall may be a
+        glitch of the reference, and its end lies close to it.
+        """
         both = np.minimum(self.fall, self.by_motion)
+        apart = np.abs(self.time - self.time[np.argmax(self.fall)]) > _GLITCH_S
         found: list[int] = []
-        for size in (self.fall, self.by_motion, both, np.where(self.apart < APART, both, -np.inf)):
-            at = int(np.argmax(size))
+        for size in (self.fall, np.where(apart, self.fall, 0.0), both, np.where(self.apart < APART, both, 0.0)):
+            near = np.abs(self.time - self.time[np.argmax(size)]) <= _DATED_S
+            at = int(np.argmax(np.where(near, self.fall, -np.inf)))
             if all(abs(self.keyframe[at] - self.keyframe[i]) > _SAME for i in found):
                 found.append(at)
         return found
@@ -262,21 +272,24 @@ def _largest_steps(
     compiled: Compiled, engine: Linearization, levels: Sequence[Level], solved: Linearization, values: Values
 ) -> tuple[StepEstimate, ...]:
     parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.may_step]
-    base = _Fit.of(engine, values, levels)
+    outliers = rejected(solved, values)
+    transient = {group: _transient(out) for group, out in outliers.items()}
+    base = _Fit.of(engine, values, levels, transient)
     scans = [(p, found) for p in parameters if (found := base.scanned(p)) is not None]
     steps = [_scanned(base, p, found) for p, found in scans if found.fall.max() < NOTHING]
     scans = [(p, found) for p, found in scans if found.fall.max() >= NOTHING]
     if scans:
-        outliers = rejected(solved, values)
-        without = _maximised(engine, values, levels, outliers)
-        tried = [_solved_again(without, base, outliers, p, found, i) for p, found in scans for i in found.best()]
+        without = _maximised(engine, values, levels, outliers, transient)
+        tried = [
+            _solved_again(without, base, outliers, transient, p, found, i) for p, found in scans for i in found.best()
+        ]
         steps += [step for step in tried if step is not None]
     return tuple(sorted(steps, key=lambda step: (-step.statistic, -step.fall)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A solution at the levels of the largest likelihood, all outliers widened.
+    """A solution at the levels of the largest likelihood; what is rejected to an end of the recording is widened.
 
     Attributes:
         engine: with the noise stated.
@@ -294,16 +307,18 @@ class _Fit:
     minus_two_log_likelihood: float
 
     @classmethod
-    def of(cls, engine: Linearization, values: Values, levels: Sequence[Level]) -> _Fit:
+    def of(cls, engine: Linearization, values: Values, levels: Sequence[Level], out: Outliers) -> _Fit:
         chain = LinearChain.of(engine, values)
-        wide, _ = widened(chain, levels, {})
-        found = estimate_levels(chain, levels, wide, {}).levels
-        by = [wide.get(rows.group, np.ones(len(rows.time))) for rows in chain.rows]
-        variances = [v * w**2 for v, w in zip(chain.variances(found), by, strict=True)]
-        known = [(np.log(level.scale) / max(level.noise.known, ROUGHLY)) ** 2 for level in found]
+        wide, _ = widened(chain, levels, out)
+        by = [
+            np.where(out.get(rows.group, False), NO_SAY**0.5, wide.get(rows.group, np.ones(len(rows.time))))
+            for rows in chain.rows
+        ]
+        variances = [v * w**2 for v, w in zip(chain.variances(levels), by, strict=True)]
+        known = [(np.log(level.scale) / max(level.noise.known, ROUGHLY)) ** 2 for level in levels]
         solved = chain.solved(variances)
         value = np.inf if solved is None else solved.value + float(sum(known))
-        return cls(engine, values, found, chain, variances, value)
+        return cls(engine, values, tuple(levels), chain, variances, value)
 
     def scanned(self, parameter: Parameter) -> Scan | None:
         """Tests of steps of a parameter; None: it is none of the recording, or that is too short."""
@@ -312,10 +327,21 @@ class _Fit:
         return scan(self.chain, self.variances, columns) if len(columns) else None
 
 
-def _maximised(engine: Linearization, values: Values, levels: Sequence[Level], outliers: Outliers) -> _Fit:
+def _transient(outliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (n,) of outliers with measurements before and after them: the reference went off and came back."""
+    used = np.flatnonzero(~outliers)
+    between = np.zeros(len(outliers), dtype=bool)
+    if len(used):
+        between[used[0] : used[-1]] = True
+    return outliers & between
+
+
+def _maximised(
+    engine: Linearization, values: Values, levels: Sequence[Level], outliers: Outliers, transient: Outliers
+) -> _Fit:
     """Noise levels and values of the largest likelihood, from initial ones."""
     best = maximise_likelihood(engine, values, levels, outliers, _ROUNDS)
-    return _Fit.of(engine, best.values, best.levels)
+    return _Fit.of(engine, best.values, best.levels, transient)
 
 
 def _scanned(base: _Fit, parameter: Parameter, found: Scan) -> StepEstimate:
@@ -326,7 +352,7 @@ def _scanned(base: _Fit, parameter: Parameter, found: Scan) -> StepEstimate:
     named = _named(parameter, J @ found.step[i], J @ covariance @ J.T)
     tests = float(found.fall[i]), float(found.by_motion[i]), float(found.apart[i])
     when = float(found.time[i]), float(found.since[i])
-    return StepEstimate(*when, named, *_length(found.step[i], covariance), *tests, 1.0, 1.0)
+    return StepEstimate(*when, named, *_length(found.step[i], covariance), *tests, 1.0, 1.0, False)
 
 
 def _named(parameter: Parameter, steps: Array, covariance: Array) -> dict[str, tuple[float, float]]:
@@ -343,12 +369,12 @@ def _length(step: Array, covariance: Array) -> tuple[float, float]:
 
 
 def _solved_again(
-    without: _Fit, base: _Fit, outliers: Outliers, parameter: Parameter, found: Scan, i: int
+    without: _Fit, base: _Fit, outliers: Outliers, transient: Outliers, parameter: Parameter, found: Scan, i: int
 ) -> StepEstimate | None:
     """A candidate with levels, widening and linearisation of its own; None: it is not determined."""
     engine, values, late = split(base.engine, base.values, parameter.key, float(found.time[i]), found.step[i])
     try:
-        fit = _maximised(engine, values, base.levels, outliers)
+        fit = _maximised(engine, values, base.levels, outliers, transient)
     except IndeterminateStateError:
         return None
     link = [_leads_to(rows, int(found.keyframe[i])) for rows in fit.chain.rows]
@@ -371,17 +397,39 @@ def _solved_again(
     at = layout.to_gtsam(fit.values, [parameter.key, late])
     (a, by_a), (b, by_b) = (parameter.coordinates(at, key) for key in (parameter.key, late))
     J = by_b @ second - by_a @ first
+    length, sigma = _length(step, C)
+    jumped = fall > NOTHING * ratio**2 and length > 3.0 * ratio * sigma
     return StepEstimate(
         float(found.time[i]),
         float(found.since[i]),
         _named(parameter, b - a + J @ joined.shared, joined.covariance(J)),
-        *_length(step, C),
+        length,
+        sigma,
         fall,
         float(by_motion @ np.linalg.solve(moved, by_motion)),
         float((by_motion - step) @ np.linalg.solve(moved, by_motion - step)),
         ratio,
         ratio_moved,
+        jumped and not _returns(fit, np.flatnonzero(second.any(axis=0)), float(found.time[i]), turn),
     )
+
+
+def _returns(fit: _Fit, columns: Index, time: float, turn: Array) -> bool:
+    """Whether a rotation steps back soon after its step: the reference was off, the mount is not.
+
+    Args:
+        fit: with the step.
+        columns: of the rotation after it, among the shared parameters.
+        time: of the step, s.
+        turn: (3,) the step.
+    """
+    back = scan(fit.chain, fit.variances, columns)
+    if back is None:
+        return False
+    soon = (back.time > time) & (back.time <= time + _GLITCH_S)
+    at = int(np.argmax(np.where(soon, back.fall, -np.inf)))
+    halved = np.linalg.norm(turn + back.step[at]) < 0.5 * np.linalg.norm(turn)
+    return bool(soon[at] and back.fall[at] > APART and halved)
 
 
 def _leads_to(rows: Rows, keyframe: int) -> NDArray[np.bool_]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import alidade
+from alidade.factors import so3
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.reports.result import Calibration
 
@@ -41,3 +44,28 @@ def test_with_its_true_data_sheet_the_mount_is_right(recording: Path, tmp_path: 
     assert found.status == "calibrated"
     scales = [found.parameters[f"gyro_scale_{axis}"] for axis in "xy"]
     assert all(p.value > 5.0 * p.sigma for p in scales)
+
+
+@pytest.mark.parametrize("name", ["u1", "u2"])
+def test_markers_that_slip_by_two_degrees_half_way(name: str, shared_data: Path) -> None:
+    session = alidade.open(
+        shared_data / "upenn_imu_vicon" / f"{name}.mcap", config={"sensors": {"gyro": {"scale": 0.1}}}
+    )
+    healthy = session.calibrate(report=False)
+    assert healthy.status == "calibrated", healthy.headline
+    data = session.data
+    time = 0.5 * (data.head_t[0] + data.head_t[-1])
+    turn = np.where((data.vision_t > time)[:, None], np.deg2rad([0.5, 1.2, 1.5]), 0.0)
+    slipped = replace(data, vision_wxyz=so3.multiply(data.vision_wxyz, so3.exp(turn)))
+    found = replace(session, data=slipped).calibrate(report=False)
+    assert found.status == "inconsistent", found.headline
+    (finding,) = (each for each in found.findings if each.kind == "change")
+    assert abs(finding.evidence["time_s"] - time) < 0.2
+
+
+def test_the_noise_of_the_gyro_is_at_least_that_at_rest(shared_data: Path) -> None:
+    """9.5e-4 rad/s/sqrt(Hz) by its Allan deviation; 6e-6 also has a maximum of the likelihood."""
+    for name in ("u1", "u2"):
+        found = alidade.open(shared_data / "upenn_imu_vicon" / f"{name}.mcap").calibrate(report=False)
+        (level,) = (each for each in found.noises if each.name == "gyro_density")
+        assert 6e-4 < level.used < 3e-3

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from alidade.factors import so3
 from alidade.pipelines import methods
@@ -57,6 +58,23 @@ def test_levels_found_are_where_the_likelihood_is_largest() -> None:
     for i in range(len(free)):
         for by in (0.5, 2.0):
             assert value(best * np.where(np.arange(len(free)) == i, by, 1.0)) > value(best) - 0.1
+
+
+def test_a_level_is_never_below_its_bound() -> None:
+    """The others are where the likelihood is largest with it there."""
+    linear, levels = chain()
+    bounded = tuple(
+        replace(level, noise=replace(level.noise, least=3.0)) if level.noise.name == "gyro_density" else level
+        for level in levels
+    )
+    found = {level.noise.name: level.scale for level in estimate_levels(linear, bounded).levels}
+    assert found["gyro_density"] == pytest.approx(3.0)
+    held = tuple(
+        replace(level, scale=3.0, noise=replace(level.noise, known=0.0)) if level.noise.least else level
+        for level in bounded
+    )
+    expected = {level.noise.name: level.scale for level in estimate_levels(linear, held).levels}
+    assert found["vision_attitude"] == pytest.approx(expected["vision_attitude"], rel=0.01)
 
 
 def test_level_of_vision_is_that_simulated() -> None:

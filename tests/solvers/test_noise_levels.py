@@ -17,7 +17,7 @@ from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods.cube.static_poses import static_intervals
-from alidade.pipelines.methods.noise import white_density
+from alidade.pipelines.methods.noise import at_least_at_rest, estimated, white_density
 from alidade.pipelines.settings import DEFAULT_NOISE, Config
 from alidade.pipelines.settings import Noise as NoiseSettings
 from alidade.pipelines.solvers.batch import solve_batch
@@ -289,6 +289,18 @@ def test_white_noise_of_a_sensor_in_motion() -> None:
     assert found is None or found[0] == pytest.approx(density, rel=0.2)
     # Steps of the readings hide it.
     assert white_density(time, np.round(samples / 0.1) * 0.1) is None
+
+
+def test_a_gyro_at_rest_bounds_its_noise_from_below() -> None:
+    rng, rate, density = np.random.default_rng(4), 100.0, 9e-4
+    time, level = np.arange(3000) / rate, estimated("gyro_density", Config(), ("gyro",))
+    moved = np.where(time < 10.0, 0.0, np.sin(2.0 * np.pi * (time - 10.0)))[:, None]
+    # In steps of a degree a second, as an old gyro has them.
+    gyro = np.round((moved + density * np.sqrt(rate) * rng.standard_normal((3000, 3))) / 0.0169) * 0.0169
+    bounded = at_least_at_rest(level, time, gyro, None).noise
+    assert 0.6 * density < bounded.least * bounded.stated < density
+    assert at_least_at_rest(level, time[1000:], gyro[1000:], None).noise.least == 0.0
+    assert at_least_at_rest(replace(level, noise=replace(level.noise, known=0.0)), time, gyro, None).noise.least == 0.0
 
 
 def test_coloured_innovations_leave_what_goes_together_together() -> None:

@@ -46,6 +46,11 @@ def slipped(data: HeadData, deg: float, time: float, axis: tuple[float, float, f
     return replace(data, vision_wxyz=wxyz)
 
 
+def glitching(data: HeadData) -> HeadData:
+    """The reference is off by 2 deg from 14 to 15 s."""
+    return slipped(slipped(data, 2.0, 14.0), -2.0, 15.0)
+
+
 def sparse(data: HeadData, kept: np.ndarray) -> HeadData:
     """Some of the pictures."""
     cov = None if data.vision_cov is None else data.vision_cov[kept]
@@ -121,10 +126,19 @@ def test_a_slip_is_found_that_levels_would_hide(deg: float, time: float) -> None
 
 
 def test_a_glitch_of_the_reference_is_no_change() -> None:
-    """2 deg for .4 s jumps, and motion has nothing of it."""
-    data = recorded(1)
-    back = slipped(slipped(data, 2.0, 14.0), -2.0, 14.4)
-    assert found(back)[1] is None
+    """2 deg for 1 s jumps, and comes back."""
+    estimate, finding = found(glitching(recorded(1)))
+    assert finding is None
+    assert estimate.steps is not None
+    assert not any(step.jumped for step in estimate.steps if abs(step.time_s - 14.0) < 0.1)
+
+
+def test_a_glitch_hides_no_smaller_slip() -> None:
+    """Both have a jump; the glitch has the larger one."""
+    finding = found(slipped(glitching(recorded(1)), 1.0, 20.0))[1]
+    assert finding is not None
+    assert (finding.kind, finding.severity) == ("change", Severity.INCONSISTENT)
+    assert abs(finding.evidence["time_s"] - 20.0) < 0.3
 
 
 def test_a_world_that_is_found_anew_is_no_change() -> None:
@@ -149,7 +163,7 @@ def test_a_slip_in_an_outage_is_dated_by_the_pictures_around_it() -> None:
 def step(**of: float) -> StepEstimate:
     """A step of 1 deg that both tests show, with some numbers else."""
     numbers = {"size": 0.0175, "sigma": 1e-3, "fall": 300.0, "by_motion": 300.0, "apart": 1.0}
-    numbers |= {"ratio": 1.0, "ratio_by_motion": 1.0} | of
+    numbers |= {"ratio": 1.0, "ratio_by_motion": 1.0, "jumped": True} | of
     return StepEstimate(10.0, 9.9, {"helmet_mount_x": (numbers["size"], numbers["sigma"])}, **numbers)
 
 
@@ -166,6 +180,7 @@ def test_what_is_a_change_and_what_is_a_jump() -> None:
     assert judged(step(ratio=4.0)) is None
     assert judged(step(by_motion=20.0)) == ("jump", Severity.WEAK)
     assert judged(step(by_motion=20.0, size=0.01)) == ("jump", Severity.NOTE)
+    assert judged(step(by_motion=20.0, jumped=False)) is None
     assert judged(step(by_motion=20.0, size=0.005)) is None
     assert judged(step(by_motion=60.0, apart=30.0)) is None
     assert judged(step(size=0.005), step(by_motion=20.0)) == ("jump", Severity.WEAK)

@@ -34,7 +34,7 @@ from alidade.pipelines.methods.head.initial_values import guess, guess_picture_c
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import at_gyro_rate
-from alidade.pipelines.methods.noise import estimated, sampled, stated, typical
+from alidade.pipelines.methods.noise import at_least_at_rest, estimated, sampled, stated, typical
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
@@ -129,9 +129,10 @@ def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
 
 def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     """Noises in use, by name."""
+    density = estimated("gyro_density", config, ("gyro",), data.gyro_density)
     found = [
         estimated("vision_attitude", config, (_FAMILY,), typical(data.vision_cov, 0, 1, 2)),
-        estimated("gyro_density", config, ("gyro",), data.gyro_density),
+        at_least_at_rest(density, data.head_t, data.head_gyro, data.head_force),
         estimated("gyro_rate_noise", config, ("gyro",), beside=True),
         Level(stated("gyro_bias_walk", config)),
     ]
