@@ -160,11 +160,11 @@ def test_a_slip_in_an_outage_is_dated_by_the_pictures_around_it() -> None:
     assert 12.0 < finding.evidence["time_s"] < 12.6
 
 
-def step(**of: float) -> StepEstimate:
+def step(jumped: bool = True, **of: float) -> StepEstimate:
     """A step of 1 deg that both tests show, with some numbers else."""
     numbers = {"size": 0.0175, "sigma": 1e-3, "fall": 300.0, "by_motion": 300.0, "apart": 1.0}
-    numbers |= {"ratio": 1.0, "ratio_by_motion": 1.0, "jumped": True} | of
-    return StepEstimate(10.0, 9.9, {"helmet_mount_x": (numbers["size"], numbers["sigma"])}, **numbers)
+    numbers |= {"ratio": 1.0, "ratio_by_motion": 1.0} | of
+    return StepEstimate(10.0, 9.9, {"helmet_mount_x": (numbers["size"], numbers["sigma"])}, **numbers, jumped=jumped)
 
 
 def judged(*steps: StepEstimate) -> tuple[str, Severity] | None:
