@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.published import ellipsoid
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.methods.tumble.turning import SCALE
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 
@@ -48,7 +50,7 @@ GRADES: dict[str, tuple[dict[str, float], dict[str, float]]] = {
 }
 # Largest tilt, deg, and number of attitudes: by hand, in flight, on deck.
 TILTS = {"all": (180.0, 16), "flight": (40.0, 20), "level": (8.0, 24)}
-RATES_HZ = (5.0, 25.0, 100.0, 400.0)
+RATES_HZ = (5.0, 10.0, 25.0, 100.0, 400.0)
 
 # K (3, 3) and b (3,) of calibrated = K raw + b, in any unit.
 Triad = tuple[Array, Array]
@@ -139,6 +141,7 @@ def table(draws: int, seconds: float) -> Iterator[str]:
 def nees(hz: float, grade: str, motion: str, seeds: Iterable[int], accelerometer: bool = False) -> tuple[float, int]:
     """Sum over recordings of the NEES of all parameters, and its degrees of freedom; every second place is unknown."""
     (mag, gyro), (tilt, attitudes) = GRADES[grade], TILTS[motion]
+    data_sheet = dict.fromkeys(chain.from_iterable(each.names for each in SCALE), gyro["scale"])
     total, dof = 0.0, 0
     for seed in seeds:
         scenario = TumbleScenario.model_validate(
@@ -150,6 +153,7 @@ def nees(hz: float, grade: str, motion: str, seeds: Iterable[int], accelerometer
                 "gyro": {"rate_hz": hz, **gyro},
                 "accelerometer": {"rate_hz": hz, "arm": 0.0} if accelerometer else None,
                 "latitude_deg": None if seed % 2 else 40.0,
+                "priors": data_sheet,
             }
         )
         simulated = method("tumble").simulate(scenario, seed)

@@ -269,7 +269,7 @@ def turning(
     if data.temperature is not None:
         drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)
     errors = gyro_errors(_ERRORS_KEY, SCALE, list(drivers), config)
-    path = GyroPath(data.gyro_t, data.gyro, guess.bias, acting(errors, drivers))
+    path = GyroPath(data.gyro_t, data.gyro, guess.bias, acting(errors, drivers), density.used)
     inside = _inside(mag.time, data.gyro_t)
     time, begins = shared_keyframes(mag.time[inside], mag.time[inside[0]], _SHARED, _APART)
     rested = None if accel is None else Rows.near(time, accel.time, _inside(accel.time, data.gyro_t))

@@ -208,7 +208,7 @@ def test_gyro_of_any_rate_is_consistent(hz: float, beside: bool) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("hz", [5.0, 10.0, 25.0, 50.0, 100.0, 200.0, 400.0])
 def test_gyro_of_any_rate_is_consistent_over_many_seeds(hz: float) -> None:
-    """Beside an accelerometer from 25 Hz on: NEES is 1.25 times its freedom at 10 Hz, 1.6 times at 5 Hz."""
+    """Beside an accelerometer from 25 Hz on."""
     if hz >= 25.0:
         _assert_consistent(_turned(hz, beside=True), range(8))
     for latitude in (40.0, None):
@@ -219,18 +219,23 @@ def test_gyro_of_any_rate_is_consistent_over_many_seeds(hz: float) -> None:
     ("hz", "grades", "motions", "seeds"),
     [
         (100.0, ["tactical"], ["flight"], 1),
-        *(pytest.param(hz, compass.GRADES, compass.TILTS, 4, marks=pytest.mark.slow) for hz in (25.0, 100.0, 400.0)),
+        (5.0, ["tactical"], ["level"], 2),
+        *(
+            pytest.param(hz, compass.GRADES, compass.TILTS, 6, marks=pytest.mark.slow)
+            for hz in (5.0, 10.0, 25.0, 400.0)
+        ),
     ],
 )
 def test_compass_of_any_grade_and_motion_is_consistent(
     hz: float, grades: Sequence[str], motions: Sequence[str], seeds: int
 ) -> None:
-    """Not on deck with a gyro of 1 mrad/s/sqrt(Hz), 2 to 6, or a tactical one that samples 25 points a second, 3."""
+    """Not on deck from 25 Hz on with a gyro of 1 mrad/s/sqrt(Hz), which the field does not tie to the magnetometer."""
     for grade, motion in product(grades, motions):
-        if motion == "level" and (grade == "poor" or (hz == 25.0 and grade == "tactical")):
+        if motion == "level" and grade == "poor" and hz >= 25.0:
             continue
         total, dof = compass.nees(hz, grade, motion, range(seeds))
-        assert quantile(0.005, dof) < total < quantile(0.995, dof), f"{grade}, {motion}: NEES {total:.1f} for {dof}"
+        low, high = min(0.6, quantile(0.005, dof) / dof), max(1.4, quantile(0.995, dof) / dof)
+        assert low < total / dof < high, f"{grade}, {motion}: NEES {total:.1f} for {dof}"
 
 
 @pytest.mark.slow
