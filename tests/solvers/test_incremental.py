@@ -15,11 +15,7 @@ from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion
 from alidade.pipelines.solvers.batch import minimum, solve, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.incremental import (
-    DEFAULT_WINDOW,
-    IncrementalSolver,
-    solve_incremental,
-)
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver, solve_incremental
 from alidade.pipelines.solvers.weak_directions import at_prior
 from benchmarks.initialisation import CASES, beginning, drawn_los, followed, made, nees, report, run
 

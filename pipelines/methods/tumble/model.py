@@ -23,12 +23,7 @@ from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import sampled, stated
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
-from alidade.pipelines.methods.static_intervals import (
-    ACCEL_TREMOR,
-    GYRO_TREMOR,
-    Stream,
-    find_static_intervals,
-)
+from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess
 from alidade.pipelines.methods.tumble.published import FEWEST
