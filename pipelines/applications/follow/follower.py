@@ -243,8 +243,8 @@ class Follower:
             self._run = IncrementalSolver(problem, self.settings.window)
             return problem.steps(1)
         assert problem.steps_after is not None
-        steps = deque(_first(problem.steps_after(self._run.time)))
-        if steps and steps[0].keyframes.start != self._run.keyframes:
+        first = next(problem.steps_after(self._run.time), None)
+        if first is not None and first.keyframes.start != self._run.keyframes:
             self._say("what was recorded before now reads otherwise: beginning anew")
             self._run = IncrementalSolver(problem, self.settings.window)
             return problem.steps(1)
@@ -340,13 +340,6 @@ class Follower:
         with session.usual_time(online=True):
             (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
         return calibration
-
-
-def _first(steps: Iterable[Step]) -> Iterator[Step]:
-    """The first step, if there is one."""
-    for step in steps:
-        yield step
-        return
 
 
 def _min_delay_ns(session: Session) -> int:
