@@ -28,7 +28,7 @@ _FREE = 10.0
 _UNTOLD = 0.98
 
 # What the names of numbers of one kind differ by.
-_NUMBERS = re.compile(r"(_[xyzenu]{1,2})?(_sin|_cos)?$")
+_NUMBERS = re.compile(r"(_p?[xyzenu]{1,2})?(_sin|_cos)?$")
 
 _WORDS = {**dict(zip("123", "xyz", strict=True)), "e": "east", "n": "north", "u": "up", "sin": "sine", "cos": "cosine"}
 
