@@ -37,6 +37,9 @@ MIN_MEASUREMENTS = 100
 DIED_OUT, CORRELATED = 2.0, 4.0
 # Longest lag, share of the recording.
 MAX_LAG = 0.25
+# Blocks of a recording by which variances are judged, each with as many measurements as there are numbers at least, and
+# sigmas of a ratio of sigmas by them, 1 / sqrt(2 blocks) each, beyond which they are certainly too small.
+_BLOCKS, _CERTAIN = 16, 3.0
 # Coefficients of a prior's row below this share of its largest are rounding.
 ROUNDING = 1e-9
 
@@ -232,14 +235,22 @@ def added_covariance(influence: Influence, correlations: Mapping[str, Array]) ->
 
     Residuals of correlation T beside the identity add L'TL to the covariance L'L that white ones leave.
 
+    By their autocorrelation, as if errors knew nothing of the motion; by the sandwich over blocks of the recording
+    (Liang, Zeger, Biometrika 1986) where that is certainly larger, as of a field that differs from place to place.
+
     Args:
         influence: of the residuals.
         correlations: see `autocorrelations`.
     """
     added, groups, scale = {}, _measured(influence.engine), influence.reported.scale
     for family, correlation in correlations.items():
-        L = np.concatenate([influence.rows(group)[0] for group in groups[family]])[_in_time(groups[family])]
-        more = _correlated(L, correlation) / np.outer(scale, scale)
+        found, order = [influence.rows(group) for group in groups[family]], _in_time(groups[family])
+        L, right = (np.concatenate([each[i] for each in found])[order] for i in (0, 1))
+        time = np.concatenate([group.model.time for group in groups[family]])[order]
+        nominal = np.einsum("nri,nrj->ij", L, L)
+        whole = nominal + _correlated(L, correlation)
+        ratio = ratio_by_blocks(time, np.einsum("nrm,nr->nm", L, right), np.diag(whole))
+        more = (np.outer(ratio, ratio) * whole - nominal) / np.outer(scale, scale)
         variances, axes = np.linalg.eigh(0.5 * (more + more.T))
         root = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
         added[family] = root @ root.T
@@ -257,6 +268,25 @@ def _correlated(L: Array, correlation: Array) -> Array:
         moved = np.fft.irfft(kernel[:, None] * np.fft.rfft(L[..., j], size, axis=0), size, axis=0)[: len(L)]
         out[:, j] = np.einsum("nrm,nr->m", L, moved)
     return out
+
+
+def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
+    """Ratio (m,) of sigmas of numbers by blocks of a recording to those expected; ones where none is certainly above.
+
+    Args:
+        time: (n,) s, in order.
+        moves: (n, m) of the numbers, by each measurement.
+        expected: (m,) variance.
+    """
+    if len(moves) < _BLOCKS * moves.shape[1]:
+        return np.ones(moves.shape[1])
+    block = np.minimum(_BLOCKS * (time - time[0]) / max(time[-1] - time[0], 1e-300), _BLOCKS - 1).astype(int)
+    sums = np.zeros((_BLOCKS, moves.shape[1]))
+    np.add.at(sums, block, moves)
+    found = np.square(sums).sum(axis=0)
+    ratio = np.sqrt(np.divide(found, expected, out=np.ones(len(found)), where=expected > 0.0))
+    certain = ratio.max(initial=1.0) > 1.0 + _CERTAIN / np.sqrt(2.0 * _BLOCKS)
+    return np.maximum(ratio, 1.0) if certain else np.ones(len(ratio))
 
 
 def _measured(engine: Engine) -> dict[str, list[Group]]:

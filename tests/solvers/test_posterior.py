@@ -18,6 +18,7 @@ from alidade.pipelines.solvers.error_budget import (
     autocorrelation,
     error_budget,
     most_influential,
+    ratio_by_blocks,
 )
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Linearization
@@ -285,6 +286,23 @@ def test_autocorrelation_is_that_of_the_noise() -> None:
     # A fifth of white noise that lasts for a hundred measurements: 4.8 of them count as one, and no lag shows it alone.
     faint = 0.2 * lfilter([0.2], [1.0, -0.98], rng.normal(size=20_000))[:, None] + rng.normal(size=(20_000, 1))
     assert 3.0 < 1.0 + 2.0 * float(autocorrelation(faint).sum()) < 7.0
+
+
+def test_blocks_show_an_error_that_goes_with_the_motion() -> None:
+    """A field that differs between two places is no noise to the number that is read from its difference."""
+    rng, n = np.random.default_rng(0), 8000
+    time = np.arange(n) / 50.0
+    L = np.stack([np.ones(n), np.sign(np.sin(2.0 * np.pi * time / 80.0))], axis=1) / n
+    nominal = np.square(L).sum(axis=0)
+    white = [ratio_by_blocks(time, L * rng.standard_normal((n, 1)), nominal) for _ in range(200)]
+    assert np.mean([found.max() > 1.0 for found in white]) < 0.03
+    drawn = 0.3 * np.repeat(rng.standard_normal(16), n // 16)[:, None]
+    placed = L * (rng.standard_normal((n, 1)) + n * L[:, 1:] * drawn)
+    found = ratio_by_blocks(time, placed, nominal)
+    variance = nominal[1] + float((drawn[:: n // 16] ** 2).sum()) / 16**2
+    assert found[1] == pytest.approx((variance / nominal[1]) ** 0.5, rel=0.3)
+    assert found[1] > 3.0
+    assert (ratio_by_blocks(time[:20], placed[:20], nominal) == 1.0).all()
 
 
 def test_correlated_residuals_of_one_family_leave_what_another_determines() -> None:
