@@ -556,6 +556,7 @@ class Estimate:
             are zero. Directions without any information have the variance of a very wide prior, never infinity.
         converged: whether the solver converged; `message`: how, or why not.
         residuals: family -> residuals of measurements at the estimate; innovations if `has_innovations`.
+        innovations: family -> those of a batch solution, predicted from what was measured before by its noise levels.
         chi_square: None for solvers that have none.
         history: values and sigmas from what was recorded until each moment.
         posterior_history: joint posterior at moments; None where noise levels differ between moments.
@@ -586,6 +587,7 @@ class Estimate:
     converged: bool
     message: str
     residuals: Mapping[str, Residuals] = field(default_factory=dict)
+    innovations: Mapping[str, Residuals] = field(default_factory=dict)
     chi_square: ChiSquare | None = None
     history: History | None = None
     posterior_history: PosteriorHistory | None = None

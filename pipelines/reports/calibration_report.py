@@ -165,6 +165,9 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
     inflation = max((p.inflation for p in c.parameters.values()), default=1.0)
     if inflation > _NOTABLE_INFLATION:
         found.append(Badge(f"sigmas × {inflation:.1f} for correlated noise", "warn", "included in all sigmas"))
+    slow = sentences.slow_error(c.findings)
+    if slow > sentences.SLOW_ERROR_WARNING:
+        found.append(Badge(f"sigmas × {slow:.1f} for slow errors", "warn", "included in all sigmas"))
     for family, residuals in c.residuals.items():
         share = 1.0 - float(residuals.used.mean()) if len(residuals.used) else 0.0
         if share > _NOTABLE_REJECTION:

@@ -9,6 +9,7 @@ from itertools import cycle
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.chi_square import interval
 from alidade.pipelines.display.figure import AXES, COLORS, PALE, REJECTED, Figure, Plot
 from alidade.pipelines.display.units import human_unit
 from alidade.pipelines.estimation.problem import Array, History, Quantity, Residuals
@@ -18,6 +19,8 @@ from alidade.pipelines.reports.result import Calibration, quantities_of
 _AXIS = re.compile(r"_([xyzenu]{1,2}|sin|cos)$|_?\d+$")
 # So many variables are named in a title.
 _MOST_NAMED = 3
+# Innovations of a piece of which a spectrum is made, and of which there are so many at least.
+_PIECE, _LEAST_SPECTRUM = 256, 100
 # Numbers are written into the correlation map up to this many parameters.
 _MOST_LABELLED = 12
 # Ellipses are drawn of so many pairs that are correlated at least so much.
@@ -41,6 +44,9 @@ def common_plots(calibration: Calibration) -> list[Plot]:
             plots.append(_residuals(family, residuals, names, estimate.has_innovations))
             if estimate.has_innovations:
                 plots.append(_squares(family, residuals))
+            innovations = residuals if estimate.has_innovations else estimate.innovations.get(family)
+            if innovations is not None and innovations.used.sum() >= _LEAST_SPECTRUM:
+                plots.append(_spectrum(family, innovations, names))
     correlation, ellipses = _correlation(calibration), _ellipses(calibration)
     return [*plots, *([correlation] if correlation else []), *([ellipses] if ellipses else [])]
 
@@ -104,6 +110,45 @@ def _squares(family: str, residuals: Residuals) -> Plot:
         "lacks something at that time, below it noise is smaller.",
         out,
     )
+
+
+def _spectrum(family: str, innovations: Residuals, names: Sequence[str]) -> Plot:
+    """Power spectrum of innovations over the model's, with the band of chance."""
+    time, rows = innovations.time[innovations.used], innovations.whitened[innovations.used]
+    frequency, power, dof = power_spectrum(float(np.median(np.diff(time))), rows)
+    out = Figure("power over the model's", "frequency, Hz", x_scale="log", y_scale="log")
+    bounds = [interval(0.99, each) for each in dof]
+    low, high = [1.0 / b for _, b in bounds], [1.0 / b for b, _ in bounds]
+    out.band(frequency, low, high, PALE, "99 % by chance")
+    out.line(frequency, np.ones(len(frequency)), "99 % by chance", PALE, "dashed")
+    for i, (name, color) in enumerate(zip(names, _colors(names), strict=False)):
+        out.line(frequency, power[:, i], name, color)
+    return Plot(
+        f"Spectrum of {family}",
+        "Innovations are white if the noise model is right: 1 at every frequency. Higher at low frequencies: a slow "
+        "error, as with the pose, or a correlated reference.",
+        out,
+    )
+
+
+def power_spectrum(period: float, rows: Array) -> tuple[Array, Array, Array]:
+    """Frequency (k,) Hz, power (k, m) of rows (n, m), 1 for white noise of unit variance, and degrees of freedom (k,).
+
+    Mean of half-overlapping pieces under a Hann window (Welch, IEEE Trans. Audio Electroacoust. 1967), over half
+    octaves.
+    """
+    size = min(_PIECE, len(rows))
+    window = np.hanning(size)
+    begins = range(0, len(rows) - size + 1, max(size // 2, 1))
+    pieces = np.array([rows[begin : begin + size] * window[:, None] for begin in begins])
+    power = (np.abs(np.fft.rfft(pieces, axis=1)[:, 1:-1]) ** 2).mean(axis=0) / (window**2).sum()
+    number = np.arange(1, len(power) + 1)
+    octave = np.unique(np.floor(2.0 * np.log2(number)), return_inverse=True)[1]
+    count = np.bincount(octave)
+    mean = np.stack([np.bincount(octave, column) / count for column in power.T], axis=1)
+    # Of a Hann window's lines two in three are independent, as are pieces that overlap by half all but nearly.
+    dof = np.maximum(2.0 * len(pieces) * count / 1.5, 2.0)
+    return np.bincount(octave, number) / count / (size * period), mean, dof
 
 
 def variables(calibration: Calibration) -> list[tuple[str, str, list[Quantity]]]:

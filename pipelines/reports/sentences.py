@@ -58,7 +58,18 @@ def headline(findings: Sequence[Finding], quantities: Quantities, verdicts: Mapp
     estimated = sum(verdict != "fixed" for verdict in verdicts.values())
     by_prior = [name for name, verdict in verdicts.items() if verdict == "prior"]
     but = f", {', '.join(by_prior)} by prior alone" if by_prior else ""
-    return f"{estimated} of {estimated} parameters meet the required accuracy{but}."
+    return f"{estimated} of {estimated} parameters meet the required accuracy{but}.{_warning(findings)}"
+
+
+def _warning(findings: Sequence[Finding]) -> str:
+    """That sigmas are mostly those of slow errors, after a sentence; empty where they are not."""
+    worst = slow_error(findings)
+    return f" Warning: sigmas × {worst:.2g} for slow errors of a sensor." if worst > SLOW_ERROR_WARNING else ""
+
+
+def slow_error(findings: Sequence[Finding]) -> float:
+    """Ratio of sandwich to nominal sigma, the largest of a required parameter; 1 where there is no finding on it."""
+    return max((float(f.evidence["ratio"]) for f in findings if f.kind == "slow_error"), default=1.0)
 
 
 @dataclass(frozen=True)
@@ -98,7 +109,9 @@ def short_verdict(
         return sentence(first, quantities), f"Do not use the values before the cause is found.{probable}"
     if state == "calibrated":
         closest = f"; the closest is {worst.name}, at {100.0 * worst.ratio:.2g} % of the requirement" if worst else ""
-        text = f"All {len(required)} required parameters are within their required accuracy{closest}."
+        text = (
+            f"All {len(required)} required parameters are within their required accuracy{closest}.{_warning(findings)}"
+        )
         return text, _APPLY
     directions = sum(f.kind == "direction" and f.severity == Severity.UNOBSERVABLE for f in findings)
     if state == "weak" or not directions:

@@ -47,7 +47,7 @@ from alidade.pipelines.solvers.error_budget import (
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize, without_rejected
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.marginal_likelihood import sandwich_of, solve_likelihood
+from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
 from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
@@ -228,9 +228,10 @@ def whole_estimate(
     covariance = posterior.covariance
     covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
     by = sigma_ratio(np.diag(posterior.covariance), np.diag(covariance))
-    sandwich, steps, wide = None, None, by
+    sandwich, steps, wide, innovations = None, None, by, dict[str, Residuals]()
     if problem.marginal_likelihood and isinstance(engine, Linearization) and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
+        innovations = innovations_of(compiled, solved.levels, solved.solution) if budget else innovations
         steps = largest_steps(compiled, solved.levels, solved.solution)
         widened = np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
@@ -251,6 +252,7 @@ def whole_estimate(
         converged=solved.solution.converged,
         message=solved.solution.message,
         residuals=residuals,
+        innovations=innovations,
         chi_square=chi_square(leverages(engine, system, found, values)),
         history=None if history is None else history.history.inflated(wide),
         posterior_history=history,

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from alidade.factors.chi_square import gate
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
-from alidade.pipelines.estimation.problem import Problem
+from alidade.pipelines.estimation.problem import Problem, Residuals
 from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
@@ -850,6 +850,21 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
         columns.append(J @ layout.root_columns(key)[:, layout.sizes[3] :])
     outliers = rejected(solution.engine, solution.values)
     return np.maximum(sandwich_ratio(chain, levels, outliers, np.concatenate(columns)), 1.0)
+
+
+def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> dict[str, Residuals]:
+    """Innovations by family at noise levels, white and of unit variance if the model is right; outliers have no say."""
+    assert isinstance(compiled.engine, Linearization)
+    assert isinstance(solution.engine, Linearization)
+    chain = LinearChain.of(compiled.engine, solution.values)
+    out = _by_row(chain, rejected(solution.engine, solution.values), 0.0)
+    variances = [np.where(o > 0.0, NO_SAY * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
+    limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
+    found = chain.innovations(variances, limits)
+    return {
+        chain.rows[k].family: Residuals(chain.rows[k].time, each.whitened[..., 0], out[k] == 0.0)
+        for k, each in found.items()
+    }
 
 
 def _keys(compiled: Compiled) -> list[int]:
