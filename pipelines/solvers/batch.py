@@ -51,7 +51,7 @@ from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwi
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
 from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
-from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated, without_onsets
 from alidade.pipelines.solvers.step_test import largest_steps
 from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
@@ -140,6 +140,13 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
                 problem = compiled.problem
     elif levels is None:
         solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, expected_squares)
+    if problem.loss is not None and not problem.marginal_likelihood and solution.converged:
+        rest = without_onsets(engine, solution)
+        if rest is not None:
+            weighted = apply_levels(rest, start)
+            solution = solve_truncated(weighted, solution.values, problem.loss, config.robust)
+            if levels is None:
+                solution, start = estimate_noise(rest, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
     kept = replace(solution, engine=without_rejected(solution.engine, solution.values))
     vars(kept).update(factorization=solution.factorization)

@@ -91,6 +91,7 @@ class Group:
         columns: for each block those (n or 1, dim) that its Jacobian is added to: of a bias node the shared ones of the
             first node and those of its deviation from that.
         deviates: for each block (n or 1,) whether it is a later node than the first.
+        excluded: (n,) measurements that do not count whatever their residuals; None: none.
     """
 
     family: str
@@ -107,6 +108,7 @@ class Group:
     row: Index
     columns: list[list[Index]]
     deviates: list[NDArray[np.bool_]]
+    excluded: NDArray[np.bool_] | None = None
 
     def evaluate(self, values: Values) -> Residuals:
         """Whitened residuals (n, m), unweighted, and their Jacobians on demand."""
@@ -134,13 +136,17 @@ class Group:
     def cost(self, residuals: Array) -> float:
         """Twice the sum of the losses of whitened residuals, unweighted."""
         squares = np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)]))
-        return float((squares if self.loss is None else self.loss.cost(squares)).sum())
+        return float(self._included(squares if self.loss is None else self.loss.cost(squares)).sum())
 
     def used(self, residuals: Array) -> Array:
         """Weights (n,) by the loss of measurements with these unweighted whitened residuals."""
         if self.loss is None:
-            return np.ones(len(residuals))
-        return self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)])))
+            return self._included(np.ones(len(residuals)))
+        return self._included(self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)]))))
+
+    def _included(self, each: Array) -> Array:
+        """Numbers (n,), zero for what is excluded."""
+        return each if self.excluded is None else np.where(self.excluded, 0.0, each)
 
     def whitened(self, values: Values) -> tuple[Array, tuple[Array, ...], float]:
         """Right side (n, m), Jacobian (n, m, dim) by each block, both under loss and weights; and the cost."""
@@ -148,7 +154,7 @@ class Group:
         factor = np.broadcast_to(np.sqrt(self.used(residuals))[:, None], residuals.shape)
         if self.weights is not None:
             factor = factor * self.weights
-        plain = self.weights is None and self.loss is None
+        plain = self.weights is None and self.loss is None and self.excluded is None
         jacobians = tuple(J if plain else factor[..., None] * J for J in linearize())
         return -factor * residuals, jacobians, self.cost(residuals)
 

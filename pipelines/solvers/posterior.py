@@ -225,8 +225,8 @@ class Leverage:
 
 
 def counted(group: Group, values: Values) -> NDArray[np.bool_]:
-    """Mask (n,) of measurements that the loss does not reject."""
-    if group.loss is None:
+    """Mask (n,) of measurements that are neither rejected by the loss nor excluded."""
+    if group.loss is None and group.excluded is None:
         return np.ones(len(group.model.time), dtype=bool)
     return np.asarray(group.used(group.evaluate(values)[0]) > 0.0)
 

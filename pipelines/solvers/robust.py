@@ -22,6 +22,7 @@ import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines import deadline
+from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, System, minimize
@@ -164,6 +165,29 @@ def _undecided(engine: Engine, values: Values) -> float:
 def _norms(group: Group, values: Values) -> Array:
     """Whitened norms (n,) of measurements."""
     return np.linalg.norm(group.weighted(group.evaluate(values)[0]), axis=1)
+
+
+def without_onsets(engine: Engine, solution: Solution) -> Engine | None:
+    """The engine without what lies at the smooth ends of disturbed intervals; None where there are none.
+
+    Of vectors alone: one component of a disturbance varies with the attitude.
+    """
+    found: dict[str, list[tuple[int, Array, Array, Array]]] = {}
+    for i, group in enumerate(solution.engine.groups):
+        if group.loss is not None and group.model.rows > 1:
+            residuals = group.evaluate(solution.values)[0]
+            norms = np.linalg.norm(group.weighted(residuals), axis=1)
+            found.setdefault(group.family, []).append((i, group.model.time, norms, group.used(residuals) == 0.0))
+    groups = list(engine.groups)
+    for parts in found.values():
+        time, norms, rejected = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
+        order, excluded = np.argsort(time, kind="stable"), np.zeros(len(time), dtype=bool)
+        excluded[order] = onsets(time[order], norms[order], rejected[order])
+        ends = np.cumsum([len(each[1]) for each in parts])
+        for (i, *_), own in zip(parts, np.split(excluded, ends[:-1]), strict=True):
+            if own.any():
+                groups[i] = replace(groups[i], excluded=own)
+    return engine.with_groups(groups) if any(g.excluded is not None for g in groups) else None
 
 
 def _mostly_rejected(engine: Engine, values: Values, chance: float) -> set[str]:

@@ -12,6 +12,7 @@ import pytest
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.disturbances import disturbances
+from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.estimation.problem import Estimate, Residuals
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
@@ -45,29 +46,44 @@ def _named(found: Any) -> list[tuple[float, float]]:
 @pytest.mark.parametrize("kind", ["", "motor", "ring"])
 def test_disturbed_interval_is_named_and_the_rest_is_calibrated(kind: str, gyro: bool) -> None:
     calibration = Session.of(TUMBLE, _disturbed(kind, gyro, 0)).calibrate(report=False)
-    # The ends of a ring's approach are below the gate, and bias what a gyro makes precise.
-    assert calibration.status == "calibrated" or (kind == "ring" and gyro)
+    assert calibration.status == "calibrated"
     named = _named(calibration.findings)
     if not kind:
         assert named == []
         return
     ((since, until),) = named
-    begin, end = (_BEGIN, _END) if kind == "motor" else (12.5, 15.5)
+    # What a ring adds exceeds the gate from 12.6 to 15.5 s; of vectors half of that at either end is left out too.
+    begin, end = {"motor": (_BEGIN, _END), "ring": (11.1, 17.0) if gyro else (12.5, 15.5)}[kind]
     assert since == pytest.approx(begin, abs=0.7)
     assert until == pytest.approx(end, abs=0.7)
 
 
-@pytest.mark.parametrize("gyro", [False, True])
-def test_sigmas_are_true_beside_a_motor_current(gyro: bool) -> None:
+@pytest.mark.parametrize(("kind", "gyro", "seeds"), [("motor", False, 8), ("motor", True, 4), ("ring", True, 4)])
+def test_sigmas_are_true_beside_a_disturbance(kind: str, gyro: bool, seeds: int) -> None:
     total, dof = 0.0, 0
-    for seed in range(4 if gyro else 8):
-        simulated = _disturbed("motor", gyro, seed)
+    for seed in range(seeds):
+        simulated = _disturbed(kind, gyro, seed)
         estimate: Estimate = Session.of(TUMBLE, simulated).calibrate(report=False).estimate
         rows = [i for i, n in enumerate(estimate.names) if n in simulated.truth and estimate.covariance[i, i] > 0.0]
         error = estimate.values[rows] - [simulated.truth[estimate.names[i]] for i in rows]
         total += float(error @ np.linalg.solve(estimate.covariance[np.ix_(rows, rows)], error))
         dof += len(rows)
     assert quantile(0.005, dof) < total < quantile(0.995, dof), f"NEES {total:.1f} for {dof}"
+
+
+@pytest.mark.parametrize("smooth", [True, False])
+def test_only_smooth_ends_of_a_disturbance_are_left_out(smooth: bool) -> None:
+    rng, t = np.random.default_rng(0), np.arange(0.0, 40.0, 0.05)
+    shape = 90.0 / (1.0 + ((t - 14.0) / 0.6) ** 2) ** 1.5 if smooth else 36.0 * (abs(t - 14.0) < 1.7)
+    norms = np.abs(shape + rng.standard_normal(len(t)))
+    excluded = t[onsets(t, norms, norms > 4.0)]
+    if not smooth:
+        assert not len(excluded)
+        return
+    assert excluded[0] == pytest.approx(14.0 - 3.2, abs=0.4)
+    assert excluded[-1] == pytest.approx(14.0 + 3.2, abs=0.4)
+    # Half a sigma is left.
+    assert shape[~np.isin(t, excluded)].max() < 1.0
 
 
 def test_independent_outliers_are_no_disturbance() -> None:
