@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +15,10 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods.los.model import problem
+from alidade.pipelines.methods.los.parameters import GYRO_SLOPE, NUISANCE
 from alidade.pipelines.methods.los.published import recursive_least_squares
 from alidade.pipelines.methods.los.recording import LosData, read_los
-from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
+from alidade.pipelines.methods.los.simulation import LosAngles, LosNoise, LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config, Noise, Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
@@ -388,3 +389,66 @@ def test_encoders_read_late_while_the_carrier_swings_fast(
     assert _nees(estimate, truth) < quantile(1 - 1e-3, len(estimate.values))
     assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
     assert estimate.sigmas[estimate.names.index("encoder_delay")] < 5e-5
+
+
+# Sensors of three grades: the gyro's bias at the start, rad/s, and noises where they are not those of the simulator.
+GRADES: tuple[tuple[float, dict[str, float]], ...] = (
+    (2e-5, {"gyro_density": 5e-6, "encoder": 2e-6, "los_error": 1e-5}),
+    (1e-4, {}),
+    (2e-3, {"gyro_density": 3e-4, "gyro_bias_walk": 2e-6, "encoder": 5e-5, "los_error": 2e-4}),
+)
+
+
+def _combination(seed: int, shortest_s: float, longest_s: float) -> LosScenario:
+    """Three to six effects, drawn from their priors and not stated; any mounts, sensors of three grades, any motion."""
+    rng, (turn_on_bias, noise) = np.random.default_rng([seed, 77]), GRADES[seed % len(GRADES)]
+    specs = [spec for spec in NUISANCE if spec != GYRO_SLOPE]
+    chosen = set(rng.choice(len(specs), rng.integers(3, 7), replace=False).tolist())
+    effects = {
+        name: float(rng.normal(scale=spec.prior)) if i in chosen else 0.0
+        for i, spec in enumerate(specs)
+        for name in spec.names
+    }
+    swings = {
+        axis: [
+            Swing(
+                amplitude_deg=float(rng.uniform(2.0, 8.0)),
+                frequency_hz=float(np.exp(rng.uniform(np.log(0.08), np.log(0.8)))),
+                phase_deg=float(rng.uniform(0.0, 360.0)),
+            )
+            for _ in range(2)
+        ]
+        for axis in ("roll", "pitch", "yaw")
+    }
+    mounts = np.rad2deg(0.1) * rng.normal(size=5)
+    return LosScenario(
+        duration_s=float(np.exp(rng.uniform(np.log(shortest_s), np.log(longest_s)))),
+        carrier=EulerMotion(**swings),
+        azimuth_deg=float(rng.uniform(-180.0, 180.0)),
+        elevation_deg=float(rng.uniform(-40.0, 50.0)),
+        angles_deg=LosAngles(**dict(zip(LosAngles.model_fields, mounts.tolist(), strict=True))),
+        noise=LosNoise(**noise),
+        gyro_turn_on_bias=turn_on_bias,
+        gyro_rate_hz=float(rng.uniform(400.0, 600.0)),
+        gimbal_rate_hz=float(rng.uniform(20.0, 400.0)),
+        image_rate_hz=float(rng.uniform(5.0, 30.0)),
+        effects=effects,
+    )
+
+
+@pytest.mark.parametrize(
+    ("seeds", "longest_s"),
+    [((1, 2), 16.0), *(pytest.param(range(a, a + 14), 200.0, marks=pytest.mark.slow) for a in (0, 14, 28))],
+)
+def test_errors_of_several_effects_at_once_stay_within_their_sigmas(seeds: Sequence[int], longest_s: float) -> None:
+    found = []
+    for seed in seeds:
+        scenario = _combination(seed, 15.0, longest_s)
+        data, truth = simulate_los(scenario, seed)
+        estimate = solve_batch(problem(data, _config(scenario)))
+        assert estimate.converged, seed
+        found.append(np.abs(_errors(estimate, truth)) / estimate.sigmas)
+        assert found[-1][: estimate.names.index("camera_roll")].max() < 4.0, seed
+    # Most effects are absent: errors are smaller than sigmas that count with all of them.
+    shares = [np.mean(np.concatenate(found) < limit) for limit in (1.0, 2.0, 3.0)]
+    assert (np.array(shares) > [0.64, 0.94, 0.985]).all(), shares
