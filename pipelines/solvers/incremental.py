@@ -337,9 +337,9 @@ class IncrementalSolver:
 
     def finish(self, seconds: float) -> Estimate:
         """The estimate after the last step, as batch has it. More steps may follow."""
+        if self.initialising and len(self.steps_since) > self._of[0]:
+            self._solve_batch()  # which may end the initialisation phase
         if self.initialising:
-            if len(self.steps_since) > self._of[0]:
-                self._solve_batch()
             self._estimate = self._with_own_history(whole_estimate(self._batch(), BatchConfig()))
         return replace(self.estimate(), seconds={"solve": seconds})
 
