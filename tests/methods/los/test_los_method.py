@@ -15,10 +15,11 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods.los.model import problem
-from alidade.pipelines.methods.los.parameters import GYRO_SLOPE, NUISANCE
+from alidade.pipelines.methods.los.parameters import NUISANCE
 from alidade.pipelines.methods.los.published import recursive_least_squares
 from alidade.pipelines.methods.los.recording import LosData, read_los
 from alidade.pipelines.methods.los.simulation import LosAngles, LosNoise, LosScenario, los_config, simulate_los
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config, Noise, Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
