@@ -177,6 +177,10 @@ class Band:
     coefficients: Array | None = None
 
 
+# Unit -> largest error of a direction, which linear bands exceed where it is not determined.
+_LARGEST = {"deg": 180.0, "mrad": 1e3 * np.pi}
+
+
 @dataclass(frozen=True)
 class UseBands:
     """A use with the band of each of its lines; `drawn`: bounds are quantiles of draws."""
@@ -186,9 +190,10 @@ class UseBands:
     drawn: bool = False
 
     def figure(self, values: Callable[[Band], Array]) -> float:
-        """The headline figure of a value of the bands, in the use's unit."""
-        at = self.use.at
-        return self.use.factor * max(float(v.max() if at is None else v[at]) for v in map(values, self.bands.values()))
+        """The headline figure of a value of the bands, in the use's unit; of an angle half a turn at most."""
+        at, most = self.use.at, _LARGEST.get(self.use.unit, np.inf)
+        found = max(float(v.max() if at is None else v[at]) for v in map(values, self.bands.values()))
+        return float(min(self.use.factor * found, most))
 
     @property
     def before(self) -> float:

@@ -49,6 +49,13 @@ def test_bands_cover_95_percent_of_exact_errors_at_every_operating_point(name: s
             assert known.max() < 0.96, (found.use.name, line, known.max())
 
 
+def test_an_undetermined_direction_is_off_by_half_a_turn_at_most() -> None:
+    """A compass that was turned on the spot: linear bands before calibration are many turns wide."""
+    c = alidade.calibrate(alidade.simulate("tumble", "tumble_car", seed=3))
+    (heading,) = (found for found in c.uses if found.use.unit == "deg")
+    assert 90.0 < heading.after <= heading.before == 180.0
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_true_values_applied_leave_no_error(name: str) -> None:
     """Readings of a sensor with some parameters, through the formulas with the same ones."""
