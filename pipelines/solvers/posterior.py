@@ -404,6 +404,8 @@ def sqrt_information(
     reported = Reported.of(problem, layout, values, current_keys)
     c, J = layout.sizes[3], reported.jacobian
     inverse = np.linalg.pinv(J)[c:]
+    # Rounding, which units that differ by many orders make large.
+    inverse[np.abs(inverse) < UNSEEN * np.abs(inverse).max(initial=0.0)] = 0.0
     named = np.array([name in device for name in reported.names], dtype=bool)
     scales = np.array([q.prior_scale for q in problem.quantities])
     groups, prior_R, prior_d = [], [np.empty((0, len(reported.free)))], [np.empty(0)]
