@@ -67,14 +67,15 @@ def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Ar
         about_n = noise.mean(axis=0) / len(wxyz)
         return Reference(np.tile(whole, (len(poses), 1)), _on_the_right(whole, about_n, len(poses)), False, BRC)
     means, covariances = [], []
-    for start, stop in poses.span:
+    for (start, stop), seen in zip(poses.span, poses.tags, strict=True):
         rows = (data.reference_t >= start) & (data.reference_t <= stop)
         if not rows.any():
             raise InputError(
                 f"topic {config.topic(REFERENCE_IMU)}: no attitude of the moving reference between {start:.3f} and "
                 f"{stop:.3f} s, while the cube stood still"
             )
-        mean, _ = _mean(wxyz[rows])
+        # When the pictures were taken: it moves on while there is none.
+        mean, _ = _mean(wxyz[rows] if seen is None else so3.interpolate(data.reference_t, wxyz, seen.t))
         means.append(mean)
         covariances.append(_on_the_right(mean, noise[rows].mean(axis=0) / rows.sum(), 1)[0])
     return Reference(np.array(means), np.array(covariances), True, BRC)

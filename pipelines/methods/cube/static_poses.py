@@ -12,7 +12,14 @@ from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, computed_once, noise_densities, nominal
+from alidade.pipelines.methods.cube.recording import (
+    CubeConfig,
+    CubeData,
+    Sightings,
+    computed_once,
+    noise_densities,
+    nominal,
+)
 from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.recording.checks import count
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -24,6 +31,9 @@ if TYPE_CHECKING:
 
 # Corners this many sigmas from the median of their pose are left out of its mean.
 _FAR = 6.0
+# Corners that are this many sigmas from their median in half of the pictures move; at rest the largest of a tag's eight
+# numbers is 1.7 sigmas away.
+_MOVED = 3.0
 # What stays of a corner's error when pictures of a tag at rest are averaged, px.
 _CORNER_BIAS = 0.01
 # A tag misses the layout when its corners miss the pose by this share of its side (one made by hand is good to half
@@ -39,12 +49,14 @@ class SeenTags:
         ids: (k,), ascending.
         corners: (k, 4, 2) px, means over the pictures.
         covariance: (k, 4, 2, 2) px^2, of the means.
+        t: (F,) s, stamps of the pictures.
         pose: of the cube in the camera, with the layout as given.
     """
 
     ids: NDArray[np.int64]
     corners: Array
     covariance: Array
+    t: Array
     pose: BodyPose
 
 
@@ -148,10 +160,10 @@ def _seen_tags(
         expected = None
         if last is not None:
             expected = so3.multiply(last[1], path.increments(np.array([last[0]]), np.array([start])).wxyz[0])
-        tags = _tags_in(data, config, start, stop)
+        tags, t = _tags_in(data, config, start, stop)
         if len(tags.ids) > 1:
             several.append(tags)
-        seen = _seen_in(tags, data, body, expected, wrong, dropped)
+        seen = _seen_in(tags, t, data, body, expected, wrong, dropped)
         found.append(seen)
         if seen is not None:
             last = float(stop), seen.pose.cRb
@@ -163,23 +175,45 @@ def _seen_tags(
     return tuple(found)
 
 
-def _tags_in(data: CubeData, config: Config, start: float, stop: float) -> Detections:
-    """The tags in the pictures taken from start to stop, their corners averaged."""
+def _tags_in(data: CubeData, config: Config, start: float, stop: float) -> tuple[Detections, Array]:
+    """The tags in the pictures taken from start to stop, their corners averaged, and the stamps of these pictures.
+
+    Where the corners move, as before a camera that does, all tags are averaged over the same pictures.
+    """
     from alidade.pipelines.vision.tags import Detections
 
     seen = data.sightings
     assert seen is not None
     rows = np.flatnonzero((seen.t[seen.frame] >= start) & (seen.t[seen.frame] <= stop))
+    if not len(rows):
+        return Detections(seen.ids[rows], np.empty((0, 4, 2)), np.empty((0, 4, 2, 2))), np.empty(0)
     ids = np.unique(seen.ids[rows])
-    if not len(ids):
-        return Detections(ids, np.empty((0, 4, 2)), np.empty((0, 4, 2, 2)))
+    moved = [np.median(_away(seen.corners[rows[seen.ids[rows] == tag]])) for tag in ids]
+    if max(moved) > _MOVED * _corner_px(config):
+        rows = _in_common(seen, rows)
+        ids = np.unique(seen.ids[rows])
     averages = [_mean_corners(data, config, rows[seen.ids[rows] == tag]) for tag in ids]
     corners, covariance = (np.array(column) for column in zip(*averages, strict=True))
-    return Detections(ids, corners, covariance)
+    return Detections(ids, corners, covariance), seen.t[np.unique(seen.frame[rows])]
+
+
+def _away(corners: Array) -> Array:
+    """How far the corners (n, 4, 2) of each picture are from their median, (n,) px, at most."""
+    return np.asarray(np.abs(corners - np.median(corners, axis=0)).max(axis=(1, 2)))
+
+
+def _in_common(seen: Sightings, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The rows of one set of tags in the pictures that show all of it: the set with most of them."""
+    frames, ids = seen.frame[rows], seen.ids[rows]
+    shown = {frame: frozenset(ids[frames == frame].tolist()) for frame in frames.tolist()}
+    pictures = {tags: [frame for frame, whole in shown.items() if whole >= tags] for tags in shown.values()}
+    best = max(pictures, key=lambda tags: len(tags) * len(pictures[tags]))
+    return rows[np.isin(frames, pictures[best]) & np.isin(ids, list(best))]
 
 
 def _seen_in(
     tags: Detections,
+    t: Array,
     data: CubeData,
     body: TagBody,
     expected: Array | None,
@@ -206,7 +240,7 @@ def _seen_in(
         count(dropped, "static pose whose tags do not fit the layout", 1)
         return None
     keep = np.isin(tags.ids, pose.ids)
-    return SeenTags(tags.ids[keep], tags.corners[keep], tags.covariance[keep], pose)
+    return SeenTags(tags.ids[keep], tags.corners[keep], tags.covariance[keep], t, pose)
 
 
 def _mean_corners(data: CubeData, config: Config, rows: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -218,7 +252,7 @@ def _mean_corners(data: CubeData, config: Config, rows: NDArray[np.intp]) -> tup
         covariance = seen.covariance[rows].mean(axis=0)
     else:
         covariance = np.tile(_corner_px(config) ** 2 * np.eye(2), (4, 1, 1))
-    away = np.abs(corners - np.median(corners, axis=0)).max(axis=(1, 2))
+    away = _away(corners)
     sigma = float(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max()))
     good = away <= _FAR * max(sigma, float(np.median(away)))
     bias = 0.0 if seen.covariance is None else _CORNER_BIAS
