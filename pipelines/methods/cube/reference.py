@@ -75,7 +75,8 @@ def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Ar
                 f"{stop:.3f} s, while the cube stood still"
             )
         # When the pictures were taken: it moves on while there is none.
-        mean, _ = _mean(wxyz[rows] if seen is None else so3.interpolate(data.reference_t, wxyz, seen.t))
+        at = data.reference_t[rows] if seen is None else np.clip(seen.t, data.reference_t[0], data.reference_t[-1])
+        mean, _ = _mean(so3.interpolate(data.reference_t, wxyz, at))
         means.append(mean)
         covariances.append(_on_the_right(mean, noise[rows].mean(axis=0) / rows.sum(), 1)[0])
     return Reference(np.array(means), np.array(covariances), True, BRC)
