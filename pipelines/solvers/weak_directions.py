@@ -124,7 +124,11 @@ class WeakDirections:
         if w:
             prior = np.linalg.inv(weak.T @ precision @ weak)
             root = np.hstack([root, slope @ np.linalg.cholesky(prior)])
-        turned, sigmas, _ = np.linalg.svd(root, full_matrices=False)
+        try:
+            turned, sigmas, _ = np.linalg.svd(root, full_matrices=False)
+        except np.linalg.LinAlgError:  # LAPACK's divide and conquer, rarely, where columns differ by many decades
+            _, sigmas, axes = np.linalg.svd(root.T, full_matrices=False)
+            turned = axes.T
         order = np.argsort(sigmas)
         strong, sigmas = others @ turned[:, order], sigmas[order]
         beyond = sigmas**2 > BEYOND * np.einsum("ia,ia->a", strong, np.linalg.solve(precision, strong))
