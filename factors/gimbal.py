@@ -193,11 +193,12 @@ def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
 
 
 def _smoothing(at: Array, t: Array, values: Array) -> float:
-    """Half width, s, of the windows: the longest in which samples (N, d) near the times are predicted about best.
+    """Half width, s, of the windows: the longest in which samples (N, d) between the times are predicted about best.
 
     Each sample by the others; of the squared errors the median, so that a few samples beside a slew do not count.
     """
-    rows = np.clip(np.searchsorted(t, at[:: len(at) // _TRIED + 1]), 0, len(t) - 1)
+    begin, end = np.clip(np.searchsorted(t, [at.min(), at.max()]), 0, len(t) - 1).tolist()
+    rows = np.arange(begin, end + 1, (end - begin) // _TRIED + 1)
     errors = []
     for half in WINDOWS:
         # At its middle a cubic's own sample has 9/4 of a mean's weight.

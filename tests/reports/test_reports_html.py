@@ -79,7 +79,7 @@ def test_long_recordings_are_thinned_and_outliers_are_not_lost() -> None:
     rows = np.random.default_rng(0).standard_normal((n, 2))
     rows[~used] = 50.0
     calibration = make_calibration(residuals={"vision": Residuals(np.arange(n) / 100.0, rows, used)}, history=None)
-    residuals, squares, _ = common_plots(calibration)
+    residuals, squares, *_ = common_plots(calibration)
     for plot in (residuals, squares):
         assert max(len(column) for mark in plot.figure.marks for column in mark.columns.values()) <= 3000
     (rejected,) = residuals.figure.named("rejected (length)")
