@@ -272,14 +272,14 @@ class _Errors:
     worst: list[float] = field(default_factory=list)
     messages: list[str] = field(default_factory=list)
 
-    def add(self, time: float, estimate: Estimate) -> None:
+    def add(self, time: float, estimate: Estimate, has_to_converge: bool = True) -> None:
         """Compare an estimate with the truth."""
         true, sigmas = _nearest(self.problem, self.truth, estimate.values), estimate.sigmas
         free = sigmas > 0.0
         self.moments.append(time)
         self.nees.append(nees(estimate.values, estimate.covariance, true)[0])
         self.worst.append(float(np.max(np.abs(estimate.values - true)[free] / sigmas[free])))
-        self.messages.extend([] if estimate.converged else [estimate.message])
+        self.messages.extend([estimate.message] if has_to_converge and not estimate.converged else [])
 
     def result(self) -> Followed:
         """All of them."""
@@ -303,7 +303,8 @@ def followed(problem: Problem, truth: Array, moments: Array) -> Followed:
     for step in problem.steps(1):
         run.add_step(step)
         if len(errors.nees) < len(moments) and step.time >= moments[len(errors.nees)]:
-            errors.add(step.time, run.estimate())
+            # While a run begins, what does not converge is at its priors.
+            errors.add(step.time, run.estimate(), has_to_converge=not run.initialising)
     final = run.finish(0.0)
     errors.messages.extend([] if final.converged else [final.message])
     return errors.result()
