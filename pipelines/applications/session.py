@@ -500,9 +500,10 @@ class Session:
 def open_session(
     path: Where, method: str | None = None, config: Path | Config | None = None, strict: bool = False, **more: Any
 ) -> Session:
-    """Read a recording: a file, a folder of parts, a pattern, or a list of parts; `more` as `Session.read` has it.
+    """Open a recording for calibration: a file, a folder of parts, a pattern of names, or a list of parts.
 
-    With `strict` one of which anything is lost is refused. Raises InputError.
+    With `strict` one of which anything is lost is refused; `more` are further arguments of `Session.read`. Raises
+    InputError.
     """
     start = time.perf_counter()
     with progress.doing("reading"):

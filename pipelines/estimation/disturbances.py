@@ -18,7 +18,7 @@ _SMOOTH = 0.5
 
 
 def intervals(rejected: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and one past the last measurement of each interval of measurements (n,) in time order.
+    """Disturbed intervals of measurements (n,) in time order: index of the first of each, and one past the last.
 
     An interval maximises the sum of log likelihood ratios of its measurements, outliers with a share of `_WITHIN`
     against outliers with the recording's share; with n measurements that sum exceeds log(n / p) with a probability of

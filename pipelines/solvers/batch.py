@@ -232,9 +232,10 @@ def whole_estimate(
     if budget or correlations:
         influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
         added = added_covariance(influence, correlations)
-    covariance = posterior.covariance
+    nominal = posterior.covariance
+    covariance = nominal.copy()
     covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
-    by = sigma_ratio(np.diag(posterior.covariance), np.diag(covariance))
+    by = sigma_ratio(np.diag(nominal), np.diag(covariance))
     sandwich, steps, wide, innovations = None, None, by, dict[str, Residuals]()
     if problem.marginal_likelihood and isinstance(engine, Linearization) and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
@@ -244,7 +245,7 @@ def whole_estimate(
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
     system, history = posterior.system, None
     if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
-        final = posterior.reported.numbers, posterior.covariance
+        final = posterior.reported.numbers, nominal
         history = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time, final)
     residuals = residuals_by_family(engine, values)
     out = Estimate(

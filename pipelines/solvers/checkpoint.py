@@ -128,12 +128,16 @@ def finite_measurements(step: Step, values: gtsam.Values) -> Step:
 
 def counted_apart(steps: Sequence[Step], kept: Sequence[Step]) -> dict[str, int]:
     """Family -> number of measurements of some steps that are not in those kept."""
+    return dict(_measurements(steps) - _measurements(kept))
+
+
+def _measurements(steps: Sequence[Step]) -> Counter[str]:
+    """Number of measurements by family."""
     count: Counter[str] = Counter()
-    for sign, each in ((1, steps), (-1, kept)):
-        for f in (f for step in each for f in step.factors if f.measurement is not None):
-            assert f.measurement is not None
-            count[f.family] += sign * len(f.measurement.model.time)
-    return {family: n for family, n in count.items() if n}
+    for step in steps:
+        for f in step.factors:
+            count[f.family] += 0 if f.measurement is None else len(f.measurement.model.time)
+    return count
 
 
 def _is_finite(factor: Factor, values: gtsam.Values) -> bool:

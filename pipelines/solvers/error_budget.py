@@ -258,7 +258,7 @@ def added_covariance(influence: Influence, correlations: Mapping[str, Array]) ->
 
 
 def _correlated(L: Array, correlation: Array) -> Array:
-    """L'TL (m, m) of influences L (n, r, m), T with a correlation (K,) at the lags 1 ... K, both ways."""
+    """Covariance L'TL (m, m) of numbers by noise of correlation T, (K,) at lags 1 ... K, and influences L (n, r, m)."""
     size = 1 << (2 * len(L) - 1).bit_length()
     kernel = np.fft.rfft(
         np.concatenate([[0.0], correlation, np.zeros(size - 2 * len(correlation) - 1), correlation[::-1]])

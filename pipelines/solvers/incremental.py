@@ -340,7 +340,7 @@ class IncrementalSolver:
         if self.initialising and len(self.steps_since) > self._of[0]:
             self._solve_batch()  # which may end the initialisation phase
         if self.initialising:
-            self._estimate = self._with_own_history(whole_estimate(self._batch(), BatchConfig()))
+            self._estimate = self._estimate_of(self._batch())
         return replace(self.estimate(), seconds={"solve": seconds})
 
     def estimate(self) -> Estimate:
@@ -349,18 +349,16 @@ class IncrementalSolver:
             return self._filtered()
         if self._estimate is None:
             solved = self._batch()
-            self._estimate = self._with_own_history(
-                whole_estimate(replace(solved, posterior=self._posterior_of(solved)), BatchConfig())
-            )
+            self._estimate = self._estimate_of(replace(solved, posterior=self._posterior_of(solved)))
         return self._estimate
 
-    def _with_own_history(self, estimate: Estimate) -> Estimate:
-        """An estimate of a batch solution, with what was known over time."""
-        message = self.trouble or "all steps taken"
+    def _estimate_of(self, solved: Solved) -> Estimate:
+        """Everything that is reported of a batch solution, with what was known over time."""
+        estimate = whole_estimate(solved, BatchConfig())
         return replace(
             estimate,
             solver="incremental",
-            message=message,
+            message=self.trouble or "all steps taken",
             history=self._history(estimate.inflation),
             rejected=self.gate.rejected(),
         )
@@ -514,7 +512,7 @@ class IncrementalSolver:
     # -- batch solutions
 
     def _solve_batch(self) -> None:
-        """Solve everything since the marginal in batch; start the smoother from it, or end the initialisation phase."""
+        """Solve everything since the marginal in batch; once that is linear enough, start the smoother from it."""
         solved = self._batch_solution(self._all_steps_since())
         if self.marginal is None:
             self.gate.adopt(residuals_by_family(solved.engine, solved.solution.values))
@@ -524,10 +522,9 @@ class IncrementalSolver:
             self.moments += 1
             if self._beyond.any():
                 # Second order that has once gone far enough does so from then on.
-                posterior = solved.posterior
-                kept = replace(solved.solution, engine=without_rejected(solved.engine, solved.solution.values))
-                keys = solved.compiled.current_keys
-                self._beyond[posterior.reported.free] &= beyond_second_order(self.problem, kept, posterior, keys)
+                engine = without_rejected(solved.engine, solved.solution.values)
+                beyond = beyond_second_order(self.problem, engine, solved.posterior, solved.compiled.current_keys)
+                self._beyond[solved.posterior.reported.free] &= beyond
             if since < self.config.max_initialisation and not self._is_linear(solved):
                 self._record()
                 return
@@ -544,7 +541,7 @@ class IncrementalSolver:
         self._record()
 
     def _is_linear(self, solved: Solved) -> bool:
-        """Whether no calibrated direction is weak, and second-order terms are a small share of every variance."""
+        """Whether a smoother can continue from a solution: no weak direction, a small share of second order."""
         if self.trouble or len(self.steps_since) < self.config.min_steps or self.gate.too_few_to_decide():
             return False
         posterior = solved.posterior

@@ -187,6 +187,11 @@ class LinearChain:
         rows = tuple(replace(r, states=tuple((last - i, J) for i, J in r.states[::-1])) for r in self.rows)
         return replace(self, rows=rows)
 
+    @property
+    def limits(self) -> list[float]:
+        """Gate of the squared innovations of each kind of rows."""
+        return [gate(rows.residuals.shape[1]) ** 2 for rows in self.rows]
+
     def variances(self, levels: Sequence[Level]) -> list[Array]:
         """Variances (n,) of each kind of rows, over the stated ones."""
         return [_variance(rows, levels) for rows in self.rows]
@@ -513,10 +518,10 @@ def widened(
     """
     variances = chain.variances(levels)
     before = [out > 0.0 for out in _by_row(chain, rejected, 0.0)]
-    kept = [np.where(out, NO_SAY * v, v) for out, v in zip(before, variances, strict=True)]
+    kept = _without_say(variances, before)
     # Only what was rejected is judged by the residuals that the solution leaves.
     residuals = _residuals_of(chain, kept) if any(out.any() for out in before) else [r.residuals for r in chain.rows]
-    limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
+    limits = chain.limits
     wide: dict[int, Array] = {}
     outlying: dict[int, NDArray[np.bool_]] = {}
     for kind, each in chain.innovations(kept, limits).items():
@@ -567,8 +572,7 @@ def sandwich_ratio(
         rejected: group -> (n,) outliers.
         reported: (r, p) derivatives of the numbers.
     """
-    out = _by_row(chain, rejected, 0.0)
-    variances = [np.where(o > 0.0, NO_SAY * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
+    variances = _without_say(chain.variances(levels), _by_row(chain, rejected, 0.0))
     nominal, robust, blocks = sandwich(chain, variances)
     above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
     ratio = np.sqrt(np.divide(above, below, out=np.ones_like(below), where=below > 0.0))
@@ -587,11 +591,10 @@ def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = 
         variances: (n,) of each kind of rows.
         at: (p,) the solution, from where the chain is about it; None: there.
     """
-    limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
     p = chain.prior.shape[1] - 1
     known = chain.prior[:, :p].T @ chain.prior[:, :p]
     information, middle, blocks = known.copy(), known.copy(), 0
-    for kind, each in chain.innovations(variances, limits, by_shared=True).items():
+    for kind, each in chain.innovations(variances, chain.limits, by_shared=True).items():
         time = chain.rows[kind].time
         G = each.whitened[..., 1:]
         e = each.whitened[..., 0] + (0.0 if at is None else G @ at)
@@ -608,6 +611,11 @@ def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = 
 def _square(S: Array, y: Array) -> Array:
     """y' S^-1 y, (n,)."""
     return np.asarray(np.einsum("ni,ni->n", y, np.linalg.solve(S, y[..., None])[..., 0]))
+
+
+def _without_say(variances: Sequence[Array], out: Sequence[NDArray[Any]]) -> list[Array]:
+    """Variances (n,) of each kind of rows, those of outliers, 1 in `out`, so large that they have no say."""
+    return [np.where(o > 0.0, NO_SAY * v, v) for o, v in zip(out, variances, strict=True)]
 
 
 def _by_row(chain: LinearChain, of: Mapping[int, NDArray[Any]] | None, otherwise: float) -> list[Array]:
@@ -858,9 +866,7 @@ def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Soluti
     assert isinstance(solution.engine, Linearization)
     chain = LinearChain.of(compiled.engine, solution.values)
     out = _by_row(chain, rejected(solution.engine, solution.values), 0.0)
-    variances = [np.where(o > 0.0, NO_SAY * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
-    limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
-    found = chain.innovations(variances, limits)
+    found = chain.innovations(_without_say(chain.variances(levels), out), chain.limits)
     return {
         chain.rows[k].family: Residuals(chain.rows[k].time, each.whitened[..., 0], out[k] == 0.0)
         for k, each in found.items()

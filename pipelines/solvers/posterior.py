@@ -225,7 +225,7 @@ class Leverage:
 
 
 def counted(group: Group, values: Values) -> NDArray[np.bool_]:
-    """Mask (n,) of measurements that are neither rejected by the loss nor excluded."""
+    """Mask (n,) of a group's measurements that count: neither rejected by its loss nor excluded."""
     if group.loss is None and group.excluded is None:
         return np.ones(len(group.model.time), dtype=bool)
     return np.asarray(group.used(group.evaluate(values)[0]) > 0.0)

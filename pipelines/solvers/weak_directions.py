@@ -351,7 +351,7 @@ def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
 
 
 def beyond_second_order(
-    problem: Problem, minimum: Solution, found: Posterior, current_keys: Mapping[int, int]
+    problem: Problem, engine: Engine, found: Posterior, current_keys: Mapping[int, int]
 ) -> NDArray[np.bool_]:
     """Which free numbers (m,), those of one variable together, are part of terms of higher than second order.
 
@@ -360,14 +360,15 @@ def beyond_second_order(
 
     Args:
         problem: of which the reported numbers are.
-        minimum, current_keys: see `constrained_solution`.
-        found: its posterior.
+        engine: of its factors, without the measurements that are rejected.
+        found: the posterior.
+        current_keys: see `constrained_solution`.
     """
     reported, directions = found.reported, found.directions
     left = np.ones(len(reported.free), dtype=bool)
     linear = directions.again(reported.root(found.factorization.root).R)
     ways = np.random.default_rng(0).standard_normal((len(linear.axes), THIRD_DRAWS))
-    roots = partial(moved_roots, problem, minimum.engine, found, current_keys)
+    roots = partial(moved_roots, problem, engine, found, current_keys)
     follows = linear.followers & (linear.sigmas < KNOWN)[:, None]
     try:
         half, whole = (slopes(linear, roots, follows, length * ways) for length in (0.5, 1.0))

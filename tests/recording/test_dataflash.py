@@ -163,9 +163,9 @@ def test_a_tumble_from_an_ardupilot_log(alidade: Command, tmp_path: Path) -> Non
     }
     path, config = forms.dataflash(tmp_path / "1.bin", kinds), tmp_path / "c.yaml"
     config.write_text(simulated.config + "topics: {imu: /IMU, mag: /MAG, fix: /GPS}\n")
-    told = alidade("info", path, "--config", config).out
-    assert "tumble: yes" in told
-    assert "/IMU/1" in told
+    printed = alidade("info", path, "--config", config).out
+    assert "tumble: yes" in printed
+    assert "/IMU/1" in printed
     right, found = (
         {one["name"]: one for one in json.loads(run.out)["parameters"]}
         for run in (

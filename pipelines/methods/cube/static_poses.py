@@ -203,7 +203,7 @@ def _away(corners: Array) -> Array:
 
 
 def _in_common(seen: Sightings, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The rows of one set of tags in the pictures that show all of it: the set with most of them."""
+    """Rows of detections from the set of tags, and the pictures showing all of it, that keep the most rows."""
     frames, ids = seen.frame[rows], seen.ids[rows]
     shown = {frame: frozenset(ids[frames == frame].tolist()) for frame in frames.tolist()}
     pictures = {tags: [frame for frame, whole in shown.items() if whole >= tags] for tags in shown.values()}

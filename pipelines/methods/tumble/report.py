@@ -63,7 +63,7 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
 
 
 def _less_square(formula: Formula, parameters: Collection[str]) -> Formula:
-    """The accelerometer's reading without its square term."""
+    """Formula of the accelerometer's reading f_read, m/s^2 by axis, less its square term."""
     square = vector_text(ACCEL_SQUARE.names, parameters)
     return replace(formula, expression=f"f_read - {square} * f_read**2", inputs=("accel",))
 
