@@ -37,9 +37,8 @@ MIN_MEASUREMENTS = 100
 DIED_OUT, CORRELATED = 2.0, 4.0
 # Longest lag, share of the recording.
 MAX_LAG = 0.25
-# Blocks of a recording by which variances are judged, each with as many measurements as there are numbers at least, and
-# sigmas of a ratio of sigmas by them, 1 / sqrt(2 blocks) each, beyond which they are certainly too small.
-_BLOCKS, _CERTAIN = 16, 3.0
+# Blocks of a recording by which variances are judged, each with as many measurements as there are numbers at least.
+_BLOCKS = 16
 # Coefficients of a prior's row below this share of its largest are rounding.
 ROUNDING = 1e-9
 
@@ -284,8 +283,8 @@ def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
     sums = np.zeros((_BLOCKS, moves.shape[1]))
     np.add.at(sums, block, moves)
     found = np.square(sums).sum(axis=0)
-    ratio = np.sqrt(np.divide(found, expected, out=np.ones(len(found)), where=expected > 0.0))
-    certain = ratio.max(initial=1.0) > 1.0 + _CERTAIN / np.sqrt(2.0 * _BLOCKS)
+    ratio = sigma_ratio(expected, found)
+    certain = ratio.max(initial=1.0) > certain_ratio(_BLOCKS)
     return np.maximum(ratio, 1.0) if certain else np.ones(len(ratio))
 
 
@@ -308,6 +307,14 @@ def _lagged(whitened: Array, lags: int) -> Array:
     size = 1 << (2 * len(whitened) - 1).bit_length()
     power = (np.abs(np.fft.rfft(whitened, size, axis=0)) ** 2).sum(axis=1)
     return np.asarray(np.fft.irfft(power, size)[: min(lags, len(whitened))])
+
+
+def certain_ratio(blocks: int) -> float:
+    """Ratio of sigmas by blocks of a recording beyond which it is certainly above 1: by three of its own sigmas.
+
+    These are 1 / sqrt(2 n) for n blocks.
+    """
+    return float(1.0 + 3.0 / np.sqrt(2.0 * max(blocks, 1)))
 
 
 def sigma_ratio(variance: Array, grown: Array) -> Array:

@@ -30,6 +30,7 @@ from alidade.pipelines.estimation.noise import ROUGHLY, Level
 from alidade.pipelines.estimation.problem import Problem, Residuals
 from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.error_budget import certain_ratio, sigma_ratio
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
@@ -50,7 +51,6 @@ _MOST_STEPS, _LONGEST_STEP, _SETTLED = 12, 1.5, 0.05
 _HALVINGS, _FINE = 6, 1e-3
 # s, within which errors may be correlated however they are.
 SANDWICH_BLOCK_S = 5.0
-_CERTAIN = 3.0
 # Linearisations, of which the first ones widen; levels have settled whose logarithms move by less.
 _MOST_ROUNDS, _WIDENING_ROUNDS, _STEADY = 8, 2, 0.02
 # Of the gate, where measurements that are widened lie at most.
@@ -563,8 +563,8 @@ def sandwich_ratio(
 ) -> Array:
     """Sandwich over nominal sigma of numbers that are linear in the shared parameters, (r,).
 
-    Above 1 where something errs slowly that no noise of the model has, as with the pose. Less than three of its own
-    sigmas above 1, which for n blocks are 1 / sqrt(2 n), it counts as 1.
+    Above 1 where something errs slowly that no noise of the model has, as with the pose. Up to `certain_ratio` it counts
+    as 1.
 
     Args:
         chain: about the solution.
@@ -575,8 +575,8 @@ def sandwich_ratio(
     variances = _without_say(chain.variances(levels), _by_row(chain, rejected, 0.0))
     nominal, robust, blocks = sandwich(chain, variances)
     above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
-    ratio = np.sqrt(np.divide(above, below, out=np.ones_like(below), where=below > 0.0))
-    return np.where(ratio > 1.0 + _CERTAIN / np.sqrt(2.0 * max(blocks, 1)), ratio, 1.0)
+    ratio = sigma_ratio(below, above)
+    return np.where(ratio > certain_ratio(blocks), ratio, 1.0)
 
 
 def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = None) -> tuple[Array, Array, int]:
