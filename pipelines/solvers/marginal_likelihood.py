@@ -563,8 +563,8 @@ def sandwich_ratio(
 ) -> Array:
     """Sandwich over nominal sigma of numbers that are linear in the shared parameters, (r,).
 
-    Above 1 where something errs slowly that no noise of the model has, as with the pose. Up to `certain_ratio` it counts
-    as 1.
+    Above 1 where something errs slowly that no noise of the model has, as with the pose. Up to `certain_ratio` it
+    counts as 1.
 
     Args:
         chain: about the solution.
