@@ -361,7 +361,7 @@ def fleet(
 
 
 def export(calibration: str | Path | Calibration | SavedCalibration, form: str) -> str:
-    """The text of a calibration for px4, ardupilot, betaflight, inav, ros2, kalibr, openvins; tf or urdf (mounts).
+    """The text of a calibration: px4, ardupilot, betaflight, inav, ros2, kalibr, openvins, realsense, oak; tf, urdf.
 
     Raises:
         InputError: the calibration cannot be used, or has no such format.

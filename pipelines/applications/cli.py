@@ -661,12 +661,15 @@ def fleet(
 def export(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
     form: Annotated[
-        str, typer.Option("--format", help="px4, ardupilot, betaflight, inav, ros2, kalibr, openvins; tf, urdf.")
+        str,
+        typer.Option(
+            "--format", help="px4, ardupilot, betaflight, inav, ros2, kalibr, openvins, realsense, oak; tf, urdf."
+        ),
     ],
     out: Annotated[Path | None, typer.Option(help="File to write [default: printed].")] = None,
     as_json: Json = False,
 ) -> None:
-    """Export to flight controllers, ROS 2, URDF, Kalibr, OpenVINS.
+    """Export to flight controllers, cameras, ROS 2, URDF, Kalibr.
 
     Each in the conventions of that program.
     """

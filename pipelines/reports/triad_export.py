@@ -5,7 +5,8 @@ The numbers are for the axes as recorded. Where a format has no place for a part
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,19 +24,20 @@ _GAUSS, _MILLIGAUSS = 1e4, 1e7  # in a tesla
 _AXES = "XYZ"
 
 
-def _triads(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
+def _triads(saved: SavedCalibration, names: Collection[str] = TRIADS) -> dict[str, tuple[Array, Array]]:
     """K and b of the sensors there are."""
-    names = [name for name in TRIADS if f"{name}_k11" in saved.parameters]
-    return {name: _triad(saved, name) for name in names}
+    return {name: _triad(saved, name) for name in names if f"{name}_k11" in saved.parameters}
 
 
-def _in_si(saved: SavedCalibration) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
+def _in_si(
+    saved: SavedCalibration, names: Collection[str] = TRIADS
+) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
     """K and b of sensors that are recorded in SI, and notes about them.
 
     A magnetometer in T, calibrated in a field of unknown strength, keeps its scale on average: its K has the
     determinant 1. Raises InputError when a sensor is recorded in counts.
     """
-    triads, notes = _triads(saved), []
+    triads, notes = _triads(saved, names), []
     for name, (K, b) in triads.items():
         unit = saved.parameters[f"{name}_k11"].unit
         if unit == "1/T":
@@ -225,7 +227,7 @@ def _openvins(saved: SavedCalibration) -> str:
     Raises InputError when the calibration holds no noise, a sensor was recorded in counts, or its axes are left-handed.
     """
     noise = _noise_lines(saved)
-    triads, _ = _in_si(saved)
+    triads = _imu(saved)
     lines = ["%YAML:1.0", "", "imu0:", *_matrix("T_i_b", np.eye(4)), *(f"  {line}" for line in noise)]
     lines += ["  time_offset: 0.0", '  model: "kalibr"']
     for name, T, rotation, what in (
@@ -247,6 +249,48 @@ def _openvins(saved: SavedCalibration) -> str:
     return "\n".join([*lines, *_matrix("Tg", np.reshape(held, (3, 3))), ""])
 
 
+def _realsense(saved: SavedCalibration) -> str:
+    """calibration.json as librealsense's rs-imu-calibration writes it: S raw - bias, SI, S by columns."""
+    imu = {
+        word: {"scale_and_alignment": K.T.ravel().tolist(), "bias": (-b).tolist()}
+        for word, (K, b) in zip(_IMU.values(), _imu(saved).values(), strict=True)
+    }
+    return json.dumps({"device_type": "D435i", "imus": [imu]}, indent=4, sort_keys=True) + "\n"
+
+
+def _oak(saved: SavedCalibration) -> str:
+    """Part of the EEPROM of DepthAI's CalibrationHandler: affine maps (3, 4) of raw readings, and noise, SI.
+
+    Noise that was not measured is 0, as in a camera that holds none.
+    """
+    noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
+    content: dict[str, Any] = {"noise": {"name": ""}}
+    for (name, word), (K, b) in zip(_IMU.items(), _imu(saved).values(), strict=True):
+        content[word] = np.column_stack([K, b]).tolist()
+        row = {"density": [0.0] * 3, "walk": 0.0} | noise.get(name, {})
+        content["noise"][word] = {
+            axis: {"noiseDensity": density, "randomWalk": row["walk"], "biasStability": 0.0}
+            for axis, density in zip("xyz", row["density"], strict=True)
+        }
+    return json.dumps({"imuCalibrationParams": content}, indent=1) + "\n"
+
+
+_IMU = {"accel": "accelerometer", "gyro": "gyroscope"}
+
+
+def _imu(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
+    """K and b of accelerometer and gyro, which are 1 and 0 where one of them is not calibrated.
+
+    Raises InputError when neither is, or one was recorded in counts.
+    """
+    triads, _ = _in_si(saved, _IMU)
+    if not triads:
+        raise InputError(
+            "this format corrects an IMU, and the calibration holds neither its accelerometer nor its gyro"
+        )
+    return {name: triads.get(name, (np.eye(3), np.zeros(3))) for name in _IMU}
+
+
 def lower_triangular_part(K: Array) -> tuple[Array, Array]:
     """R orthogonal and D lower triangular, positive on its diagonal, with K = R D."""
     q, r = np.linalg.qr(K[::-1, ::-1])
@@ -266,6 +310,8 @@ FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {
     "ros2": _ros2,
     "kalibr": _kalibr,
     "openvins": _openvins,
+    "realsense": _realsense,
+    "oak": _oak,
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -162,6 +163,42 @@ def test_openvins_holds_all_of_accelerometer_and_gyro() -> None:
         applied = (raw[name] - b) @ (np.transpose(imu[R]) @ np.tril(D)).T
         np.testing.assert_allclose(applied, nominal[name], rtol=1e-9, atol=1e-10)
     np.testing.assert_array_equal(imu["Tg"], np.zeros((3, 3)))
+
+
+def test_realsense_corrects_as_librealsense_and_its_script_do() -> None:
+    """rs-imu-calibration fits rows [raw, -1] X; librealsense reads X as a float3x3 by columns and a bias."""
+    full = {name: np.eye(3) + 0.05 * RNG.normal(size=(3, 3)) for name in ("accel", "gyro", "mag")}
+    saved, raw, nominal = _fits(full)
+    (imu,) = json.loads(exported(saved, "realsense"))["imus"]
+    for name, word in (("accel", "accelerometer"), ("gyro", "gyroscope")):
+        X = np.reshape([*imu[word]["scale_and_alignment"], *imu[word]["bias"]], (4, 3))
+        script = np.column_stack([raw[name], np.full(len(raw[name]), -1.0)]) @ X
+        x, y, z = X[:3]  # float3x3: three columns, one after the other
+        library = [x * r[0] + y * r[1] + z * r[2] - X[3] for r in raw[name]]
+        np.testing.assert_allclose(script, nominal[name], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(library, nominal[name], rtol=1e-9, atol=1e-12)
+
+
+def test_oak_holds_affine_maps_and_noise() -> None:
+    full = {name: np.eye(3) + 0.05 * RNG.normal(size=(3, 3)) for name in ("accel", "gyro")}
+    saved, raw, nominal = _fits(full)
+    saved.findings["noise"] = [{"sensor": "gyro", "rate_hz": 200.0, "density": [1e-4, 2e-4, 3e-4], "walk": 2e-6}]
+    found = json.loads(exported(saved, "oak"))["imuCalibrationParams"]
+    for name, word in (("accel", "accelerometer"), ("gyro", "gyroscope")):
+        applied = np.column_stack([raw[name], np.ones(len(raw[name]))]) @ np.transpose(found[word])
+        np.testing.assert_allclose(applied, nominal[name], rtol=1e-9, atol=1e-12)
+    assert found["noise"]["gyroscope"]["y"] == {"noiseDensity": 2e-4, "randomWalk": 2e-6, "biasStability": 0.0}
+    assert found["noise"]["accelerometer"]["z"] == {"noiseDensity": 0.0, "randomWalk": 0.0, "biasStability": 0.0}
+
+
+@pytest.mark.parametrize("form", ["realsense", "oak"])
+def test_cameras_take_an_imu_whatever_the_unit_of_a_magnetometer(form: str) -> None:
+    saved, _, _ = _fits({"accel": np.eye(3), "mag": np.eye(3)})
+    in_counts = saved.parameters["mag_k11"].model_copy(update={"unit": "T/count"})
+    saved = saved.model_copy(update={"parameters": {**saved.parameters, "mag_k11": in_counts}})
+    assert '"gyroscope"' in exported(saved, form)
+    with pytest.raises(InputError, match="holds neither its accelerometer nor its gyro"):
+        exported(_fits({"mag": np.eye(3)})[0], form)
 
 
 @pytest.mark.parametrize("form", ["px4", "ardupilot"])
