@@ -292,6 +292,9 @@ class _Table:
         if unit in UNITS:
             self.reasons.append(f"{self.path.name}: {kind} is in {unit} by its header")
             return unit
+        if kind != "gyro" and any("adc" in self._form.names[i].lower() for i in columns):
+            self.reasons.append(f"{self.path.name}: {kind} is in counts by its name")  # Betaflight's magADC
+            return ""
         if kind == "gyro":
             norms = self._norms(columns)
             most = float(norms.max()) if len(norms) else 0.0

@@ -8,6 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade import export
+from alidade.factors import so3
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.table_discovery import propose_columns
 from alidade.pipelines.recording.recording import open_recording
 from tests.support.command import Command
@@ -39,8 +42,9 @@ CASES = {
         {},
     ),
     "blackbox": (
-        "loopIteration,time (us),gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0],accSmooth[1],accSmooth[2]",
-        (np.arange(N), 1e4 * np.arange(N), 20.0 * RATES + 50.0, 2048 * DIRECTIONS),
+        "loopIteration, time (us), magADC[0], magADC[1], magADC[2], gyroADC[0], gyroADC[1], gyroADC[2], "
+        "gyroUnfilt[0], gyroUnfilt[1], gyroUnfilt[2], accSmooth[0], accSmooth[1], accSmooth[2]",
+        (np.arange(N), 1e4 * np.arange(N), 500 * DIRECTIONS, *2 * [20.0 * RATES + 50.0], 2048 * DIRECTIONS),
         {
             "/imu": {
                 "time": "time (us)",
@@ -48,7 +52,8 @@ CASES = {
                 "gyro": [f"gyroADC[{i}]" for i in range(3)],
                 "accel": [f"accSmooth[{i}]" for i in range(3)],
                 "units": {"gyro": "deg/s"},
-            }
+            },
+            "/mag": {"time": "time (us)", "unit": "us", "field": [f"magADC[{i}]" for i in range(3)]},
         },
     ),
     "SD logger": (
@@ -171,6 +176,34 @@ def test_one_command_calibrates_a_phones_table(tmp_path: Path, alidade: Command)
     assert any(
         note.startswith("columns taken as concluded: phone.csv: Time (s) is the time") for note in result["notes"]
     )
+
+
+def test_a_decoded_blackbox_log_is_calibrated_and_its_offset_exported(tmp_path: Path) -> None:
+    """Columns as blackbox_decode writes them: words among numbers, a compass that repeats its readings, counts."""
+    n, dt = 800, 0.01
+    t = dt * np.arange(n)
+    rates = np.stack([2.0 * np.sin(1.1 * t), 2.3 * np.cos(0.7 * t), 1.5 + np.sin(0.31 * t)], axis=1)
+    attitudes = [np.array([1.0, 0.0, 0.0, 0.0])]
+    for rate in 0.5 * (rates[1:] + rates[:-1]):
+        attitudes.append(so3.multiply(attitudes[-1], so3.exp(rate * dt)))
+    R = so3.matrix(np.array(attitudes))
+    offset = np.array([120.0, -333.0, 41.0])
+    field = (offset + 500.0 * R.transpose(0, 2, 1) @ [0.4, 0.0, -0.9165])[np.arange(n) // 4 * 4]
+    columns = {"gyroADC": np.rad2deg(rates), "accSmooth": 2048.0 * R[:, 2], "magADC": field}
+    names = [f"{name}[{i}]" for name in columns for i in range(3)]
+    rows = np.rint(np.column_stack(list(columns.values())) + 0.5 * RNG.normal(size=(n, 9))).astype(int)
+    lines = [
+        f"{8 * i}, {27_000_000 + 10_000 * i}, {', '.join(f'{x:3d}' for x in row)}, 16.1, ANGLE_MODE|MAG, IDLE"
+        for i, row in enumerate(rows.tolist())
+    ]
+    header = ", ".join(["loopIteration", "time (us)", *names, "vbatLatest (V)", "flightModeFlags (flags)", "failsafe"])
+    (tmp_path / "LOG00001.01.csv").write_text("\n".join([header, *lines]))
+    recording = open_recording(tmp_path / "LOG00001.01.csv")
+    result = Session.read(recording, "tumble", None, auto_columns=True).calibrate()
+    assert result.status in ("calibrated", "weak"), result.headline
+    command = export(result, "betaflight").splitlines()[-1]
+    found = [int(x) for x in command.removeprefix("set mag_calibration = ").split(",")]
+    np.testing.assert_allclose(found, offset, atol=2.0)
 
 
 def test_several_tables_of_one_device_have_their_columns_proposed(tmp_path: Path, alidade: Command) -> None:
