@@ -407,6 +407,7 @@ def certificate(
     before: str | Path | None = None,
     out: str | Path | None = None,
     pdf: bool = False,
+    dcc: bool = False,
 ) -> tuple[tuple[Path, ...], list[str]]:
     """Write a calibration certificate from a result; returns its files and the fields that are not stated.
 
@@ -416,7 +417,7 @@ def certificate(
     from alidade.pipelines.reports.certificate import write_certificate
 
     stated, earlier, folder = (None if each is None else Path(each) for each in (fields, before, out))
-    return write_certificate(Path(results), stated, earlier, folder, pdf)
+    return write_certificate(Path(results), stated, earlier, folder, pdf, dcc)
 
 
 def _check_seed(seed: object) -> None:

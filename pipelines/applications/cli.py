@@ -732,6 +732,7 @@ def certificate(
     before: Annotated[Path | None, typer.Option(help="Earlier result.json or calibration.yaml of the item.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the certificate [default: that of the results].")] = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Write certificate.pdf too.")] = False,
+    digital: Annotated[bool, typer.Option("--dcc", help="Write certificate.xml too, after PTB's DCC 3.3.0.")] = False,
 ) -> None:
     """Write a calibration certificate (ISO/IEC 17025 items).
 
@@ -740,7 +741,7 @@ def certificate(
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.certificate import write_certificate
 
-    written, missing = write_certificate(results, fields, before, out, pdf)
+    written, missing = write_certificate(results, fields, before, out, pdf, digital)
     terminal.say(f"Wrote {', '.join(map(str, written))}")
     if missing:
         terminal.say(f"not stated: {', '.join(missing)}")

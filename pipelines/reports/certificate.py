@@ -26,6 +26,7 @@ from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods import method
+from alidade.pipelines.reports.dcc import digital_certificate
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
@@ -34,7 +35,7 @@ from alidade.pipelines.reports.whole import write_whole
 from alidade.pipelines.settings import first_error
 from alidade.pipelines.solvers.joint import RECORDING
 
-FILES = ("certificate.html", "certificate.pdf", "certificate.json")
+FILES = ("certificate.html", "certificate.pdf", "certificate.xml", "certificate.json")
 # Of effective degrees of freedom more than this are as good as infinitely many.
 _MANY = 1e4
 
@@ -57,6 +58,7 @@ class Fields(_Fields):
     """What only people know; None where it is not stated."""
 
     number: _Text | None = None
+    country: Annotated[str, Field(pattern="^[A-Z]{2}$")] | None = None  # ISO 3166-1 alpha-2; of the digital one
     laboratory: _Text | None = None
     customer: _Text | None = None
     item: _Text | None = None
@@ -120,9 +122,9 @@ def _recordings(result: Result) -> list[_Recording]:
 
 
 def write_certificate(
-    results: Path, fields: Path | None, before: Path | None, out: Path | None, pdf: bool = False
+    results: Path, fields: Path | None, before: Path | None, out: Path | None, pdf: bool = False, digital: bool = False
 ) -> tuple[tuple[Path, ...], list[str]]:
-    """Write certificate.html, certificate.json and certificate.pdf; returns their paths and what was not stated.
+    """Write certificate.html and .json, .pdf and .xml; returns their paths and what was not stated.
 
     Args:
         results: folder of a calibration, or its result.json.
@@ -130,9 +132,11 @@ def write_certificate(
         before: an earlier calibration of the item, result.json or calibration.yaml, as found against it.
         out: folder; None: that of the results.
         pdf: print it, by WeasyPrint.
+        digital: write a Digital Calibration Certificate.
 
     Raises:
-        InputError: a file cannot be used, the result is none to certify, or there is no WeasyPrint that works.
+        InputError: a file cannot be used, the result is none to certify, there is no WeasyPrint that works, or a field
+            that a digital certificate needs is not stated.
     """
     path = results / "result.json" if results.is_dir() else results
     result, stated = _read_result(path), _read_fields(fields)
@@ -141,17 +145,23 @@ def write_certificate(
     for name in stated.limits:
         if name not in {row.name for row in rows}:
             raise InputError(f"{fields}: unknown key limits.{name}{nearest(name, [row.name for row in rows])}")
-    missing = [name for name, value in stated.model_dump(exclude={"remarks", "limits"}).items() if value is None]
+    missing = [
+        name for name, value in stated.model_dump(exclude={"remarks", "limits", "country"}).items() if value is None
+    ]
     content = _content(result, stated, rows, missing)
 
     page = render_html(certificate_report(result, stated, rows, missing, before))
     printed = _printed(page) if pdf else None
+    matrix = result.covariance
+    xml = digital_certificate(content, matrix.order, matrix.matrix) if digital else None
 
     def make(folder: Path) -> None:
         (folder / FILES[0]).write_text(page, encoding="utf-8")
         if printed is not None:
             (folder / FILES[1]).write_bytes(printed)
-        (folder / FILES[2]).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        if xml is not None:
+            (folder / FILES[2]).write_text(xml, encoding="utf-8")
+        (folder / FILES[3]).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
     return write_whole(out or path.parent, FILES, make), missing
 
