@@ -86,6 +86,27 @@ def test_fewer_degrees_of_freedom_need_a_larger_factor(results: Path, tmp_path: 
     assert rows["gyro_bias_x"]["coverage"] > 2.3
 
 
+def test_expanded_uncertainties_are_those_of_the_gum_tree_calculator(results: Path, tmp_path: Path) -> None:
+    gtc = pytest.importorskip("GTC", reason="GTC is not installed")
+    changed = json.loads((results / "result.json").read_text())
+    for i, fit in enumerate(changed["chi_square"]["families"].values()):
+        fit["dof"] = 5.0 + i
+    (tmp_path / "result.json").write_text(json.dumps(changed))
+    write_certificate(tmp_path, None, None, None)
+    freedoms = {name: fit["dof"] for name, fit in changed["chi_square"]["families"].items()}
+    rows = json.loads((tmp_path / "certificate.json").read_text())["results"]
+    for row in rows:
+        y = sum(
+            gtc.ureal(0.0, row["standard"] * share**0.5, freedoms.get(source, gtc.inf))
+            for source, share in row["budget"].items()
+        )
+        assert row["standard"] == pytest.approx(gtc.uncertainty(y), rel=1e-9)
+        if row["degrees"] is not None:
+            assert row["degrees"] == pytest.approx(gtc.dof(y), rel=1e-9)
+        assert row["coverage"] == pytest.approx(gtc.reporting.k_factor(gtc.dof(y), 95.45), rel=1e-6)
+    assert any(row["degrees"] is not None for row in rows)
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

@@ -177,6 +177,27 @@ def test_budget_and_influence_are_those_of_the_dense_system(name: str) -> None:
         assert shares.get("not modelled", 0.0) < 1e-5
 
 
+def test_budget_is_that_of_the_gum_tree_calculator() -> None:
+    """GTC propagates whitened residuals of unit uncertainty through the solution of the dense system by itself."""
+    gtc = pytest.importorskip("GTC", reason="GTC is not installed")
+    case = dense("tumble at rest")
+    reported = case.reported
+    found = reported.root(case.factorization.root)
+    influence = Influence.of(
+        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
+    )
+    budget = error_budget(influence, {}, reported.covariance(found.covariance()) - np.diag(reported.extra**2))
+    Q, R = np.linalg.qr(np.vstack(case.rows))
+    residuals = [gtc.ureal(0.0, 1.0) for _ in Q]
+    solution = gtc.la.solve(gtc.la.uarray(R.tolist()), gtc.la.matmul(gtc.la.uarray(Q.T.tolist()), residuals))
+    families = np.repeat([f.family for f in case.factors], [len(rows) for rows in case.rows])
+    for name, number in zip(influence.names, case.numbers[reported.free], strict=True):
+        y = sum(float(weight) * x for weight, x in zip(number, solution, strict=True) if weight)
+        parts = np.square([gtc.component(y, each) for each in residuals]) / gtc.variance(y)
+        for family in {*families} - {"prior"}:
+            assert budget[name].get(family, 0.0) == pytest.approx(parts[families == family].sum(), abs=1e-6)
+
+
 def test_moves_of_a_changed_input_are_those_of_the_dense_system() -> None:
     case = dense("head")
     reported = case.reported

@@ -126,8 +126,7 @@ def limit(tests: int, values: int | None = None) -> float:
 
     Args:
         tests: made on the whole page.
-        values: the spread was estimated from so many (Student's t then, by Wallace's approximation of 1959, which is
-            2 % large at 40 values, 10 % at 12); None: it is known.
+        values: the spread was estimated from so many (Student's t then); None: it is known.
     """
     z = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARM / max(tests, 1))
     if values is None:
