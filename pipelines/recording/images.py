@@ -1,7 +1,7 @@
 """Pictures as files in the Netpbm form, which any decoder of pictures reads: a line of text and the pixels.
 
-Raw pictures of any encoding become such files, and so do those of videos: H.264, a message a picture, and MP4 and AVI
-files. OpenCV's FFmpeg decodes them.
+Raw pictures of any encoding become such files, and so do those of videos, a message a picture, and of MP4 and AVI
+files. OpenCV's FFmpeg decodes H.264, H.265 and files; PyAV (extra `video`) decodes AV1, VP8 and VP9.
 """
 
 from __future__ import annotations
@@ -35,12 +35,17 @@ _YUV = {"yuv422": 1, "uyvy": 1, "UYVY": 1, "yuv422_yuy2": 0, "yuyv": 0, "YUYV": 
 _RED = {"rggb": (0, 0), "bggr": (1, 1), "gbrg": (1, 0), "grbg": (0, 1)}
 _BAYER = re.compile("bayer_(?P<pattern>rggb|bggr|gbrg|grbg)(?P<bits>8|16)")
 MAX_PICTURE_BYTES = 1 << 28
-# How the formats of messages are called; what is read, and what else a video may be.
-H264 = ("h264", "avc", "x264", "libx264")
-OTHERS = ("h265", "hevc", "vp8", "vp9", "av1")
+# Formats of messages -> ending of a file that FFmpeg takes for that form.
+ANNEX_B = {
+    **dict.fromkeys(("h264", "avc", "x264", "libx264"), ".h264"),
+    **dict.fromkeys(("h265", "hevc", "x265", "libx265"), ".h265"),
+}
+# Formats of messages -> PyAV's decoder.
+BY_PYAV = {"av1": "libdav1d", "vp8": "vp8", "vp9": "vp9"}
 MAX_PICTURE_PIXELS = 1 << 26
-# What a message of H.264 begins with (Annex B of ITU-T H.264).
+# What a message of H.264 or H.265 begins with (Annex B of ITU-T H.264 and H.265).
 _STARTS = (b"\0\0\1", b"\0\0\0\1")
+_NEEDED = "it has to begin with a key picture, and a message has to be a picture"
 
 
 def netpbm(image: Any) -> bytes:
@@ -109,22 +114,44 @@ def _file(pixels: Pixels) -> bytes:
     return f"{kind} {pixels.shape[1]} {pixels.shape[0]} 255\n".encode() + pixels.tobytes()
 
 
-def decode_video(packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
-    """Decode H.264 messages (stamp, message) into (stamp, file in the Netpbm form), one picture each, in order.
+def decode_video(packets: Iterable[tuple[int, bytes]], form: str) -> Iterator[tuple[int, bytes]]:
+    """Decode messages (stamp, message) of a video into (stamp, file in the Netpbm form), one picture each, in order.
 
-    Raises ValueError where that is not what the messages are, or nothing of them can be decoded.
+    Raises ValueError where the messages are not of that form, or nothing of them can be decoded.
     """
+    if form in BY_PYAV:
+        yield from _decoded_by_pyav(packets, form)
+        return
     stamps = []
-    with tempfile.NamedTemporaryFile(prefix="alidade-", suffix=".h264") as whole:
+    with tempfile.NamedTemporaryFile(prefix="alidade-", suffix=ANNEX_B[form]) as whole:
         for t_ns, data in packets:
             # FFmpeg goes by what a file begins with, and other forms name files of their own to be read.
             if not data.startswith(_STARTS):
-                raise ValueError("a message of the video is no H.264 (Annex B)")
+                raise ValueError(f"a message of the video is no {form.upper()} (Annex B)")
             whole.write(data)
             stamps.append(t_ns)
         whole.flush()
-        needed = "it has to begin with a key picture, and a message has to be a picture"
-        yield from zip(stamps, _decoded_pictures(whole.name, len(stamps), "messages", needed), strict=True)
+        yield from zip(stamps, _decoded_pictures(whole.name, len(stamps), "messages", _NEEDED), strict=True)
+
+
+def _decoded_by_pyav(packets: Iterable[tuple[int, bytes]], form: str) -> Iterator[tuple[int, bytes]]:
+    """Decode with one thread, which has no delay: each message is a picture at once."""
+    try:
+        import av
+    except ImportError as error:
+        raise ValueError(f"a video in {form} needs PyAV: pip install 'alidade[video]'") from error
+    decoder = av.CodecContext.create(BY_PYAV[form], "r")
+    decoder.thread_count = 1
+    for i, (t_ns, data) in enumerate(packets):
+        try:
+            frames = decoder.decode(av.Packet(data))
+        except av.FFmpegError as error:
+            raise ValueError(f"picture {i + 1} of the video cannot be decoded: {_NEEDED}") from error
+        if len(frames) != 1:
+            raise ValueError(f"message {i + 1} of the video has {len(frames)} pictures: {_NEEDED}")
+        if frames[0].width * frames[0].height > MAX_PICTURE_PIXELS:
+            raise ValueError(f"pictures of {frames[0].width} x {frames[0].height}, which no camera makes")
+        yield t_ns, colour_file(frames[0].to_ndarray(format="rgb24"))
 
 
 def is_video(start: bytes) -> bool:

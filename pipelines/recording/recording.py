@@ -332,7 +332,7 @@ class Recording:
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """Pictures on a CompressedImage or Image topic as (stamp in ns, file), one by one.
 
-        Raw ones, and those of a H.264 video, are files in the Netpbm form.
+        Raw ones, and those of a video, are files in the Netpbm form.
         """
         info = self._require(topic, *messages.PICTURES)
         found = progress.track(self._decoded(topic, *messages.PICTURES), "pictures", info.count)

@@ -27,15 +27,13 @@ def camera_info(message: DecodedMessage) -> series.CameraInfo:
 
 
 def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
-    """Pictures as (stamp in ns, file): raw ones and those of a H.264 video in the Netpbm form."""
+    """Pictures as (stamp in ns, file): raw ones and those of a video in the Netpbm form."""
     files = (_file(message, is_raw) for message in messages)
     for t_ns, form, data in files:
-        if form in images.OTHERS:
-            raise MessageError(f"a video in {form}; H.264 is read, or single pictures")
-        if form in images.H264:
+        if form in images.ANNEX_B or form in images.BY_PYAV:
             packets = itertools.chain([(t_ns, data)], ((t_ns, data) for t_ns, _, data in files))
             try:
-                yield from images.decode_video(packets)
+                yield from images.decode_video(packets, form)
             except ValueError as error:
                 raise MessageError(str(error)) from error
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import bz2
 import resource
 import sqlite3
@@ -176,7 +177,7 @@ def test_many_cuts_and_flips(small: Small) -> None:
         print(small.form, name, dict(small.outcomes(copies, is_sound)))
 
 
-def damaged_videos(whole: list[bytes], number: int, seed: int) -> Counter[str]:
+def damaged_videos(whole: list[bytes], number: int, seed: int, form: str) -> Counter[str]:
     """What becomes of videos whose messages are damaged: as many pictures as messages, or one line."""
     rng = np.random.default_rng(seed)
     found: Counter[str] = Counter()
@@ -188,7 +189,7 @@ def damaged_videos(whole: list[bytes], number: int, seed: int) -> Counter[str]:
         else:
             packets[at] = next(iter((flips if i % 3 == 1 else spoilt)(packets[at], 1, seed + i)))
         try:
-            pictures = list(images.decode_video(enumerate(packets)))
+            pictures = list(images.decode_video(enumerate(packets), form))
         except ValueError as error:
             found["refused" if "\n" not in str(error) else "refused in several lines"] += 1
             continue
@@ -198,11 +199,15 @@ def damaged_videos(whole: list[bytes], number: int, seed: int) -> Counter[str]:
 
 
 @pytest.mark.parametrize("number", [20, pytest.param(500, marks=pytest.mark.slow)])
-def test_damaged_videos(number: int) -> None:
+@pytest.mark.parametrize("form", ["h264", *forms.VIDEOS])
+def test_damaged_videos(form: str, number: int) -> None:
     """A video has no checksums: what is damaged in a picture is seen, if at all, by what is measured in it."""
-    whole = forms.h264(np.random.default_rng(1).integers(0, 256, (4, 32, 48), dtype=np.uint8))
-    found = damaged_videos(whole, number, 5)
-    print("video", dict(found))
+    if form in images.BY_PYAV:
+        pytest.importorskip("av", reason="needs the extra alidade[video]")
+    whole = [base64.b64decode(each) for each in forms.VIDEOS.get(form, ())]
+    whole = whole or forms.h264(np.random.default_rng(1).integers(0, 256, (4, 32, 48), dtype=np.uint8))
+    found = damaged_videos(whole, number, 5, form)
+    print("video", form, dict(found))
     assert found["read"] + found["refused"] == number
     assert found["read"] > 0
 

@@ -174,7 +174,7 @@ def test_bytes_as_a_video(trial: settings) -> None:
     )
     def property_(packets: list[bytes]) -> None:
         with suppress(ValueError):
-            assert len(list(images.decode_video(enumerate(packets)))) == len(packets)
+            assert len(list(images.decode_video(enumerate(packets), "h264"))) == len(packets)
 
     property_()
 

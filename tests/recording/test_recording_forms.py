@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,7 +23,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.head.recording import VISION_ATTITUDE
 from alidade.pipelines.methods.indexer.simulation import Position
-from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording import images, messages, series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.plausibility import density
 from alidade.pipelines.recording.recording import Recording, open_recording
@@ -763,11 +765,39 @@ def test_pictures_of_a_video(tmp_path: Path) -> None:
         np.testing.assert_array_equal(grey, picture)
 
 
+@pytest.mark.parametrize("form", forms.VIDEOS)
+def test_pictures_of_videos_of_other_forms(form: str, tmp_path: Path) -> None:
+    import cv2
+
+    if form in images.BY_PYAV:
+        pytest.importorskip("av", reason="needs the extra alidade[video]")
+    packets = [base64.b64decode(each) for each in forms.VIDEOS[form]]
+
+    def recorded(made: list[bytes]) -> Recording:
+        return video(tmp_path / "v.mcap", np.zeros((0, 16, 16), np.uint8), lambda _: made, form)
+
+    found = list(recorded(packets).images("/video"))
+    assert [t_ns % 10**9 for t_ns, _ in found] == [0, 100_000_000, 200_000_000]
+    files = [np.frombuffer(file, np.uint8) for _, file in found]
+    grey = np.array([cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) for file in files], float)
+    assert grey.shape == (3, 64, 64)
+    np.testing.assert_allclose(grey.mean(axis=(1, 2)), [40.0, 100.0, 160.0], atol=2.0)
+    for wrong in (packets[1:], [packets[0], b"junk" + packets[1]]):
+        with pytest.raises(InputError, match=r"topic /video: .*(picture|Annex B)"):
+            list(recorded(wrong).images("/video"))
+
+
+def test_a_video_without_its_decoder_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    recording = video(tmp_path / "v.mcap", np.full((3, 16, 16), 90, np.uint8), form="av1")
+    with pytest.raises(InputError, match=r"a video in av1 needs PyAV: pip install 'alidade\[video\]'"):
+        list(recording.images("/video"))
+
+
 @pytest.mark.parametrize(
     ("change", "form", "message"),
     [
-        (list, "h265", "a video in h265; H.264 is read"),
-        (lambda whole: [b"#EXTM3U\n" + whole[0], *whole[1:]], "h264", r"is no H.264 \(Annex B\)"),
+        (lambda whole: [b"#EXTM3U\n" + whole[0], *whole[1:]], "h264", r"is no H264 \(Annex B\)"),
         (lambda whole: [whole[0][:9], *whole[1:]], "h264", r"only 2 of 3 pictures of the video can be decoded"),
         (lambda whole: [whole[0] + whole[1], *whole[1:]], "h264", "more pictures than its 3 messages"),
         (lambda _: [b"\0\0\0\1\x67junk"] * 3, "h264", "only 0 of 3 pictures"),

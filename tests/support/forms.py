@@ -305,6 +305,27 @@ def h264(pictures: Any) -> list[bytes]:
     return out
 
 
+# Three grey pictures of 64 x 64, brightness 40, 100, 160, a key picture and what follows: x265, SVT-AV1, libvpx.
+VIDEOS = {
+    "h265": (
+        "AAAAAUABDAH//wFgAAADAJAAAAMAAAMAHroCQAAAAAFCAQEBYAAAAwCQAAADAAADAB6gIIEFlukpMLmgIAAAAwAgAAADAUEAAAABRAHAcYESAAAB"
+        "KAGt4NEX/77FzI4u",
+        "AAAAAQIB0Al4gdyAI//5YsAaLg8=",
+        "AAAAAQIB0BH+IHWAI8J5NKAaLg8=",
+    ),
+    "av1": (
+        "EgAKCgAAAAKv/4lfIAgyDxAAloAQQIIAAAAA68lRwA==",
+        "EgAyEjACAAAAACMYAAACAAIAGCWzFw==",
+        "EgAyEzAEAIAAAGLwAAACAAIAGCWyOcA=",
+    ),
+    "vp9": (
+        "gkmDQgAD8AP2ADgkHBhKAAAwYAAAZz///uxDCd2Y",
+        "hgBAkpwAUAAAA2AAACA////sNX///9hq////sNX//7DQAA==",
+        "hgBAkpwATuAAA2AAACA////vkJ///98hP///vkJ//98fAA==",
+    ),
+}
+
+
 def h264_parameters(width: int, height: int) -> bytes:
     """Sequence and picture parameter sets (7.3.2.1 and 7.3.2.2): baseline profile, the full range of brightness."""
     vui = "00110110000000"
