@@ -135,14 +135,14 @@ def _ardupilot(saved: SavedCalibration) -> str:
 
 def _betaflight(saved: SavedCalibration) -> str:
     """A command of the CLI: the offset in counts, which Betaflight subtracts after mag_align (sensors/compass.c)."""
-    S, offset, notes = _compass_in_counts(saved)
+    S, offset, notes = _compass_in_counts(saved, "mag_calibration 0,0,0")
     lost = _lost("magnetometer", S / np.cbrt(np.linalg.det(S)) - np.eye(3))
     return "\n".join([f"# {lost}", *notes, f"set mag_calibration = {','.join(map(str, offset))}", ""])
 
 
 def _inav(saved: SavedCalibration) -> str:
     """Commands of the CLI; INAV computes (raw - magzero) 1024 / maggain per axis, then aligns (sensors/compass.c)."""
-    S, offset, notes = _compass_in_counts(saved)
+    S, offset, notes = _compass_in_counts(saved, "magzero 0, maggain 1024")
     diagonal = np.diag(S)
     size = float(np.cbrt(diagonal.prod()))
     # A field of the earth's strength becomes 1024, where K has its unit; else the mean gain is 1.
@@ -153,8 +153,10 @@ def _inav(saved: SavedCalibration) -> str:
     return "\n".join([f"# {lost}", *notes, *commands, ""])
 
 
-def _compass_in_counts(saved: SavedCalibration) -> tuple[Array, NDArray[np.int64], list[str]]:
-    """The symmetric part of the magnetometer's K, its offset in whole counts, and a comment on its mounting.
+def _compass_in_counts(saved: SavedCalibration, neutral: str) -> tuple[Array, NDArray[np.int64], list[str]]:
+    """The symmetric part of the magnetometer's K, its offset in whole counts, and comments on mounting and logs.
+
+    Betaflight and INAV log a compass with its calibration applied, which is none with the settings `neutral`.
 
     Raises InputError when it was not recorded in counts, or the offset is beyond 16 bits.
     """
@@ -165,7 +167,7 @@ def _compass_in_counts(saved: SavedCalibration) -> tuple[Array, NDArray[np.int64
     if np.abs(offset).max() > np.iinfo(np.int16).max:
         raise InputError(f"mag has an offset of {np.abs(offset).max()} counts, and this format has 16 bits")
     S, angle = symmetric_part(K)
-    return S, offset, [f"# {_turned(angle)}"]
+    return S, offset, [f"# {_turned(angle)}", f"# logs have the calibration of their time applied: log with {neutral}"]
 
 
 def _unit(saved: SavedCalibration) -> str:

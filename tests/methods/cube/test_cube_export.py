@@ -251,7 +251,9 @@ def test_betaflight_subtracts_counts() -> None:
     """magADC -= magZero, whole numbers, after the alignment: what is left is the soft iron."""
     offset = np.array([120.0, -333.0, 41.0])
     saved, raw = _in_counts(np.eye(3) / 300.0, offset + 0.3, "1/count")
-    command = exported(saved, "betaflight").splitlines()[-1]
+    text = exported(saved, "betaflight")
+    assert "log with mag_calibration 0,0,0" in text
+    command = text.splitlines()[-1]
     found = re.fullmatch(r"set mag_calibration = (-?\d+),(-?\d+),(-?\d+)", command)
     assert found
     corrected = raw - np.array([int(x) for x in found.groups()])
