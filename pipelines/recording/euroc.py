@@ -17,11 +17,10 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
+from alidade.pipelines.recording.camera_files import camera
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.recording.table_times import nanoseconds
 from alidade.pipelines.recording.tables import numbers, read_columns, table_form
-
-_DISTORTION = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 
 
 def find_euroc(path: Path) -> Path | None:
@@ -108,16 +107,9 @@ class _Pictures:
 
 def _camera_info(table: Path, t_ns: int, sensor: Mapping[str, Any]) -> series.CameraInfo:
     try:
-        fu, fv, cu, cv = map(float, sensor["intrinsics"])
-        width, height = map(int, sensor["resolution"])
-        model = _DISTORTION[sensor["distortion_model"]]
-        d = np.array(sensor["distortion_coefficients"], dtype=float)
+        return camera(sensor, table.parent.name, t_ns)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{table.with_name('sensor.yaml')}: no usable camera ({error})") from error
-    k = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
-    d = np.append(d, 0.0) if model == "plumb_bob" and len(d) == 4 else d
-    p = np.hstack([k, np.zeros((3, 1))])
-    return series.CameraInfo(t_ns, width, height, model, d, k, np.eye(3), p, frame_id=table.parent.name)
 
 
 def _sensor(path: Path) -> dict[str, Any]:

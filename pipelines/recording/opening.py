@@ -17,6 +17,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes, require_regular
 from alidade.pipelines.recording import ros1_bag
 from alidade.pipelines.recording.array_container import ArrayContainer
+from alidade.pipelines.recording.camera_files import SUFFIXES, CameraFile, read_cameras
 from alidade.pipelines.recording.container import Container, MultiPartContainer
 from alidade.pipelines.recording.images import is_video
 from alidade.pipelines.recording.mcap_file import McapFile
@@ -101,6 +102,8 @@ def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise InputError(f"{paths[0]}: the same file is named twice")
     parts = [_file(path) for path in paths]
+    begin = min((part.first_log_ns for part in parts if not isinstance(part, CameraFile)), default=0)
+    parts = [CameraFile(p.path, p.cameras, p.data, begin) if isinstance(p, CameraFile) else p for p in parts]
     whole = parts[0] if len(parts) == 1 else MultiPartContainer(folder or paths[0], parts)
     if folder is None:
         whole.assumptions = (*_part_of(paths), *whole.assumptions)
@@ -144,6 +147,8 @@ def _by_content(path: Path, data: Path) -> Container:
         return ArrayContainer(path, {}, ["a video; `columns:` in the config says which table has its pictures' stamps"])
     from alidade.pipelines.recording.tables import looks_like_text, read_table
 
+    if path.suffix in SUFFIXES and looks_like_text(start):
+        return read_cameras(path, data)
     is_table = looks_like_text(start) and not start.startswith(MAGIC)
     return read_table(path, data) if is_table else McapFile(path, data)
 
