@@ -138,7 +138,7 @@ def _measurement(content: Mapping[str, Any], order: Sequence[str], covariance: S
     )
     results = {
         "results": [_quantity(row, fields) for row in rows],
-        "covariance": _covariance(rows, order, covariance),
+        "covariance": [*_covariance(rows, order, covariance)],
         "uncertainty budget, shares of the variance": [_budget(row) for row in rows if row["budget"]],
     }
     return _tag(
