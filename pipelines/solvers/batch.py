@@ -45,7 +45,7 @@ from alidade.pipelines.solvers.error_budget import (
     sigma_ratio,
 )
 from alidade.pipelines.solvers.layout import Layout, Values
-from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize, without_rejected
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize, without_rejected
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
@@ -100,7 +100,7 @@ class Solved:
     second: Minimum | None = None
 
     @property
-    def engine(self) -> Engine:
+    def engine(self) -> Linearization:
         """The engine of the graph, with the loss and the weights of the solution."""
         return self.solution.engine
 
@@ -130,9 +130,9 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
     """
     config, problem = config or BatchConfig(), compiled.problem
     start = problem.noises if levels is None else levels
-    engine: Engine = compiled.engine
+    engine = compiled.engine
     solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config.robust)
-    if levels is None and problem.marginal_likelihood and isinstance(engine, Linearization):
+    if levels is None and problem.marginal_likelihood and engine.is_chain:
         # Noise far from what was stated may be why there is no minimum yet.
         if np.isfinite(solution.cost) and any(level.noise.estimated for level in start) and not deadline.passed():
             with suppress(*(() if solution.converged else (IndeterminateStateError,))):
@@ -237,14 +237,14 @@ def whole_estimate(
     covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
     by = sigma_ratio(np.diag(nominal), np.diag(covariance))
     sandwich, steps, wide, innovations = None, None, by, dict[str, Residuals]()
-    if problem.marginal_likelihood and isinstance(engine, Linearization) and solved.solution.converged:
+    if problem.marginal_likelihood and engine.is_chain and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
         innovations = innovations_of(compiled, solved.levels, solved.solution) if budget else innovations
         steps = largest_steps(compiled, solved.levels, solved.solution)
         widened = np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
     system, history = posterior.system, None
-    if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
+    if isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
         final = posterior.reported.numbers, nominal
         history = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time, final)
     residuals = residuals_by_family(engine, values)
@@ -288,7 +288,7 @@ def _attitudes(solved: Solved) -> Attitudes | None:
     return None if attitudes is None else attitudes(compiled.keyframes, compiled.layout.to_gtsam(solved.values))
 
 
-def residuals_by_family(engine: Engine, values: Values) -> dict[str, Residuals]:
+def residuals_by_family(engine: Linearization, values: Values) -> dict[str, Residuals]:
     """Family -> whitened residuals of its measurements at some values, in the order of the problem's factors."""
     parts: dict[str, list[tuple[NDArray[Any], ...]]] = {}
     for group in engine.groups:

@@ -23,6 +23,7 @@ numpy.linalg.LinAlgError.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -210,13 +211,49 @@ class _Level:
         return out
 
 
-@dataclass(frozen=True, eq=False)
-class ChainFactorization:
-    """R of a chain's system and what follows from it: states are (N, d, n), nodes (J, c, n), for n columns.
+class Factorization(ABC):
+    """R of a linear system and what follows from it: states are (N, d, n), nodes (J, c, n), for n columns.
 
     Attributes:
-        root: (c + s + 1, c + s + 1) R of the last node, the shared unknowns and the right side.
+        c: numbers of the last node.
+        root: (c + s + 1, c + s + 1) R of that, the shared unknowns and the right side.
     """
+
+    c: int
+    root: Array
+
+    @property
+    def minimum(self) -> float:
+        """Sum of squares of the rows at the solution."""
+        return float(self.root[-1, -1] ** 2)
+
+    def solve(self) -> tuple[Array, Array, Array]:
+        """States (N, d), nodes (J, c) and shared unknowns (s,) of the least squares."""
+        last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)
+        states, nodes = self.given(last[:, None])
+        return states[..., 0], nodes[..., 0], last[self.c :]
+
+    def given(self, last: Array) -> tuple[Array, Array]:
+        """States and nodes of the least squares for given last node and shared unknowns (c + s, n)."""
+        return self._back(last, 1.0)
+
+    def propagate(self, last: Array) -> tuple[Array, Array]:
+        """Moves of states and nodes that go with moves of the last node and the shared unknowns (c + s, n)."""
+        return self._back(last, 0.0)
+
+    def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
+        """Draws from the posterior, as deviations from its mean: states, nodes, shared unknowns (s, n)."""
+        last = _solved(self.root[:-1, :-1], np.zeros((len(self.root) - 1, count)), generator)
+        return *self._back(last, 0.0, generator), last[self.c :]
+
+    @abstractmethod
+    def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
+        """States and nodes for the last node and the shared unknowns (c + s, n), and so many times the right side."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChainFactorization(Factorization):
+    """R of a chain's system, all but the last node and the shared unknowns eliminated."""
 
     d: int
     c: int
@@ -238,30 +275,6 @@ class ChainFactorization:
                 keyframes = keyframes[lasts]
         ends, root = _TimeOrder.eliminate(chain, keyframes, own)
         return cls(own, tail, root, levels, ends)
-
-    @property
-    def minimum(self) -> float:
-        """Sum of squares of the rows at the solution."""
-        return float(self.root[-1, -1] ** 2)
-
-    def solve(self) -> tuple[Array, Array, Array]:
-        """States (N, d), nodes (J, c) and shared unknowns (s,) of the least squares."""
-        last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)
-        states, nodes = self.given(last[:, None])
-        return states[..., 0], nodes[..., 0], last[self.c :]
-
-    def given(self, last: Array) -> tuple[Array, Array]:
-        """States and nodes of the least squares for given last node and shared unknowns (c + s, n)."""
-        return self._back(last, -1.0)
-
-    def propagate(self, last: Array) -> tuple[Array, Array]:
-        """Moves of states and nodes that go with moves of the last node and the shared unknowns (c + s, n)."""
-        return self._back(last, 0.0)
-
-    def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Draws from the posterior, as deviations from its mean: states, nodes, shared unknowns (s, n)."""
-        last = _solved(self.root[:-1, :-1], np.zeros((len(self.root) - 1, count)), generator)
-        return *self._back(last, 0.0, generator), last[self.c :]
 
     def given_shared(self) -> tuple[Array, Array]:
         """Covariances where the shared unknowns are known, those that rows need.
@@ -295,7 +308,7 @@ class ChainFactorization:
         return ends.keyframes, roots
 
     def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
-        last = np.pad(last, ((0, 1), (0, 0)), constant_values=right)
+        last = np.pad(last, ((0, 1), (0, 0)), constant_values=-right)
         x, nodes = self._ends.back(last, self.c, generator)
         shared = last[self.c :]
         for level in reversed(self._levels):

@@ -14,7 +14,6 @@ from typing import Self
 import gtsam
 
 from alidade.pipelines.estimation.problem import EngineName, Factor, Problem, Step
-from alidade.pipelines.solvers.gtsam_engine import GtsamEngine
 from alidade.pipelines.solvers.layout import Layout, NotAChainError, Values
 from alidade.pipelines.solvers.linearization import Linearization
 
@@ -35,7 +34,7 @@ class Compiled:
     """
 
     problem: Problem
-    engine: Linearization | GtsamEngine
+    engine: Linearization
     initial: Values
     current_keys: dict[int, int]
     keyframes: list[int]
@@ -64,7 +63,7 @@ class Compiled:
 
 def _engine(
     problem: Problem, name: EngineName, factors: list[Factor], initial: gtsam.Values, current: dict[int, int]
-) -> tuple[Linearization | GtsamEngine, Values]:
+) -> tuple[Linearization, Values]:
     shared = [current.get(p.key, p.key) for p in problem.parameters]
     try:
         if problem.layout is None:
@@ -78,4 +77,4 @@ def _engine(
         if name == "chain":
             raise
         layout, values = Layout.of(None, initial, shared)
-    return GtsamEngine.of(factors, layout), values
+    return Linearization.of(factors, layout, chain=False), values

@@ -24,10 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import InfluentialMeasurement
-from alidade.pipelines.solvers.chain import Array
+from alidade.pipelines.solvers.chain import Array, Factorization
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization
-from alidade.pipelines.solvers.linearization import Group
+from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.posterior import Reported, counted, responses
 from alidade.pipelines.solvers.weak_directions import WeakDirections
 
@@ -56,7 +55,7 @@ class Influence:
             of the others, columns for each number's prior.
     """
 
-    engine: Engine
+    engine: Linearization
     values: Values
     reported: Reported
     step: Tangent
@@ -67,7 +66,7 @@ class Influence:
         cls,
         reported: Reported,
         directions: WeakDirections,
-        engine: Engine,
+        engine: Linearization,
         factorization: Factorization,
         values: Values,
     ) -> Influence:
@@ -96,7 +95,7 @@ class Influence:
         """L (n, rows, m) of a group, and minus its weighted residuals (n, rows)."""
         return self.engine.products(group, self.values, self.step)
 
-    def moves(self, changed: Engine) -> Array:
+    def moves(self, changed: Linearization) -> Array:
         """Changes (m,) of the numbers, to first order, under other factors of the same layout."""
         moved = np.zeros(len(self.names))
         for sign, engine in ((1.0, changed), (-1.0, self.engine)):
@@ -218,7 +217,7 @@ def autocorrelation(whitened: Array) -> Array:
     return np.repeat(means[:end], count[:end])
 
 
-def autocorrelations(engine: Engine, values: Values) -> dict[str, Array]:
+def autocorrelations(engine: Linearization, values: Values) -> dict[str, Array]:
     """Family of measurements -> autocorrelation of its residuals where they are not white; rejected ones are zero."""
     found = {}
     for family, groups in _measured(engine).items():
@@ -288,7 +287,7 @@ def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
     return np.maximum(ratio, 1.0) if certain else np.ones(len(ratio))
 
 
-def _measured(engine: Engine) -> dict[str, list[Group]]:
+def _measured(engine: Linearization) -> dict[str, list[Group]]:
     """Family -> its groups of measurements."""
     found: dict[str, list[Group]] = {}
     for group in engine.groups:

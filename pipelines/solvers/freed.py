@@ -11,7 +11,6 @@ from alidade.pipelines.estimation.problem import Estimate, Problem, SqrtInformat
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels
 from alidade.pipelines.solvers.noise_estimation import apply_levels
@@ -40,7 +39,7 @@ def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | N
     try:
         engine = _without_rejected(apply_levels(compiled.engine, levels), used)
         values = _with_optimal_states(engine, _at(compiled, estimate))
-        if freed.marginal_likelihood and isinstance(compiled.engine, Linearization):
+        if freed.marginal_likelihood and compiled.engine.is_chain:
             out = {i: ~used[i] for i, group in enumerate(engine.groups) if group.is_measurement}
             found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
             engine = _without_rejected(apply_levels(compiled.engine, found.levels), used)
@@ -65,7 +64,7 @@ def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]
     return used
 
 
-def _without_rejected(engine: Engine, used: Sequence[NDArray[np.bool_]]) -> Engine:
+def _without_rejected(engine: Linearization, used: Sequence[NDArray[np.bool_]]) -> Linearization:
     """The engine with measurements that count in full or not at all."""
     return engine.with_groups([group.counting(own) for group, own in zip(engine.groups, used, strict=True)])
 
@@ -83,7 +82,7 @@ def _at(compiled: Compiled, estimate: Estimate) -> Values:
     return values
 
 
-def _with_optimal_states(engine: Engine, values: Values) -> Values:
+def _with_optimal_states(engine: Linearization, values: Values) -> Values:
     """Values with the states optimal for the parameters as they are."""
     *_, c, s = engine.layout.sizes
     for _ in range(_STEPS):

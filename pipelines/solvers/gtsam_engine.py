@@ -2,7 +2,7 @@
 
 Models are evaluated as for the chain; every measurement becomes a gtsam.JacobianFactor about its own variables. All but
 the last bias node and the shared unknowns are eliminated by QR in an order of gtsam's choice (COLAMD), and what is left
-is R of these. Its interface is that of the chain.
+is R of these. Systems and factorizations are used as those of the chain are.
 
 Limits: a factor and a conditional at a time pass through Python, some 20 us each, and what was known at moments on the
 way is not asked for.
@@ -11,7 +11,7 @@ way is not asked for.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,86 +19,19 @@ import gtsam
 import numpy as np
 
 from alidade.factors.bridge import jacobian_factor
-from alidade.factors.loss import TruncatedLoss
-from alidade.pipelines.estimation.problem import Factor
-from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
-from alidade.pipelines.solvers.layout import Layout, Tangent, Values
-from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.chain import UNDETERMINED, Array, Factorization, IndeterminateStateError, Index
+from alidade.pipelines.solvers.layout import Layout
 
 
-@dataclass(frozen=True, eq=False)
-class GtsamEngine:
-    """A problem's factors, eliminated by gtsam; see levenberg.Engine.
-
-    Attributes:
-        linearization: of the factors, as they are evaluated.
-    """
-
-    linearization: Linearization
-
-    @classmethod
-    def of(cls, factors: Sequence[Factor], layout: Layout) -> GtsamEngine:
-        """Build the engine that eliminates these factors by gtsam."""
-        return cls(Linearization.of(factors, layout, chain=False))
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of the variables."""
-        return self.linearization.layout
-
-    @property
-    def groups(self) -> Sequence[Group]:
-        """The measurements by kind."""
-        return self.linearization.groups
-
-    @property
-    def piece(self) -> Index:
-        """Node in force at each keyframe; nobody asks where there is no chain."""
-        return self.linearization.piece
-
-    @property
-    def time(self) -> Array:
-        """Times of the keyframes (N,), s."""
-        return self.linearization.time
-
-    def at(self, values: Values) -> tuple[GtsamSystem, float]:
-        """The system about the values, and the cost there."""
-        graph, squares, cost = gtsam.GaussianFactorGraph(), 0.0, 0.0
-        for group in self.groups:
-            right, jacobians, own = group.whitened(values)
-            squares, cost = squares + float(np.square(right).sum()), cost + own
-            for factor in _factors(self.layout, group, right, jacobians):
-                graph.push_back(factor)
-        return GtsamSystem(self.layout, graph, squares), cost
-
-    def cost(self, values: Values) -> float:
-        """Twice the sum of the losses."""
-        return self.linearization.cost(values)
-
-    def residuals(self, values: Values) -> list[Array]:
-        """Weighted whitened residuals of each group."""
-        return self.linearization.residuals(values)
-
-    def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
-        """A x of a group's whitened rows with tangent vectors, and its right side."""
-        return self.linearization.products(group, values, tangent)
-
-    def under(self, loss: TruncatedLoss | None) -> GtsamEngine:
-        """The engine with another loss for the measurements that have one."""
-        return GtsamEngine(self.linearization.under(loss))
-
-    def with_groups(self, groups: Sequence[Group]) -> GtsamEngine:
-        """The engine with other measurements at the same variables."""
-        return GtsamEngine(self.linearization.with_groups(groups))
-
-
-def _factors(layout: Layout, group: Group, right: Array, jacobians: tuple[Array, ...]) -> list[gtsam.GaussianFactor]:
+def _factors(
+    layout: Layout, at: Sequence[Index], right: Array, jacobians: Sequence[Array]
+) -> list[gtsam.GaussianFactor]:
     """The rows of a group: one factor if all are about the same variables, else one a measurement."""
     n, m = right.shape
-    if all(len(at) == 1 for at in group.at):
+    if all(len(each) == 1 for each in at):
         columns = [np.broadcast_to(J, (n, *J.shape[1:])).reshape(n * m, -1) for J in jacobians]
-        return [_factor([int(layout.key[at[0]]) for at in group.at], columns, right.ravel())]
-    keys = [np.broadcast_to(layout.key[at], n) for at in group.at]
+        return [_factor([int(layout.key[each[0]]) for each in at], columns, right.ravel())]
+    keys = [np.broadcast_to(layout.key[each], n) for each in at]
     blocks = [np.broadcast_to(J, (n, *J.shape[1:])) for J in jacobians]
     return [_factor([int(k[i]) for k in keys], [J[i] for J in blocks], right[i]) for i in range(n)]
 
@@ -114,11 +47,32 @@ def _factor(keys: Sequence[int], blocks: Sequence[Array], right: Array) -> gtsam
 
 @dataclass(frozen=True, eq=False)
 class GtsamSystem:
-    """Whitened rows about some values; see levenberg.System."""
+    """Whitened rows about some values.
+
+    Attributes:
+        layout: of the variables.
+        graph: of the rows.
+        squares: sum of squares of the right side.
+    """
 
     layout: Layout
     graph: gtsam.GaussianFactorGraph
     squares: float
+
+    @classmethod
+    def of(cls, layout: Layout, groups: Iterable[tuple[Sequence[Index], Array, Sequence[Array]]]) -> GtsamSystem:
+        """The system of groups of rows.
+
+        Args:
+            layout: of the variables.
+            groups: of each, for each block the positions (n or 1,) of its variables, right side (n, m) and Jacobians.
+        """
+        graph, squares = gtsam.GaussianFactorGraph(), 0.0
+        for at, right, jacobians in groups:
+            squares += float(np.square(right).sum())
+            for factor in _factors(layout, at, right, jacobians):
+                graph.push_back(factor)
+        return cls(layout, graph, squares)
 
     def eliminate(self, damping: float = 0.0) -> GtsamFactorization:
         """R of the rows, with so many times the information of each unknown added. Raises IndeterminateStateError."""
@@ -149,7 +103,7 @@ class GtsamSystem:
             whole = np.pad(whole, ((0, c + s + 1 - len(whole)), (0, 0)))
         root = np.triu(np.linalg.qr(whole, mode="r"))
         conditionals = [_Conditional.of(each, layout) for each in conditionals_of(tree, ordering)]
-        found = GtsamFactorization(layout, root, conditionals)
+        found = GtsamFactorization(layout, c, root, conditionals)
         root[-1, -1] = np.sqrt(self._minimum(graph, found))  # gtsam drops what no variable can change
         return found
 
@@ -157,7 +111,7 @@ class GtsamSystem:
         """Sum of squares at the solution; where there is none, what the rows of R leave of it."""
         try:
             last = np.asarray(np.linalg.solve(found.root[:-1, :-1], found.root[:-1, -1:]), dtype=float)
-            moves = found.moves(last, 1.0, np.zeros)
+            moves = found.moves(last, 1.0, None)
         except np.linalg.LinAlgError:
             return max(self.squares - found.explained, 0.0)
         solution = gtsam.VectorValues()
@@ -222,69 +176,38 @@ class _Conditional:
 
 
 @dataclass(frozen=True, eq=False)
-class GtsamFactorization:
-    """R of a system that gtsam eliminated; see levenberg.Factorization."""
+class GtsamFactorization(Factorization):
+    """R of a system that gtsam eliminated."""
 
     layout: Layout
+    c: int
     root: Array
     _conditionals: list[_Conditional]
-
-    @property
-    def c(self) -> int:
-        """Numbers of the last node."""
-        return self.layout.sizes[3]
-
-    @property
-    def minimum(self) -> float:
-        """Sum of squares at the solution."""
-        return float(self.root[-1, -1] ** 2)
-
-    def solve(self) -> tuple[Array, Array, Array]:
-        """States, nodes, shared unknowns of the least squares."""
-        last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)
-        states, nodes = self.given(last[:, None])
-        return states[..., 0], nodes[..., 0], last[self.c :]
-
-    def given(self, last: Array) -> tuple[Array, Array]:
-        """States and nodes of the least squares for given last node and shared unknowns (c + s, n)."""
-        return self._back(last, 1.0, np.zeros)
-
-    def propagate(self, last: Array) -> tuple[Array, Array]:
-        """Moves of states and nodes that go with moves of the last node and the shared unknowns (c + s, n)."""
-        return self._back(last, 0.0, np.zeros)
-
-    def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Draws from the posterior, as deviations from its mean."""
-        noise = generator.standard_normal((len(self.root) - 1, count))
-        last = np.asarray(np.linalg.solve(self.root[:-1, :-1], noise), dtype=float)
-        return *self._back(last, 0.0, generator.standard_normal), last[self.c :]
-
-    def prefix_roots(self) -> tuple[Index, list[Array]]:
-        """Always None: the elimination is not in time order."""
-        return np.zeros(0, dtype=np.intp), []
 
     @property
     def explained(self) -> float:
         """Decrease of the sum of squares by the solution."""
         return sum(float(np.square(d).sum()) for d in (self.root[:-1, -1], *(each.d for each in self._conditionals)))
 
-    def moves(self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]) -> dict[int, Array]:
+    def moves(self, last: Array, right: float, generator: np.random.Generator | None) -> dict[int, Array]:
         """Moves (dim, n) of all variables, by position, for those of the last node and the shared unknowns."""
         layout, found, J = self.layout, dict[int, Array](), self.layout.sizes[2]
         for at in np.flatnonzero((layout.keyframe < 0) & ((layout.node <= 0) | (layout.node == J - 1))).tolist():
             found[at] = layout.root_columns(int(layout.key[at])) @ last
         for each in reversed(self._conditionals):
-            rest = right * each.d[:, None] + noise((len(each.d), last.shape[1]))
+            rest = right * each.d[:, None]
+            if generator is not None:
+                rest = rest - generator.standard_normal((len(each.d), last.shape[1]))
             if each.others:
                 rest = rest - each.S @ np.vstack([found[at] for at in each.others])
             ends = np.cumsum([layout.size(at) for at in each.own])[:-1]
             found |= zip(each.own, np.split(np.linalg.solve(each.R, rest), ends), strict=True)
         return found
 
-    def _back(self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]) -> tuple[Array, Array]:
+    def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
         layout, n = self.layout, last.shape[1]
         N, d, J, c, _ = layout.sizes
-        states, nodes, found = np.zeros((N, d, n)), np.zeros((J, c, n)), self.moves(last, right, noise)
+        states, nodes, found = np.zeros((N, d, n)), np.zeros((J, c, n)), self.moves(last, right, generator)
         first = int(np.flatnonzero(layout.node == 0)[0]) if c else -1
         for at, x in found.items():
             size = layout.size(at)

@@ -48,9 +48,8 @@ from alidade.pipelines.solvers.checkpoint import (
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
-from alidade.pipelines.solvers.gtsam_engine import GtsamEngine, undetermined
+from alidade.pipelines.solvers.gtsam_engine import GtsamSystem, undetermined
 from alidade.pipelines.solvers.levenberg import without_rejected
-from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.posterior import WIDEST, Reported
 from alidade.pipelines.solvers.smoother import (
     FixedLagSmoother,
@@ -602,9 +601,8 @@ class IncrementalSolver:
             self._start(used, values, stamps)
             return
         at = solved.solution.values
-        engine = without_rejected(solved.engine, at)
-        assert isinstance(engine, Linearization | GtsamEngine)
-        system, _ = (engine if isinstance(engine, GtsamEngine) else GtsamEngine(engine)).at(at)
+        system, _ = replace(without_rejected(solved.engine, at), is_chain=False).at(at)
+        assert isinstance(system, GtsamSystem)
         self._continue_from(MarginalState.of(self.time, system.graph, values, active_variables(values, stamps), stamps))
 
     def _continue_from(self, state: MarginalState) -> None:

@@ -16,99 +16,19 @@ Limits: a minimum is a local one. A cost is a sum of squares, in units of square
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, Self
 
 import numpy as np
 
-from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines import deadline
-from alidade.pipelines.solvers.chain import Array, IndeterminateStateError, Index
-from alidade.pipelines.solvers.layout import Layout, Tangent, Values
-from alidade.pipelines.solvers.linearization import Group
+from alidade.pipelines.solvers.chain import Factorization as Factorization
+from alidade.pipelines.solvers.chain import IndeterminateStateError
+from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.linearization import Linearization
+from alidade.pipelines.solvers.linearization import System as System
 
-
-class Factorization(Protocol):
-    """R of a linear system, all but the last node and the shared unknowns eliminated; see ChainFactorization."""
-
-    @property
-    def c(self) -> int:
-        """Numbers of the last node."""
-
-    @property
-    def root(self) -> Array:
-        """R of the last node, the shared unknowns and the right side."""
-
-    @property
-    def minimum(self) -> float:
-        """Sum of squares at the solution."""
-
-    def solve(self) -> tuple[Array, Array, Array]:
-        """States, nodes, shared unknowns of the least squares."""
-
-    def given(self, last: Array) -> tuple[Array, Array]:
-        """States and nodes for given last node and shared unknowns (c + s, n)."""
-
-    def propagate(self, last: Array) -> tuple[Array, Array]:
-        """Moves of states and nodes that go with moves (c + s, n)."""
-
-    def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Draws from the posterior, as deviations from its mean."""
-
-    def prefix_roots(self) -> tuple[Index, list[Array]]:
-        """Keyframes, and R of (their node, shared unknowns, right side) by all until then."""
-
-
-class System(Protocol):
-    """Whitened rows A dx = b about some values."""
-
-    @property
-    def squares(self) -> float:
-        """|b|^2."""
-
-    def eliminate(self, damping: float = 0.0) -> Factorization:
-        """R of the rows. Raises IndeterminateStateError."""
-
-
-class Engine(Protocol):
-    """A problem's factors, ready to be linearised: `Linearization`, or `GtsamEngine`."""
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of the variables."""
-
-    @property
-    def groups(self) -> Sequence[Group]:
-        """The measurements by kind."""
-
-    def at(self, values: Values) -> tuple[System, float]:
-        """The system about the values, and the cost there."""
-
-    def cost(self, values: Values) -> float:
-        """Twice the sum of the losses."""
-
-    def residuals(self, values: Values) -> list[Array]:
-        """Weighted whitened residuals of each group."""
-
-    def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
-        """A x (n, m, k) of a group's whitened rows with k tangent vectors, and its right side (n, m)."""
-
-    @property
-    def piece(self) -> Index:
-        """Node in force at each keyframe, (N,)."""
-
-    @property
-    def time(self) -> Array:
-        """Times of the keyframes (N,), s."""
-
-    def under(self, loss: TruncatedLoss | None) -> Self:
-        """The engine with another loss for the measurements that have one."""
-
-    def with_groups(self, groups: Sequence[Group]) -> Self:
-        """The engine with other measurements at the same variables."""
-
+Engine = Linearization
 
 # Decrease of the cost over the one predicted above which a step is doubled: along it the cost is no parabola, and falls
 # on, as it does about a saddle, where the ratio is 2.
@@ -161,7 +81,7 @@ class Solution:
         iterations: linear systems solved on the way.
     """
 
-    engine: Engine
+    engine: Linearization
     values: Values
     system: System
     cost: float
@@ -184,12 +104,12 @@ class _Point:
     cost: float
 
     @classmethod
-    def of(cls, engine: Engine, values: Values) -> _Point:
+    def of(cls, engine: Linearization, values: Values) -> _Point:
         return cls(values, *engine.at(values))
 
 
 def minimize(
-    engine: Engine, values: Values, config: LevenbergConfig, known: tuple[System, float] | None = None
+    engine: Linearization, values: Values, config: LevenbergConfig, known: tuple[System, float] | None = None
 ) -> Solution:
     """Minimise an engine's cost from some values; `known`: the system about these, and the cost."""
     here = _Point(values, *known) if known else _Point.of(engine, values)
@@ -239,7 +159,7 @@ def _is_minimum(config: LevenbergConfig, enough: float, damping: float, predicte
 
 
 def _reached(
-    engine: Engine, here: _Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
+    engine: Linearization, here: _Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
 ) -> tuple[_Point, int]:
     """Point after a step whose length or end is corrected, and the number of corrections."""
     there = _Point.of(engine, engine.layout.retract(here.values, step))
@@ -262,13 +182,13 @@ def _reached(
     return there, config.corrections
 
 
-def without_rejected(engine: Engine, values: Values) -> Engine:
+def without_rejected(engine: Linearization, values: Values) -> Linearization:
     """The measurements that count at some values, in full, whatever they are elsewhere."""
     groups = [g if g.loss is None else g.counting(g.used(g.evaluate(values)[0]) > 0.5) for g in engine.groups]
     return engine.with_groups(groups)
 
 
-def _lengthened(engine: Engine, values: Values, step: Tangent, cost: float) -> _Point:
+def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: float) -> _Point:
     """Point after a step that is doubled as long as the cost falls; `cost` is that after the single step."""
     length = 1.0
 

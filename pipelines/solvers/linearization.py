@@ -1,7 +1,7 @@
 """A problem's measurements evaluated as arrays: values in, the chain's whitened rows out, gtsam not involved.
 
     linearization = Linearization.of(factors, layout)       # models of one kind stacked: `groups`
-    system, cost = linearization.at(values)                 # ChainSystem under the loss and weights in force
+    system, cost = linearization.at(values)                 # its linear system under the loss and weights in force
     cost = linearization.cost(values)                       # without Jacobians
     linearization.under(loss)                               # another loss (None: every measurement in full)
     rows, cost = group.rows(values, width)                  # (n, m, width) of one kind, on the columns of its target
@@ -31,10 +31,14 @@ from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Block, Model, Residuals, dimension, stack_models, stacking_key
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import Array, ChainSystem, Index
+from alidade.pipelines.solvers.gtsam_engine import GtsamSystem
 from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Values, insert_value
 
 if TYPE_CHECKING:
     import gtsam
+
+# Whitened rows A dx = b about some values, as numpy eliminates them where they are a chain, else gtsam.
+System = ChainSystem | GtsamSystem
 
 # Families whose residuals have no information about measurement noise.
 NOT_MEASURED = ("prior", "definition")
@@ -188,12 +192,14 @@ class Linearization:
         groups: of its factors.
         piece: (N,) node in force from the keyframe before to each and at it.
         sizes: rows m of a keyframe and b between two.
+        is_chain: whether its linear systems are a chain; else gtsam eliminates them.
     """
 
     layout: Layout
     groups: Sequence[Group]
     piece: Index
     sizes: tuple[int, int]
+    is_chain: bool = True
 
     @classmethod
     def of(cls, factors: Sequence[Factor], layout: Layout, chain: bool = True) -> Linearization:
@@ -209,10 +215,16 @@ class Linearization:
         # What joins keyframes first: rows about single ones may stand where there is no such row.
         groups = [draft.placed(layout, piece, used, chain) for draft in sorted(drafts, key=lambda d: d.count.max() < 2)]
         absent = int((~layout.kept[0]).sum(axis=1).max(initial=0))
-        return cls(layout, groups, piece, (int(used[0].max()) + absent, int(used[1].max())))
+        return cls(layout, groups, piece, (int(used[0].max()) + absent, int(used[1].max())), chain)
 
-    def at(self, values: Values) -> tuple[ChainSystem, float]:
+    def at(self, values: Values) -> tuple[System, float]:
         """The system about the values, and its cost: twice the sum of the losses."""
+        if self.is_chain:
+            return self._chain_at(values)
+        each = [(group.at, *group.whitened(values)) for group in self.groups]
+        return GtsamSystem.of(self.layout, (rows[:3] for rows in each)), sum(rows[3] for rows in each)
+
+    def _chain_at(self, values: Values) -> tuple[ChainSystem, float]:
         (N, d, J, c, s), (m, b) = self.layout.sizes, self.sizes
         measured, between = np.zeros((N, m, d + c + s + 1)), np.zeros((N, b, 2 * d + c + s + 1))
         shared, cost = list[Array](), 0.0

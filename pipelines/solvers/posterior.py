@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import ChiSquare, Problem, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
-from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem
+from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, Factorization
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization, System
-from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group
+from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization, System
 
 if TYPE_CHECKING:
     import gtsam
@@ -231,7 +230,7 @@ def counted(group: Group, values: Values) -> NDArray[np.bool_]:
     return np.asarray(group.used(group.evaluate(values)[0]) > 0.0)
 
 
-def leverages(engine: Engine, system: System, factorization: Factorization, values: Values) -> list[Leverage]:
+def leverages(engine: Linearization, system: System, factorization: Factorization, values: Values) -> list[Leverage]:
     """Leverages of all measurements, processes and priors.
 
     In a chain they are exact: what a row predicts has the variance that the shared unknowns leave, by the covariances
@@ -363,7 +362,7 @@ def chi_square(found: Sequence[Leverage]) -> ChiSquare:
 
 
 def expected_squares(
-    engine: Engine, system: System, factorization: Factorization, values: Values
+    engine: Linearization, system: System, factorization: Factorization, values: Values
 ) -> dict[tuple[str, int], float]:
     """Expected sums of squares under noise of unit variance, by (family, row of its measurements).
 
@@ -379,7 +378,7 @@ def expected_squares(
 
 def sqrt_information(
     problem: Problem,
-    engine: Engine,
+    engine: Linearization,
     values: Values,
     current_keys: Mapping[int, int],
     device: Collection[str],
@@ -439,7 +438,7 @@ def sqrt_information(
 
 def moved_to(
     problem: Problem,
-    engine: Engine,
+    engine: Linearization,
     values: Values,
     current_keys: Mapping[int, int],
     numbers: Mapping[str, float],

@@ -25,8 +25,8 @@ from alidade.pipelines import deadline
 from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, System, minimize
-from alidade.pipelines.solvers.linearization import Group
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.linearization import Group, Linearization, System
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class RobustConfig:
     max_chance: float = 1e-3
 
 
-def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, config: RobustConfig) -> Solution:
+def solve_robust(engine: Linearization, values: Values, loss: TruncatedLoss | None, config: RobustConfig) -> Solution:
     """Minimise the truncated loss from a first guess."""
     plain = engine.under(None)
     if loss is None:
@@ -88,7 +88,9 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
     return replace(final, iterations=iterations)
 
 
-def _hardened(engine: Engine, values: Values, softness: float, loss: TruncatedLoss, config: RobustConfig) -> Values:
+def _hardened(
+    engine: Linearization, values: Values, softness: float, loss: TruncatedLoss, config: RobustConfig
+) -> Values:
     """Values to which measurements lead whose sigmas are so many times as large first, and then less and less.
 
     A dozen pictures, three of them outliers, are explained by a gyro scale 200 sigmas from its prior, and every way
@@ -104,14 +106,14 @@ def _hardened(engine: Engine, values: Values, softness: float, loss: TruncatedLo
     return values
 
 
-def _soft(engine: Engine, softness: float) -> Engine:
+def _soft(engine: Linearization, softness: float) -> Linearization:
     """The engine with the sigmas of all measurements multiplied."""
     soft = [replace(g, weights=g.all_weights / softness) if g.is_measurement else g for g in engine.groups]
     return engine.with_groups(soft)
 
 
 def solve_truncated(
-    engine: Engine,
+    engine: Linearization,
     values: Values,
     loss: TruncatedLoss,
     config: RobustConfig,
@@ -132,7 +134,7 @@ def solve_truncated(
         current, known = current.with_groups(groups), None
 
 
-def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: RobustConfig) -> tuple[Values, int]:
+def _graduated(engine: Linearization, values: Values, loss: TruncatedLoss, config: RobustConfig) -> tuple[Values, int]:
     """Values to which one surrogate of the loss after the other leads, and the iterations that takes."""
     largest = max((_norms(g, values).max(initial=0.0) for g in engine.groups if g.loss is not None), default=0.0)
     if largest <= loss.gate:
@@ -155,7 +157,7 @@ def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: Robu
     return values, iterations
 
 
-def _undecided(engine: Engine, values: Values) -> float:
+def _undecided(engine: Linearization, values: Values) -> float:
     """Share of measurements whose weight under a surrogate is neither 0 nor 1."""
     weights = [group.used(group.evaluate(values)[0]) for group in engine.groups if group.loss is not None]
     whole = np.concatenate(weights)
@@ -167,7 +169,7 @@ def _norms(group: Group, values: Values) -> Array:
     return np.linalg.norm(group.weighted(group.evaluate(values)[0]), axis=1)
 
 
-def without_onsets(engine: Engine, solution: Solution) -> Engine | None:
+def without_onsets(engine: Linearization, solution: Solution) -> Linearization | None:
     """The engine without what lies at the smooth ends of disturbed intervals; None where there are none.
 
     Of vectors alone: one component of a disturbance varies with the attitude.
@@ -190,7 +192,7 @@ def without_onsets(engine: Engine, solution: Solution) -> Engine | None:
     return engine.with_groups(groups) if any(g.excluded is not None for g in groups) else None
 
 
-def _mostly_rejected(engine: Engine, values: Values, chance: float) -> set[str]:
+def _mostly_rejected(engine: Linearization, values: Values, chance: float) -> set[str]:
     """Families that lose more than half of their measurements significantly (binomial test against one half)."""
     counts: dict[str, list[int]] = {}
     for group in engine.groups:

@@ -259,20 +259,16 @@ def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solutio
 
     None where the recording determines too little for the tests.
     """
-    engine = compiled.engine
-    if not isinstance(engine, Linearization) or not isinstance(solution.engine, Linearization):
-        return ()
     try:
-        return _largest_steps(compiled, engine, levels, solution.engine, solution.values)
+        return _largest_steps(compiled, levels, solution)
     except (IndeterminateStateError, np.linalg.LinAlgError):
         return ()
 
 
-def _largest_steps(
-    compiled: Compiled, engine: Linearization, levels: Sequence[Level], solved: Linearization, values: Values
-) -> tuple[StepEstimate, ...]:
+def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
+    engine, values = compiled.engine, solution.values
     parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.may_step]
-    outliers = rejected(solved, values)
+    outliers = rejected(solution.engine, values)
     transient = {group: _transient(out) for group, out in outliers.items()}
     base = _Fit.of(engine, values, levels, transient)
     scans = [(p, found) for p in parameters if (found := base.scanned(p)) is not None]

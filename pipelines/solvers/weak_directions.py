@@ -38,9 +38,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
+from alidade.pipelines.solvers.chain import Array, Factorization, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System
+from alidade.pipelines.solvers.levenberg import Solution
+from alidade.pipelines.solvers.linearization import Linearization, System
 from alidade.pipelines.solvers.posterior import Reported, ReportedRoot, followed
 
 # Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
@@ -318,7 +319,7 @@ def constrained_solution(problem: Problem, minimum: Solution, current_keys: Mapp
     return replace(found, directions=directions)
 
 
-def _contradicts(engine: Engine, before: Posterior, after: Posterior) -> bool:
+def _contradicts(engine: Linearization, before: Posterior, after: Posterior) -> bool:
     """Whether measurements and other priors contradict that more directions are at their prior means.
 
     What is hardly determined can be moved at a cost: a chi-square of (move / MAX_SIGMA)^2, to first order.
@@ -351,7 +352,7 @@ def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
 
 
 def beyond_second_order(
-    problem: Problem, engine: Engine, found: Posterior, current_keys: Mapping[int, int]
+    problem: Problem, engine: Linearization, found: Posterior, current_keys: Mapping[int, int]
 ) -> NDArray[np.bool_]:
     """Which free numbers (m,), those of one variable together, are part of terms of higher than second order.
 
@@ -395,7 +396,7 @@ def _share(known: Array, missed: Array) -> float:
 
 def _constrained(
     problem: Problem,
-    engine: Engine,
+    engine: Linearization,
     values: Values,
     current_keys: Mapping[int, int],
     fixed: WeakDirections | None,
@@ -438,14 +439,16 @@ def _constrained(
     return Posterior(values, system, factorization, reported, directions, False)
 
 
-def _moved(engine: Engine, factorization: Factorization, values: Values, found: ReportedRoot, du: Array) -> Values:
+def _moved(
+    engine: Linearization, factorization: Factorization, values: Values, found: ReportedRoot, du: Array
+) -> Values:
     """Values with the reported numbers moved by du (m,), all else where it is optimal then."""
     last = found.last(du[:, None])
     return engine.layout.retract(values, followed(factorization, last))
 
 
 def moved_roots(
-    problem: Problem, engine: Engine, at: Posterior, current_keys: Mapping[int, int], moves: Array
+    problem: Problem, engine: Linearization, at: Posterior, current_keys: Mapping[int, int], moves: Array
 ) -> Iterator[Array]:
     """Square-root information (m, m) of the numbers moved by (m, n) from a solution, all else following."""
     found = at.reported.root(at.factorization.root)

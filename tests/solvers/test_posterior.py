@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from alidade.pipelines.estimation.problem import Array, Factor, Problem
-from alidade.pipelines.solvers.chain import ChainFactorization
+from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem
 from alidade.pipelines.solvers.error_budget import (
     Influence,
     added_covariance,
@@ -66,7 +66,7 @@ def dense(name: str) -> Dense:
     layout, values = Layout.of(made.layout, initial)
     linearization = Linearization.of(factors, layout).under(None)
     for _ in range(3):
-        step_taken = Tangent(*ChainFactorization.of(linearization.at(values)[0]).solve())
+        step_taken = Tangent(*linearization.at(values)[0].eliminate().solve())
         values = layout.retract(values, step_taken)
     at = layout.to_gtsam(values)
     graph = gtsam.GaussianFactorGraph()
@@ -93,7 +93,8 @@ def dense(name: str) -> Dense:
         block = np.zeros((len(J), end))
         block[:, columns[key]] = J
         numbers.append(block)
-    factorization = ChainFactorization.of(linearization.at(values)[0])
+    factorization = linearization.at(values)[0].eliminate()
+    assert isinstance(factorization, ChainFactorization)
     return Dense(
         made, factors, current, linearization, values, factorization, rows, rights, np.vstack(numbers), columns
     )
@@ -272,6 +273,7 @@ def test_history_ends_with_the_estimate(name: str) -> None:
     layout = case.linearization.layout
     time = np.arange(layout.sizes[0], dtype=float)
     system, _ = case.linearization.at(case.values)
+    assert isinstance(system, ChainSystem)
     course = posterior_history(
         case.problem, case.linearization, system, case.factorization, case.values, case.current, time
     )
