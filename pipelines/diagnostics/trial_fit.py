@@ -172,7 +172,7 @@ def _score(problem: Problem) -> tuple[float, float]:
     measured = [np.abs(r).ravel() for group, r in whitened if group.is_measurement]
     processes = [r for group, r in whitened if not group.is_measurement and group.family not in NOT_MEASURED]
     sizes = [np.sqrt((r**2).mean(axis=1)) for r in processes]
-    numbers = Reported.of(problem, compiled.layout, values, compiled.current_keys).numbers
+    numbers = Reported.of(compiled, values).numbers
     score = sum(float(np.median(np.concatenate(each))) for each in (measured, sizes) if each)
     return score, sum(_from_priors(problem.quantities, numbers))
 

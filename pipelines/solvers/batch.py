@@ -28,13 +28,12 @@ from alidade.pipelines.estimation.problem import (
     Attitudes,
     EngineName,
     Estimate,
-    History,
     Minimum,
     Problem,
     Residuals,
     SqrtInformation,
 )
-from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, IndeterminateStateError
+from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
     Influence,
@@ -44,13 +43,20 @@ from alidade.pipelines.solvers.error_budget import (
     most_influential,
     sigma_ratio,
 )
-from alidade.pipelines.solvers.layout import Layout, Values
-from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize, without_rejected
+from alidade.pipelines.solvers.layout import Values
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
-from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
-from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
+from alidade.pipelines.solvers.posterior import (
+    Reported,
+    chi_square,
+    expected_squares,
+    leverages,
+    moved_to,
+    sqrt_information,
+)
+from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated, without_onsets
 from alidade.pipelines.solvers.step_test import largest_steps
 from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
@@ -101,20 +107,19 @@ class Solved:
 
     @property
     def engine(self) -> Linearization:
-        """The engine of the graph, with the loss and the weights of the solution."""
-        return self.solution.engine
+        """The engine of the graph, with the weights of the solution, without what is rejected."""
+        return self.posterior.at.engine
 
     @property
     def values(self) -> Values:
         """Values of all variables, weak directions at their priors."""
-        return self.posterior.values
+        return self.posterior.at.values
 
 
 def minimum(compiled: Compiled, levels: Sequence[Level]) -> Solution:
     """The solution with noise levels that are known, rejected measurements left out."""
     engine = apply_levels(compiled.engine, levels)
-    solution = solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig())
-    return replace(solution, engine=without_rejected(solution.engine, solution.values))
+    return solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig()).at_inliers
 
 
 def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[Level, ...] | None = None) -> Solved:
@@ -148,10 +153,7 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
             if levels is None:
                 solution, start = estimate_noise(rest, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
-    kept = replace(solution, engine=without_rejected(solution.engine, solution.values))
-    vars(kept).update(factorization=solution.factorization)
-    posterior = constrained_solution(problem, kept, compiled.current_keys)
-    return Solved(compiled, solution, start, posterior, second)
+    return Solved(compiled, solution, start, constrained_solution(compiled, solution.at_inliers), second)
 
 
 def solve_batch(
@@ -205,19 +207,14 @@ def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[
             minimum = minimize(engine, values, config.robust.minimizer)
             found += [minimum] if minimum.converged else []
     best, *others = sorted(found, key=lambda each: each.cost)
-    here = _numbers(compiled, best.values)
+    here = Reported.of(compiled, best.values).numbers
     scales = np.array([q.scale for q in problem.quantities])
     for each in others:
-        there = _numbers(compiled, each.values)
+        there = Reported.of(compiled, each.values).numbers
         if (np.abs(there - here) > config.different * scales).any():
             above = each.cost - best.cost
             return best, Minimum(there, above) if above < config.close else None
     return best, None
-
-
-def _numbers(compiled: Compiled, values: Values) -> Array:
-    """Reported numbers (n,) at given values."""
-    return Reported.of(compiled.problem, compiled.layout, values, compiled.current_keys).numbers
 
 
 def whole_estimate(
@@ -225,12 +222,12 @@ def whole_estimate(
 ) -> Estimate:
     """Everything that is reported of a solution; see `solve_batch`."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
-    problem, found = compiled.problem, solved.posterior.factorization
+    problem, found = compiled.problem, posterior.at
     names = tuple(q.name for q in problem.quantities)
     correlations = autocorrelations(engine, values) if solved.levels and not problem.marginal_likelihood else {}
     influence, added = None, dict[str, Array]()
     if budget or correlations:
-        influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
+        influence = Influence.of(posterior)
         added = added_covariance(influence, correlations)
     nominal = posterior.covariance
     covariance = nominal.copy()
@@ -243,10 +240,7 @@ def whole_estimate(
         steps = largest_steps(compiled, solved.levels, solved.solution)
         widened = np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
-    system, history = posterior.system, None
-    if isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
-        final = posterior.reported.numbers, nominal
-        history = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time, final)
+    history = posterior_history(compiled, posterior)
     residuals = residuals_by_family(engine, values)
     out = Estimate(
         solver="batch",
@@ -261,10 +255,10 @@ def whole_estimate(
         message=solved.solution.message,
         residuals=residuals,
         innovations=innovations,
-        chi_square=chi_square(leverages(engine, system, found, values)),
+        chi_square=chi_square(leverages(engine, found.system, found.factorization, values)),
         history=None if history is None else history.history.inflated(wide),
         posterior_history=history,
-        smoothed=_smoothed(solved, covariance),
+        smoothed=smoothed(compiled, posterior, covariance),
         attitudes=_attitudes(solved) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=solved.levels,
@@ -304,38 +298,6 @@ def residuals_by_family(engine: Linearization, values: Values) -> dict[str, Resi
     return out
 
 
-def _smoothed(solved: Solved, covariance: Array) -> History | None:
-    """The reported numbers over time where a bias walks: of its nodes from the whole recording."""
-    compiled, layout = solved.compiled, solved.compiled.layout
-    *_, count, c, _ = layout.sizes
-    if count < 3 or c == 0:
-        return None
-    engine, values, factorization = solved.engine, solved.values, solved.posterior.factorization
-    if not isinstance(factorization, ChainFactorization):
-        return None
-    moving = [p for p in compiled.problem.parameters if p.key in compiled.current_keys]
-    if len(moving) != 1:
-        return None
-    (parameter,) = moving
-    keys = np.array([_node_key(layout, parameter.key, j) for j in range(count)])
-    begins = engine.time[np.searchsorted(engine.piece, np.arange(count))]
-    part = slice(0, len(parameter.quantities))
-    bias = smoothed_bias(layout, factorization, values, begins, keys, part)
-    names = [q.name for q in compiled.problem.quantities]
-    at = [names.index(q.name) for q in parameter.quantities]
-    whole = np.tile(solved.posterior.reported.numbers, (count, 1)), np.tile(np.sqrt(np.diag(covariance)), (count, 1))
-    beside = np.diag(covariance)[at] - bias.sigmas[-1] ** 2  # what the last node's has more: errors without a model
-    whole[0][:, at], whole[1][:, at] = bias.values, np.sqrt(np.maximum(bias.sigmas**2 + beside, 0.0))
-    return History(begins, *whole)
-
-
-def _node_key(layout: Layout, first: int, node: int) -> int:
-    """The variable of a bias in force at a node; `first` is that of the first one."""
-    if node == 0:
-        return first
-    return int(layout.key[(layout.node == node) & (layout.part == 0)][0])
-
-
 def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, float]:
     """Changes of the reported numbers in a slightly changed graph; empty where its variables differ.
 
@@ -347,10 +309,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     shapes = [[(g.family, g.target, len(g.model.time), g.model.rows) for g in e.groups] for e in (own, engine)]
     if not np.array_equal(other.layout.key, solved.compiled.layout.key) or shapes[0] != shapes[1]:
         return {}
-    kept = [
-        replace(new, loss=None, weights=new.all_weights * (g.used(g.evaluate(values)[0]) > 0.5)[:, None])
-        for g, new in zip(own.groups, engine.groups, strict=True)
-    ]
+    kept = [new.counting(g.used(g.evaluate(values)[0]) > 0.5) for g, new in zip(own.groups, engine.groups, strict=True)]
     moves = influence.moves(engine.with_groups(kept))
     return dict(zip(influence.names, moves.tolist(), strict=True))
 
@@ -360,8 +319,8 @@ def _information_of(
 ) -> SqrtInformation:
     """Square-root information of a graph about its numbers, linearised at its solution or at `elsewhere`."""
     compiled, engine, values = solved.compiled, solved.engine, solved.values
-    own = sqrt_information(compiled.problem, engine, values, compiled.current_keys, device)
+    own = sqrt_information(compiled, engine, values, device)
     wanted = {} if elsewhere is None else elsewhere(own)
     if not wanted:
         return own
-    return sqrt_information(compiled.problem, engine, values, compiled.current_keys, device, wanted)
+    return sqrt_information(compiled, engine, moved_to(compiled, engine, values, wanted), device)

@@ -60,6 +60,11 @@ class Compiled:
         """Layout of the variables."""
         return self.engine.layout
 
+    @property
+    def keys(self) -> list[int]:
+        """Variables that hold the parameters' values in the end."""
+        return [self.current_keys.get(p.key, p.key) for p in self.problem.parameters]
+
 
 def _engine(
     problem: Problem, name: EngineName, factors: list[Factor], initial: gtsam.Values, current: dict[int, int]

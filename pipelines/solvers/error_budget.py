@@ -24,11 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import InfluentialMeasurement
-from alidade.pipelines.solvers.chain import Array, Factorization
+from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.posterior import Reported, counted, responses
-from alidade.pipelines.solvers.weak_directions import WeakDirections
+from alidade.pipelines.solvers.weak_directions import Posterior
 
 # Fewer measurements show no autocorrelation.
 MIN_MEASUREMENTS = 100
@@ -47,44 +48,36 @@ class Influence:
     """Influence of all residuals on the free reported numbers.
 
     Attributes:
-        engine: of all factors.
-        values: at which it is linearised.
+        at: the estimate; the engine of all factors.
         reported: the numbers there.
         step: (m) columns B (B'N B)^-1 B'J' of all unknowns.
         from_priors: (m, 2 m) square root of what the priors of the weak directions add to the covariance of these and
             of the others, columns for each number's prior.
     """
 
-    engine: Linearization
-    values: Values
+    at: Point
     reported: Reported
     step: Tangent
     from_priors: Array
 
     @classmethod
-    def of(
-        cls,
-        reported: Reported,
-        directions: WeakDirections,
-        engine: Linearization,
-        factorization: Factorization,
-        values: Values,
-    ) -> Influence:
+    def of(cls, posterior: Posterior) -> Influence:
         """The influence at an estimate.
 
         Raises:
             LinAlgError: the shared unknowns are not determined.
         """
-        found, scale, weak = reported.root(factorization.root), reported.scale, directions.weak
+        at, reported, directions = posterior.at, posterior.reported, posterior.directions
+        found, scale, weak = reported.root(at.factorization.root), reported.scale, directions.weak
         p, strong = found.unseen, directions.strong
         basis = np.hstack([found.basis[:, :p], found.basis[:, p:] @ strong])
-        step = responses(factorization, reported.jacobian[reported.free], basis)
+        step = responses(at.factorization, reported.jacobian[reported.free], basis)
         slope = np.linalg.lstsq(found.R @ strong, -found.R @ weak, rcond=None)[0]
         root = np.linalg.cholesky(reported.prior)
         roots = [
             scale[:, None] * (axes @ directions.prior_covariance @ weak.T) @ root for axes in (weak, strong @ slope)
         ]
-        return cls(engine, values, reported, step, np.hstack(roots))
+        return cls(at, reported, step, np.hstack(roots))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -93,14 +86,14 @@ class Influence:
 
     def rows(self, group: Group) -> tuple[Array, Array]:
         """L (n, rows, m) of a group, and minus its weighted residuals (n, rows)."""
-        return self.engine.products(group, self.values, self.step)
+        return self.at.engine.products(group, self.at.values, self.step)
 
     def moves(self, changed: Linearization) -> Array:
         """Changes (m,) of the numbers, to first order, under other factors of the same layout."""
         moved = np.zeros(len(self.names))
-        for sign, engine in ((1.0, changed), (-1.0, self.engine)):
+        for sign, engine in ((1.0, changed), (-1.0, self.at.engine)):
             for group in engine.groups:
-                L, right = engine.products(group, self.values, self.step)
+                L, right = engine.products(group, self.at.values, self.step)
                 moved += sign * np.einsum("nrm,nr->m", L, right)
         return moved
 
@@ -121,7 +114,7 @@ def error_budget(influence: Influence, added: Mapping[str, Array], covariance: A
         covariance: (n, n) final posterior of all reported numbers.
     """
     names, variances = influence.names, dict[str, Array]()
-    for group in influence.engine.groups:
+    for group in influence.at.engine.groups:
         L, _ = influence.rows(group)
         for source, variance in _sources(influence, group, np.square(L)):
             variances[source] = variances.get(source, np.zeros(len(names))) + variance
@@ -148,8 +141,8 @@ def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[s
     """The sources of a group and the variance (m,) of each, from squares (n, rows, m) of its influence."""
     if group.family != "prior" or group.target != "shared":
         return [(group.family, squares.sum(axis=(0, 1)))]
-    layout, reported = influence.engine.layout, influence.reported
-    rows, _ = group.rows(influence.values, layout.sizes[4] + 1)
+    layout, reported = influence.at.engine.layout, influence.reported
+    rows, _ = group.rows(influence.at.values, layout.sizes[4] + 1)
     A = np.pad(rows[..., :-1].reshape(-1, layout.sizes[4]), ((0, 0), (layout.sizes[3], 0)))
     about = np.abs(A @ np.linalg.pinv(reported.jacobian)[:, reported.free] * reported.scale)
     largest = about > ROUNDING * about.max(axis=1, keepdims=True, initial=0.0)
@@ -177,7 +170,7 @@ def most_influential(
     columns = [influence.names.index(name) for name in names]
     scale = np.array([sigmas[name] for name in names])
     found: list[tuple[float, str, float, str]] = []
-    for group in influence.engine.groups:
+    for group in influence.at.engine.groups:
         if group.target == "shared" and group.family == "prior":
             continue
         L, right = influence.rows(group)
@@ -240,7 +233,7 @@ def added_covariance(influence: Influence, correlations: Mapping[str, Array]) ->
         influence: of the residuals.
         correlations: see `autocorrelations`.
     """
-    added, groups, scale = {}, _measured(influence.engine), influence.reported.scale
+    added, groups, scale = {}, _measured(influence.at.engine), influence.reported.scale
     for family, correlation in correlations.items():
         found, order = [influence.rows(group) for group in groups[family]], _in_time(groups[family])
         L, right = (np.concatenate([each[i] for each in found])[order] for i in (0, 1))

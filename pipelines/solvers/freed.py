@@ -43,7 +43,7 @@ def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | N
             out = {i: ~used[i] for i, group in enumerate(engine.groups) if group.is_measurement}
             found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
             engine = _without_rejected(apply_levels(compiled.engine, found.levels), used)
-        return sqrt_information(compiled.problem, engine, values, compiled.current_keys, ())
+        return sqrt_information(compiled, engine, values, ())
     except (IndeterminateStateError, np.linalg.LinAlgError):
         return None
 
@@ -75,7 +75,7 @@ def _at(compiled: Compiled, estimate: Estimate) -> Values:
     layout, values = compiled.layout, compiled.initial
     N, d, J, c, _ = layout.sizes
     for _ in range(_STEPS):  # rotation vectors are not linear
-        here = Reported.of(compiled.problem, layout, values, compiled.current_keys)
+        here = Reported.of(compiled, values)
         means = [numbers.get(q.name, q.prior_mean) for q in compiled.problem.quantities]
         move = np.linalg.pinv(here.jacobian[:, c:]) @ (np.array(means) - here.numbers)
         values = layout.retract(values, Tangent(np.zeros((N, d)), np.zeros((J, c)), move))

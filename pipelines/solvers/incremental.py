@@ -49,7 +49,6 @@ from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem, undetermined
-from alidade.pipelines.solvers.levenberg import without_rejected
 from alidade.pipelines.solvers.posterior import WIDEST, Reported
 from alidade.pipelines.solvers.smoother import (
     FixedLagSmoother,
@@ -521,8 +520,7 @@ class IncrementalSolver:
             self.moments += 1
             if self._beyond.any():
                 # Second order that has once gone far enough does so from then on.
-                engine = without_rejected(solved.engine, solved.solution.values)
-                beyond = beyond_second_order(self.problem, engine, solved.posterior, solved.compiled.current_keys)
+                beyond = beyond_second_order(solved.compiled, solved.posterior)
                 self._beyond[solved.posterior.reported.free] &= beyond
             if since < self.config.max_initialisation and not self._is_linear(solved):
                 self._record()
@@ -601,7 +599,7 @@ class IncrementalSolver:
             self._start(used, values, stamps)
             return
         at = solved.solution.values
-        system, _ = replace(without_rejected(solved.engine, at), is_chain=False).at(at)
+        system, _ = replace(solved.engine, is_chain=False).at(at)
         assert isinstance(system, GtsamSystem)
         self._continue_from(MarginalState.of(self.time, system.graph, values, active_variables(values, stamps), stamps))
 

@@ -218,7 +218,7 @@ def information_at_levels(problem: Problem, levels: Sequence[Level], device: Col
     """
     compiled = Compiled.of(problem)
     solution = minimum(compiled, tuple(levels) or problem.noises)
-    return sqrt_information(problem, solution.engine, solution.values, compiled.current_keys, device)
+    return sqrt_information(compiled, solution.engine, solution.values, device)
 
 
 def join(informations: Sequence[SqrtInformation], rates: Mapping[str, float], days: Sequence[float]) -> Joined:

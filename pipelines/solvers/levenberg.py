@@ -16,7 +16,7 @@ Limits: a minimum is a local one. A cost is a sum of squares, in units of square
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -70,49 +70,58 @@ class LevenbergConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """Values at a minimum of an engine's cost, with the system there.
+class Point:
+    """Values with the linear system about them.
 
     Attributes:
         engine: with the loss and the weights in force.
-        values: where it ended.
+        values: of all variables.
         system, cost: about these.
-        converged: whether it is a minimum; `message` says how or why not.
-        iterations: linear systems solved on the way.
     """
 
     engine: Linearization
     values: Values
     system: System
     cost: float
-    converged: bool
-    message: str
-    iterations: int
+
+    @classmethod
+    def of(cls, engine: Linearization, values: Values) -> Point:
+        """Linearise about some values."""
+        return cls(engine, values, *engine.at(values))
 
     @cached_property
     def factorization(self) -> Factorization:
-        """R of the whitened rows at the values. Raises IndeterminateStateError."""
+        """R of the whitened rows. Raises IndeterminateStateError."""
         return self.system.eliminate()
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
-    """Values with the system and the cost there."""
+class Solution(Point):
+    """Where a minimisation ended.
 
-    values: Values
-    system: System
-    cost: float
+    Attributes:
+        converged: whether it is a minimum; `message` says how or why not.
+        iterations: linear systems solved on the way.
+    """
 
-    @classmethod
-    def of(cls, engine: Linearization, values: Values) -> _Point:
-        return cls(values, *engine.at(values))
+    converged: bool
+    message: str
+    iterations: int
+
+    @property
+    def at_inliers(self) -> Solution:
+        """The same system, of an engine without what the loss rejects here. Raises IndeterminateStateError."""
+        engine = without_rejected(self.engine, self.values)
+        out = replace(self, engine=engine, cost=engine.cost(self.values))
+        vars(out).update(factorization=self.factorization)
+        return out
 
 
 def minimize(
     engine: Linearization, values: Values, config: LevenbergConfig, known: tuple[System, float] | None = None
 ) -> Solution:
     """Minimise an engine's cost from some values; `known`: the system about these, and the cost."""
-    here = _Point(values, *known) if known else _Point.of(engine, values)
+    here = Point(engine, values, *known) if known else Point.of(engine, values)
     damping, growth, iteration, served = 0.0, 2.0, 0, config.initial_damping
 
     def solution(converged: bool, message: str) -> Solution:
@@ -159,26 +168,26 @@ def _is_minimum(config: LevenbergConfig, enough: float, damping: float, predicte
 
 
 def _reached(
-    engine: Linearization, here: _Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
-) -> tuple[_Point, int]:
+    engine: Linearization, here: Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
+) -> tuple[Point, int]:
     """Point after a step whose length or end is corrected, and the number of corrections."""
-    there = _Point.of(engine, engine.layout.retract(here.values, step))
+    there = Point.of(engine, engine.layout.retract(here.values, step))
     if here.cost - there.cost > _DOUBLE * predicted:
         return _lengthened(engine, here.values, step, there.cost), 0
     if there.cost < here.cost or config.corrections == 0:
         return there, 0
     firm, counted = max(config.initial_damping, _FIRMER * damping), without_rejected(engine, here.values)
-    back = _Point.of(counted, there.values)
+    back = Point.of(counted, there.values)
     for count in range(1, config.corrections + 1):
         correction, _ = _step(back.system, firm)
         if correction is None:
             return there, count
-        further = _Point.of(counted, engine.layout.retract(back.values, correction))
+        further = Point.of(counted, engine.layout.retract(back.values, correction))
         if not further.cost < back.cost:
             return there, count
         back = further
         if engine.cost(back.values) < here.cost:
-            return _Point.of(engine, back.values), count
+            return Point.of(engine, back.values), count
     return there, config.corrections
 
 
@@ -188,7 +197,7 @@ def without_rejected(engine: Linearization, values: Values) -> Linearization:
     return engine.with_groups(groups)
 
 
-def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: float) -> _Point:
+def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: float) -> Point:
     """Point after a step that is doubled as long as the cost falls; `cost` is that after the single step."""
     length = 1.0
 
@@ -197,10 +206,10 @@ def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: floa
 
     while (further := engine.cost(ahead(2.0 * length))) < cost:
         length, cost = 2.0 * length, further
-    return _Point.of(engine, ahead(length))
+    return Point.of(engine, ahead(length))
 
 
-def _enough(config: LevenbergConfig, point: _Point, rows: int) -> float:
+def _enough(config: LevenbergConfig, point: Point, rows: int) -> float:
     """A decrease that is none: the tolerance, in squared sigmas as large as residuals of so many rows, and rounding."""
     return config.cost_tolerance * max(1.0, point.system.squares / max(rows, 1)) + 1e-13 * point.cost
 

@@ -131,7 +131,7 @@ class Group:
 
     def counting(self, used: NDArray[np.bool_]) -> Group:
         """Without its loss: those of its n measurements that are used in full, the others not at all."""
-        return self if self.loss is None else replace(self, loss=None, weights=self.all_weights * used[:, None])
+        return replace(self, loss=None, excluded=None if used.all() else ~used)
 
     def weighted(self, residuals: Array) -> Array:
         """Residuals with the noise weights."""

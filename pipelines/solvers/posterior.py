@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.estimation.problem import ChiSquare, Problem, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, Factorization
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization, System
 
@@ -72,17 +73,10 @@ class Reported:
     bounded: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, problem: Problem, layout: Layout, values: Values, current_keys: Mapping[int, int]) -> Reported:
-        """Evaluate the coordinates of all parameters.
-
-        Args:
-            problem: of which the parameters are.
-            layout: of its variables.
-            values: of these.
-            current_keys: parameter key -> variable that holds its value.
-        """
-        keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
-        return cls.at(problem, layout.to_gtsam(values, keys), keys, [layout.root_columns(key) for key in keys])
+    def of(cls, compiled: Compiled, values: Values) -> Reported:
+        """Evaluate the coordinates of all parameters of a problem."""
+        layout, keys = compiled.layout, compiled.keys
+        return cls.at(compiled.problem, layout.to_gtsam(values, keys), keys, [layout.root_columns(k) for k in keys])
 
     @classmethod
     def at(cls, problem: Problem, known: gtsam.Values, keys: Sequence[int], columns: Sequence[Array]) -> Reported:
@@ -377,30 +371,21 @@ def expected_squares(
 
 
 def sqrt_information(
-    problem: Problem,
-    engine: Linearization,
-    values: Values,
-    current_keys: Mapping[int, int],
-    device: Collection[str],
-    at: Mapping[str, float] | None = None,
+    compiled: Compiled, engine: Linearization, values: Values, device: Collection[str]
 ) -> SqrtInformation:
     """Square-root information about the free reported numbers, priors of the device set apart.
 
     Args:
-        problem: of which the numbers are.
-        engine: of its factors, rejected measurements without weight.
+        compiled: the problem.
+        engine: of its factors, rejected measurements left out.
         values: the estimate.
-        current_keys: parameter key -> variable that holds its value.
         device: names of the numbers whose priors are set apart.
-        at: numbers about which it is linear, by name, instead of the estimate's; states are optimal there.
 
     Raises:
         IndeterminateStateError: a state is not determined.
     """
-    if at:
-        values = moved_to(problem, engine, values, current_keys, at)
-    layout = engine.layout
-    reported = Reported.of(problem, layout, values, current_keys)
+    problem, layout = compiled.problem, engine.layout
+    reported = Reported.of(compiled, values)
     c, J = layout.sizes[3], reported.jacobian
     inverse = np.linalg.pinv(J)[c:]
     # Rounding, which units that differ by many orders make large.
@@ -436,15 +421,9 @@ def sqrt_information(
     )
 
 
-def moved_to(
-    problem: Problem,
-    engine: Linearization,
-    values: Values,
-    current_keys: Mapping[int, int],
-    numbers: Mapping[str, float],
-) -> Values:
+def moved_to(compiled: Compiled, engine: Linearization, values: Values, numbers: Mapping[str, float]) -> Values:
     """Values with some of the reported numbers moved, the other numbers kept and all states optimal to first order."""
-    reported = Reported.of(problem, engine.layout, values, current_keys)
+    reported = Reported.of(compiled, values)
     wanted = np.array([numbers.get(n, here) for n, here in zip(reported.names, reported.numbers, strict=True)])
     du = (wanted - reported.numbers)[reported.free] / reported.scale
     factorization = engine.at(values)[0].eliminate()

@@ -7,62 +7,43 @@ walking bias has few pieces these are few (one a piece): short recordings are th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from alidade.pipelines.estimation.problem import History, PosteriorHistory, Problem
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, IndeterminateStateError, Index
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Values
-from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.posterior import Reported
-from alidade.pipelines.solvers.weak_directions import WeakDirections, constrained_step
+from alidade.pipelines.solvers.weak_directions import Posterior, WeakDirections, constrained_step
 
 # Moments of the history, and how many keyframes may be eliminated once more for them (2 s at 20 us each).
 MOMENTS, ELIMINATED = 48, 100_000
 
 
-def posterior_history(
-    problem: Problem,
-    linearization: Linearization,
-    system: ChainSystem,
-    factorization: ChainFactorization,
-    values: Values,
-    current_keys: Mapping[int, int],
-    time: Array,
-    final: tuple[Array, Array] | None = None,
-) -> PosteriorHistory | None:
+def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHistory | None:
     """Values and joint covariance of the reported numbers at moments, weak directions at their priors.
 
-    Args:
-        problem: of which the numbers are.
-        linearization: of its factors.
-        system: of these at the values.
-        factorization: of the system.
-        values: the estimate.
-        current_keys: parameter key -> variable that holds its value at the end.
-        time: (N,) s of the keyframes.
-        final: numbers (n,) and covariance (n, n) of the estimate, which the last moment has.
-
-    Returns None where there is but one moment.
+    The last moment has the posterior's own. None where there is but one, or no chain.
     """
-    keyframes, roots = prefix_roots(system, factorization)
+    at, problem, layout = posterior.at, compiled.problem, compiled.layout
+    if not (isinstance(at.system, ChainSystem) and isinstance(at.factorization, ChainFactorization)):
+        return None
+    keyframes, roots = prefix_roots(at.system, at.factorization)
     if len(keyframes) < 2:
         return None
-    layout, nodes = linearization.layout, linearization.piece[keyframes]
-    own = {p.key: current_keys.get(p.key, p.key) for p in problem.parameters}
-    end = Reported.of(problem, layout, values, current_keys)
+    keys = compiled.keys
     found = [
-        _known(problem, layout, values, _keys_at(layout, own, int(node)), end, root)
-        for node, root in zip(nodes, roots, strict=True)
+        _known(problem, layout, at.values, [_at_node(layout, key, int(node)) for key in keys], posterior.reported, root)
+        for node, root in zip(at.engine.piece[keyframes], roots, strict=True)
     ]
-    if final is not None:
-        found[-1] = final
+    found[-1] = posterior.reported.numbers, posterior.covariance
     numbers, covariances = (np.array(each) for each in zip(*found, strict=True))
-    moving = [layout.sizes[3] > 0 and layout.node[layout.at([key])[0]] >= 0 for key in own.values()]
+    moving = layout.node[layout.at(keys)] >= 0
     steady = ~np.repeat(moving, [len(p.quantities) for p in problem.parameters])
-    return PosteriorHistory(time[keyframes], numbers, covariances, steady)
+    return PosteriorHistory(at.engine.time[keyframes], numbers, covariances, steady)
 
 
 def prefix_roots(system: ChainSystem, factorization: ChainFactorization) -> tuple[Index, list[Array]]:
@@ -103,28 +84,20 @@ def _until(system: ChainSystem, keyframe: int) -> ChainSystem:
 
 
 def _known(
-    problem: Problem,
-    layout: Layout,
-    values: Values,
-    keys: Mapping[int, int],
-    end: Reported,
-    root: Array,
+    problem: Problem, layout: Layout, values: Values, keys: Sequence[int], end: Reported, root: Array
 ) -> tuple[Array, Array]:
     """Numbers (n,) and their covariance (n, n) at a moment, `keys` the variables that hold the parameters then.
 
     `end` is the same at the end, which `root` is about.
     """
-    if layout.sizes[3] and set(keys.values()) == set(_keys_at(layout, keys, 0).values()):
+    if layout.sizes[3] and (layout.node[layout.at(keys)] <= 0).all():
         # The first node is among the shared unknowns, and has no numbers beside these.
         jacobian = end.jacobian.copy()
         jacobian[:, : layout.sizes[3]] = 0.0
         end = replace(end, jacobian=jacobian)
-    known = layout.to_gtsam(values, keys.values())
-    here = np.concatenate([p.coordinates(known, keys[p.key])[0] for p in problem.parameters])
-    width = end.jacobian.shape[1] + 1
-    padded = np.zeros((max(len(root), width), width))
-    padded[: len(root)] = root
-    found = end.root(padded)
+    known = layout.to_gtsam(values, keys)
+    here = np.concatenate([p.coordinates(known, key)[0] for p, key in zip(problem.parameters, keys, strict=True)])
+    found = end.root(root)
     directions = WeakDirections.of(found.R, end.prior, end.calibrated)
     u = (here[end.free] - end.mean) / end.scale
     numbers = here.copy()
@@ -132,41 +105,44 @@ def _known(
     return numbers, end.covariance(directions.covariance())
 
 
-def _keys_at(layout: Layout, own: Mapping[int, int], node: int) -> dict[int, int]:
-    """Parameter key -> the variable that holds its value while a node is in force; `own`: at the end."""
-    return {key: _at_node(layout, variable, node) for key, variable in own.items()}
-
-
 def _at_node(layout: Layout, variable: int, node: int) -> int:
     """The variable of the same kind at a node; itself where it belongs to none."""
     (at,) = layout.at([variable])
-    if layout.sizes[3] == 0 or layout.node[at] < 0:
+    if layout.node[at] < 0:
         return variable
     alike = (layout.node == node) & ((layout.part == layout.part[at]) | (node == 0))
     return int(layout.key[np.flatnonzero(alike)[0]])
 
 
-def smoothed_bias(
-    layout: Layout, factorization: ChainFactorization, values: Values, node_time: Array, nodes: Index, part: slice
-) -> History:
-    """A walking bias over time from the whole recording: values and sigmas of nodes.
+def smoothed(compiled: Compiled, posterior: Posterior, covariance: Array) -> History | None:
+    """The reported numbers where nodes of a bias begin, that bias from the whole recording; None where none walks.
 
     Args:
-        layout: of the variables.
-        factorization: of the system at the values.
-        values: the estimate.
-        node_time: (k,) s at which the nodes begin.
-        nodes: (k,) keys of the variables.
-        part: numbers of a node that the bias is.
+        compiled: the problem.
+        posterior: of its numbers.
+        covariance: (n, n) final one of these, errors without a model included.
     """
+    layout, at, factorization = compiled.layout, posterior.at, posterior.at.factorization
+    moving = [p for p in compiled.problem.parameters if p.key in compiled.current_keys]
+    count = layout.sizes[2]
+    if count < 3 or len(moving) != 1 or not isinstance(factorization, ChainFactorization):
+        return None
+    (parameter,) = moving
+    nodes = [_at_node(layout, parameter.key, j) for j in range(count)]
     _, given = factorization.given_shared()
-    roots, c, own = factorization.shared_roots, factorization.c, np.arange(part.start, part.stop)
-    columns = layout.shared[layout.at(nodes[:1])][0] + own - part.start
+    own = np.arange(len(parameter.quantities))
+    columns = factorization.c + layout.shared[layout.at(nodes[:1])] + own
     squares = given[:, own, own]
     squares[0] = 0.0  # the first node does not deviate from itself
-    for last in np.split(roots, range(1, roots.shape[1]), axis=1):
-        moved = factorization.propagate(last)[1][:, own, 0]
+    for root in factorization.shared_roots.T:
+        moved = factorization.propagate(root[:, None])[1][:, own, 0]
         moved[0] = 0.0
-        squares = squares + np.square(moved + last[c + columns, 0])
-    numbers = np.array([layout.of_key(values, int(key)) for key in nodes])
-    return History(node_time, numbers, np.sqrt(squares))
+        squares = squares + np.square(moved + root[columns])
+    names = [q.name for q in compiled.problem.quantities]
+    numbers = [names.index(q.name) for q in parameter.quantities]
+    values = np.tile(posterior.reported.numbers, (count, 1))
+    sigmas = np.tile(np.sqrt(np.diag(covariance)), (count, 1))
+    values[:, numbers] = [layout.of_key(at.values, key) for key in nodes]
+    beside = np.diag(covariance)[numbers] - squares[-1]  # what the last node's has more: errors without a model
+    sigmas[:, numbers] = np.sqrt(np.maximum(squares + beside, 0.0))
+    return History(at.engine.time[np.searchsorted(at.engine.piece, np.arange(count))], values, sigmas)

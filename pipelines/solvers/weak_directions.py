@@ -30,18 +30,17 @@ spoilt two. Where no constrained minimum is found all that is calibrated has its
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.solvers.chain import Array, Factorization, IndeterminateStateError
+from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Solution
-from alidade.pipelines.solvers.linearization import Linearization, System
+from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.posterior import Reported, ReportedRoot, followed
 
 # Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
@@ -265,16 +264,14 @@ class Posterior:
     """The final posterior of the reported numbers: the one that all results are made of.
 
     Attributes:
-        values: of all variables, weak directions at their prior means.
-        system, factorization: of the factors there.
+        at: values of all variables, weak directions at their prior means, with the system there; its engine is without
+            the measurements that are rejected.
         reported: the numbers there.
         directions: strong and weak ones, second order included.
         converged: whether there is a constrained minimum; else all that is calibrated has its prior.
     """
 
-    values: Values
-    system: System
-    factorization: Factorization
+    at: Point
     reported: Reported
     directions: WeakDirections
     converged: bool
@@ -286,54 +283,51 @@ class Posterior:
 
     def second_order_share(self) -> float:
         """Largest ratio of the second-order variance to the variance that the linear system has."""
-        linear = self.directions.again(self.reported.root(self.factorization.root).R)
+        linear = self.directions.again(self.reported.root(self.at.factorization.root).R)
         unit = linear.strong / linear.sigmas
         return float(np.linalg.norm((self.directions.strong * self.directions.sigmas).T @ unit, 2)) ** 2 - 1.0
 
 
-def constrained_solution(problem: Problem, minimum: Solution, current_keys: Mapping[int, int]) -> Posterior:
+def constrained_solution(compiled: Compiled, minimum: Point) -> Posterior:
     """The posterior near a minimum, its weak directions at the prior.
 
     Args:
-        problem: of which the reported numbers are.
+        compiled: the problem.
         minimum: of its factors, without the measurements that are rejected: elsewhere the loss would reject others.
-        current_keys: parameter key -> variable that holds its value.
 
     Raises:
         IndeterminateStateError: a state is not determined.
     """
-    engine, known = minimum.engine, (minimum.system, minimum.factorization)
-    found = _constrained(problem, engine, minimum.values, current_keys, None, known)
+    found = _constrained(compiled, minimum)
     if not found.converged:
-        return _unknown(problem, minimum, current_keys)
+        return _unknown(compiled, minimum)
     for _ in range(ROUNDS):
-        second_order = curvature(found.directions, partial(moved_roots, problem, engine, found, current_keys))
+        second_order = curvature(found.directions, partial(moved_roots, compiled, found))
         directions = found.directions.with_curvature(second_order)
         if directions.weak.shape[1] == found.directions.weak.shape[1]:
             break
-        known = found.system, found.factorization
-        constrained = _constrained(problem, engine, found.values, current_keys, directions, known)
-        if _contradicts(engine, found, constrained):
+        constrained = _constrained(compiled, found.at, directions)
+        if _contradicts(found, constrained):
             break
         found = constrained
     return replace(found, directions=directions)
 
 
-def _contradicts(engine: Linearization, before: Posterior, after: Posterior) -> bool:
+def _contradicts(before: Posterior, after: Posterior) -> bool:
     """Whether measurements and other priors contradict that more directions are at their prior means.
 
     What is hardly determined can be moved at a cost: a chi-square of (move / MAX_SIGMA)^2, to first order.
     """
     moved = np.linalg.norm(after.directions.weak.T @ (after.reported.u - before.reported.u))
-    return bool(engine.cost(after.values) - engine.cost(before.values) > (moved / MAX_SIGMA) ** 2 + CONTRADICTION**2)
+    return bool(after.at.cost - before.at.cost > (moved / MAX_SIGMA) ** 2 + CONTRADICTION**2)
 
 
-def _unknown(problem: Problem, minimum: Solution, current_keys: Mapping[int, int]) -> Posterior:
+def _unknown(compiled: Compiled, minimum: Point) -> Posterior:
     """The posterior where no constrained minimum is found: all that is calibrated has its prior."""
-    reported = Reported.of(problem, minimum.engine.layout, minimum.values, current_keys)
-    R, known = reported.root(minimum.factorization.root).R, (minimum.system, minimum.factorization)
+    reported = Reported.of(compiled, minimum.values)
+    R = reported.root(minimum.factorization.root).R
     fixed = WeakDirections.given(R, np.eye(len(R))[:, reported.calibrated], reported.prior, reported.calibrated)
-    return replace(_constrained(problem, minimum.engine, minimum.values, current_keys, fixed, known), converged=False)
+    return replace(_constrained(compiled, minimum, fixed), converged=False)
 
 
 def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
@@ -351,25 +345,17 @@ def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
     return replace(posterior, reported=replace(reported, numbers=there), directions=own)
 
 
-def beyond_second_order(
-    problem: Problem, engine: Linearization, found: Posterior, current_keys: Mapping[int, int]
-) -> NDArray[np.bool_]:
+def beyond_second_order(compiled: Compiled, found: Posterior) -> NDArray[np.bool_]:
     """Which free numbers (m,), those of one variable together, are part of terms of higher than second order.
 
     Second order goes far enough where slopes grow in proportion to the way: half the way they are half of what they
     are at the whole one. What that misses is compared with the covariance of all that stays.
-
-    Args:
-        problem: of which the reported numbers are.
-        engine: of its factors, without the measurements that are rejected.
-        found: the posterior.
-        current_keys: see `constrained_solution`.
     """
     reported, directions = found.reported, found.directions
     left = np.ones(len(reported.free), dtype=bool)
-    linear = directions.again(reported.root(found.factorization.root).R)
+    linear = directions.again(reported.root(found.at.factorization.root).R)
     ways = np.random.default_rng(0).standard_normal((len(linear.axes), THIRD_DRAWS))
-    roots = partial(moved_roots, problem, engine, found, current_keys)
+    roots = partial(moved_roots, compiled, found)
     follows = linear.followers & (linear.sigmas < KNOWN)[:, None]
     try:
         half, whole = (slopes(linear, roots, follows, length * ways) for length in (0.5, 1.0))
@@ -378,7 +364,7 @@ def beyond_second_order(
     missed = linear.strong @ np.hstack(list(half - 0.5 * whole)) / np.sqrt(THIRD_DRAWS)
     prior = directions.weak @ np.linalg.cholesky(directions.prior_covariance)
     known = np.hstack([directions.strong * directions.sigmas, prior])
-    numbers = [len(p.quantities) for p in problem.parameters]
+    numbers = [len(p.quantities) for p in compiled.problem.parameters]
     own = np.repeat(np.arange(len(numbers)), numbers)[reported.free]
     while _share(known[left], missed[left]) > MAX_THIRD:
         each = [left & (own != one) for one in np.unique(own[left])]
@@ -394,25 +380,16 @@ def _share(known: Array, missed: Array) -> float:
     return float(np.linalg.norm(np.linalg.solve(R.T, missed), 2))
 
 
-def _constrained(
-    problem: Problem,
-    engine: Linearization,
-    values: Values,
-    current_keys: Mapping[int, int],
-    fixed: WeakDirections | None,
-    known: tuple[System, Factorization],
-) -> Posterior:
+def _constrained(compiled: Compiled, start: Point, fixed: WeakDirections | None = None) -> Posterior:
     """The minimum with the weak directions at their prior means: those of the system there, or fixed ones.
 
-    `known` is the system at the values, a minimum without constraints, and its factorization.
+    `start` is a minimum without constraints.
     """
-    weak, cost, (system, factorization) = 0, np.inf, known
+    weak, values, engine = 0, start.values, start.engine
     for step in range(MAX_STEPS):
-        if step:
-            system = engine.at(values)[0]
-            factorization = system.eliminate()
-        reported = Reported.of(problem, engine.layout, values, current_keys)
-        found = reported.root(factorization.root)
+        at = Point.of(engine, values) if step else start
+        reported = Reported.of(compiled, values)
+        found = reported.root(at.factorization.root)
         directions = (
             WeakDirections.of(found.R, reported.prior, reported.calibrated, weak)
             if fixed is None
@@ -423,39 +400,30 @@ def _constrained(
         size = np.linalg.norm(directions.strong.T @ du / directions.sigmas), np.linalg.norm(directions.weak.T @ du)
         at_minimum = not step and not weak  # values are the minimum, and nothing is to be moved away from it
         if at_minimum or max(size) < NEAR:
-            return Posterior(values, system, factorization, reported, directions, True)
+            return Posterior(at, reported, directions, True)
         if size[1] > LEAP:
             du *= LEAP / size[1]
         elif size[1] > NEAR and fixed is None:
             fixed = directions
-        share, there = 1.0, _moved(engine, factorization, values, found, du)
+        share, values = 1.0, _moved(at, found, du)
         if size[1] < NEAR:  # the weak directions are where they are to be: from here on the cost falls
-            cost = engine.cost(values) if np.isinf(cost) else cost
-            while engine.cost(there) > cost and share > 1e-3:
+            while engine.cost(values) > at.cost and share > 1e-3:
                 share *= 0.3
-                there = _moved(engine, factorization, values, found, share * du)
-            cost = engine.cost(there)
-        values = there
-    return Posterior(values, system, factorization, reported, directions, False)
+                values = _moved(at, found, share * du)
+    return Posterior(at, reported, directions, False)
 
 
-def _moved(
-    engine: Linearization, factorization: Factorization, values: Values, found: ReportedRoot, du: Array
-) -> Values:
+def _moved(at: Point, found: ReportedRoot, du: Array) -> Values:
     """Values with the reported numbers moved by du (m,), all else where it is optimal then."""
-    last = found.last(du[:, None])
-    return engine.layout.retract(values, followed(factorization, last))
+    return at.engine.layout.retract(at.values, followed(at.factorization, found.last(du[:, None])))
 
 
-def moved_roots(
-    problem: Problem, engine: Linearization, at: Posterior, current_keys: Mapping[int, int], moves: Array
-) -> Iterator[Array]:
+def moved_roots(compiled: Compiled, found: Posterior, moves: Array) -> Iterator[Array]:
     """Square-root information (m, m) of the numbers moved by (m, n) from a solution, all else following."""
-    found = at.reported.root(at.factorization.root)
-    last = found.last(moves, 0.0)
+    at = found.at
+    last = found.reported.root(at.factorization.root).last(moves, 0.0)
     states, nodes = at.factorization.propagate(last)
     for i in range(moves.shape[1]):
         move = Tangent(states[..., i], nodes[..., i], last[at.factorization.c :, i])
-        there = engine.layout.retract(at.values, move)
-        reported = Reported.of(problem, engine.layout, there, current_keys)
-        yield reported.root(engine.at(there)[0].eliminate().root).R
+        there = Point.of(at.engine, at.engine.layout.retract(at.values, move))
+        yield Reported.of(compiled, there.values).root(there.factorization.root).R

@@ -35,7 +35,7 @@ def along_the_tangent(problem: Problem) -> tuple[Array, Array]:
     """The minimum, and the covariance there as the linear system has it."""
     compiled = Compiled.of(problem)
     found = solve(compiled).solution
-    reported = Reported.of(problem, compiled.layout, found.values, compiled.current_keys)
+    reported = Reported.of(compiled, found.values)
     return reported.numbers, reported.covariance(reported.root(found.factorization.root).covariance())
 
 

@@ -11,7 +11,8 @@ import pytest
 from scipy.signal import lfilter
 
 from alidade.pipelines.estimation.problem import Array, Factor, Problem
-from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem
+from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, Factorization
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
     Influence,
     added_covariance,
@@ -20,11 +21,19 @@ from alidade.pipelines.solvers.error_budget import (
     most_influential,
     ratio_by_blocks,
 )
-from alidade.pipelines.solvers.layout import Layout, Tangent, Values
+from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Linearization
-from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
-from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
-from alidade.pipelines.solvers.weak_directions import WeakDirections
+from alidade.pipelines.solvers.posterior import (
+    Reported,
+    chi_square,
+    expected_squares,
+    leverages,
+    moved_to,
+    sqrt_information,
+)
+from alidade.pipelines.solvers.posterior_history import posterior_history, prefix_roots, smoothed
+from alidade.pipelines.solvers.weak_directions import Posterior, WeakDirections
 from tests.support.problems import SCENARIOS, problem
 
 
@@ -34,18 +43,36 @@ class Dense:
 
     problem: Problem
     factors: list[Factor]
-    current: dict[int, int]
-    linearization: Linearization
-    values: Values
-    factorization: ChainFactorization
+    compiled: Compiled
+    point: Point
     rows: list[Array]  # of each factor, over all unknowns
     rights: list[Array]
     numbers: Array  # (n, unknowns) Jacobian of the reported numbers
     columns: dict[int, slice]
 
     @property
+    def linearization(self) -> Linearization:
+        return self.point.engine
+
+    @property
+    def values(self) -> Values:
+        return self.point.values
+
+    @property
+    def factorization(self) -> Factorization:
+        return self.point.factorization
+
+    @property
     def reported(self) -> Reported:
-        return Reported.of(self.problem, self.linearization.layout, self.values, self.current)
+        return Reported.of(self.compiled, self.values)
+
+    @property
+    def posterior(self) -> Posterior:
+        """With every direction as the linear system has it."""
+        reported = self.reported
+        _, sizes, axes = np.linalg.svd(reported.root(self.factorization.root).R)
+        strong = WeakDirections(axes.T, np.zeros((len(axes), 0)), 1.0 / sizes, reported.prior)
+        return Posterior(self.point, reported, strong, True)
 
     @property
     def covariance(self) -> Array:
@@ -56,19 +83,13 @@ class Dense:
 
 @cache
 def dense(name: str) -> Dense:
-    made, initial, factors, current, times = problem(name), gtsam.Values(), list[Factor](), dict[int, int](), []
-    for step in made.steps(10**9):
-        initial.insert(step.initial)
-        factors += step.factors
-        current.update(step.current_keys)
-        times.append(step.time)
-    assert made.layout is not None
-    layout, values = Layout.of(made.layout, initial)
-    linearization = Linearization.of(factors, layout).under(None)
+    made = problem(name)
+    factors = [f for step in made.steps(10**9) for f in step.factors]
+    compiled = Compiled.of(made, "chain")
+    layout, point = compiled.layout, Point.of(compiled.engine.under(None), compiled.initial)
     for _ in range(3):
-        step_taken = Tangent(*linearization.at(values)[0].eliminate().solve())
-        values = layout.retract(values, step_taken)
-    at = layout.to_gtsam(values)
+        point = Point.of(point.engine, layout.retract(point.values, Tangent(*point.factorization.solve())))
+    at = layout.to_gtsam(point.values)
     graph = gtsam.GaussianFactorGraph()
     for f in factors:
         graph.add((f.factor if f.bound is None else f.bound.under(None).factor).linearize(at))
@@ -87,23 +108,12 @@ def dense(name: str) -> Dense:
         rows.append(whole)
         rights.append(b)
     numbers = []
-    for p in made.parameters:
-        key = current.get(p.key, p.key)
+    for p, key in zip(made.parameters, compiled.keys, strict=True):
         _, J = p.coordinates(at, key)
         block = np.zeros((len(J), end))
         block[:, columns[key]] = J
         numbers.append(block)
-    factorization = linearization.at(values)[0].eliminate()
-    assert isinstance(factorization, ChainFactorization)
-    return Dense(
-        made, factors, current, linearization, values, factorization, rows, rights, np.vstack(numbers), columns
-    )
-
-
-def all_strong(reported: Reported, R: Array) -> WeakDirections:
-    """Every direction as the linear system has it."""
-    _, sizes, axes = np.linalg.svd(R)
-    return WeakDirections(axes.T, np.zeros((len(R), 0)), 1.0 / sizes, reported.prior)
+    return Dense(made, factors, compiled, point, rows, rights, np.vstack(numbers), columns)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -157,9 +167,7 @@ def test_budget_and_influence_are_those_of_the_dense_system(name: str) -> None:
     case = dense(name)
     reported = case.reported
     found = reported.root(case.factorization.root)
-    influence = Influence.of(
-        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
-    )
+    influence = Influence.of(case.posterior)
     gains = (case.numbers @ case.covariance)[reported.free]
     variance = np.einsum("ij,ij->i", gains, case.numbers[reported.free])
     families: dict[str, Array] = {}
@@ -184,9 +192,7 @@ def test_budget_is_that_of_the_gum_tree_calculator() -> None:
     case = dense("tumble at rest")
     reported = case.reported
     found = reported.root(case.factorization.root)
-    influence = Influence.of(
-        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
-    )
+    influence = Influence.of(case.posterior)
     budget = error_budget(influence, {}, reported.covariance(found.covariance()) - np.diag(reported.extra**2))
     Q, R = np.linalg.qr(np.vstack(case.rows))
     residuals = [gtc.ureal(0.0, 1.0) for _ in Q]
@@ -202,10 +208,7 @@ def test_budget_is_that_of_the_gum_tree_calculator() -> None:
 def test_moves_of_a_changed_input_are_those_of_the_dense_system() -> None:
     case = dense("head")
     reported = case.reported
-    found = reported.root(case.factorization.root)
-    influence = Influence.of(
-        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
-    )
+    influence = Influence.of(case.posterior)
     groups = [
         replace(g, weights=np.full((len(g.model.time), g.model.rows), 0.9)) if g.is_measurement else g
         for g in case.linearization.groups
@@ -223,9 +226,7 @@ def test_most_influential_measurements_are_in_balance_with_all_others() -> None:
     case = dense("los")
     reported = case.reported
     found = reported.root(case.factorization.root)
-    influence = Influence.of(
-        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
-    )
+    influence = Influence.of(case.posterior)
     covariance = reported.covariance(found.covariance())
     sigmas = dict(zip(reported.names, np.sqrt(np.diag(covariance)), strict=True))
     first = most_influential(influence, {"delta_px": sigmas["delta_px"]}, 20)
@@ -247,7 +248,7 @@ def test_square_root_information_with_device_priors_is_all_there_is(name: str) -
     reported = case.reported
     # The prior of the field is about three numbers together.
     device = {name for i in reported.free[::2] if not (name := reported.names[i]).startswith("field_")}
-    told = sqrt_information(case.problem, case.linearization, case.values, case.current, device)
+    told = sqrt_information(case.compiled, case.linearization, case.values, device)
     information = told.R.T @ told.R + told.prior_R.T @ told.prior_R
     expected = case.numbers @ case.covariance @ case.numbers.T
     block = expected[np.ix_(reported.free, reported.free)]
@@ -263,25 +264,26 @@ def test_square_root_information_with_device_priors_is_all_there_is(name: str) -
 def test_square_root_information_elsewhere_is_linear_there() -> None:
     case = dense("head")
     wanted = {"helmet_mount_x": 0.1}
-    told = sqrt_information(case.problem, case.linearization, case.values, case.current, set(), wanted)
+    values = moved_to(case.compiled, case.linearization, case.values, wanted)
+    told = sqrt_information(case.compiled, case.linearization, values, set())
     assert told.at[told.names.index("helmet_mount_x")] == pytest.approx(0.1, abs=1e-3)
 
 
 @pytest.mark.parametrize("name", ["los", "head with a bias that walks"])
 def test_history_ends_with_the_estimate(name: str) -> None:
     case = dense(name)
-    layout = case.linearization.layout
-    time = np.arange(layout.sizes[0], dtype=float)
-    system, _ = case.linearization.at(case.values)
-    assert isinstance(system, ChainSystem)
-    course = posterior_history(
-        case.problem, case.linearization, system, case.factorization, case.values, case.current, time
-    )
-    assert course is not None
-    reported = case.reported
+    reported, system = case.reported, case.point.system
     R = reported.root(case.factorization.root).R
-    expected = reported.covariance(WeakDirections.of(R, reported.prior, reported.calibrated).covariance())
-    np.testing.assert_allclose(course.covariance[-1], expected, rtol=1e-6, atol=1e-12 * expected.max())
+    directions = WeakDirections.of(R, reported.prior, reported.calibrated)
+    course = posterior_history(case.compiled, Posterior(case.point, reported, directions, True))
+    assert course is not None
+    np.testing.assert_array_equal(course.covariance[-1], reported.covariance(directions.covariance()))
+    assert isinstance(system, ChainSystem)
+    assert isinstance(case.factorization, ChainFactorization)
+    keyframes, roots = prefix_roots(system, case.factorization)
+    assert keyframes[-1] == case.linearization.layout.sizes[0] - 1
+    last = WeakDirections.of(reported.root(roots[-1]).R, reported.prior, reported.calibrated).covariance()
+    np.testing.assert_allclose(last, directions.covariance(), rtol=1e-6, atol=1e-9)
     assert len(course.time) > 10
     # What is determined only gets better known.
     widest = np.linalg.eigvalsh(course.covariance[:, reported.free[:, None], reported.free])[:, -1]
@@ -292,12 +294,14 @@ def test_history_ends_with_the_estimate(name: str) -> None:
 
 def test_smoothed_bias_has_the_dense_sigmas() -> None:
     case = dense("head with a bias that walks")
-    layout = case.linearization.layout
-    nodes = np.array([gtsam.symbol("b", j) for j in range(layout.sizes[2])])
-    history = smoothed_bias(layout, case.factorization, case.values, nodes.astype(float), nodes, slice(0, 3))
-    covariance = case.covariance
-    expected = [np.sqrt(np.diag(covariance[case.columns[int(key)], case.columns[int(key)]])) for key in nodes]
-    np.testing.assert_allclose(history.sigmas, np.array(expected), rtol=1e-6)
+    nodes = [int(gtsam.symbol("b", j)) for j in range(case.linearization.layout.sizes[2])]
+    expected = [np.sqrt(np.diag(case.covariance[case.columns[key], case.columns[key]])) for key in nodes]
+    bias = [i for i, name in enumerate(case.reported.names) if name.startswith("gyro_bias")]
+    covariance = case.posterior.covariance
+    covariance[bias, bias] = expected[-1] ** 2  # no error without a model, and the last node's is what is reported
+    history = smoothed(case.compiled, case.posterior, covariance)
+    assert history is not None
+    np.testing.assert_allclose(history.sigmas[:, bias], np.array(expected), rtol=1e-6)
 
 
 def test_autocorrelation_is_that_of_the_noise() -> None:
@@ -334,9 +338,7 @@ def test_correlated_residuals_of_one_family_leave_what_another_determines() -> N
     case = dense("tumble with gyro")
     reported = case.reported
     found = reported.root(case.factorization.root)
-    influence = Influence.of(
-        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
-    )
+    influence = Influence.of(case.posterior)
     families = {g.family for g in case.linearization.groups if g.is_measurement}
     lags: Array = 0.8 ** np.arange(1, 8, dtype=float)
     added = {family: np.diag(added_covariance(influence, {family: lags})[family]) for family in families}
@@ -354,10 +356,7 @@ def test_added_variance_is_that_of_drawn_noise() -> None:
     """Autocorrelated noise through the influence of one family has the variance that is said."""
     case = dense("head")
     reported = case.reported
-    found = reported.root(case.factorization.root)
-    influence = Influence.of(
-        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
-    )
+    influence = Influence.of(case.posterior)
     lags: Array = 0.8 ** np.arange(1, 40, dtype=float)
     (family,) = {g.family for g in case.linearization.groups if g.is_measurement}
     added = added_covariance(influence, {family: lags})[family]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import gtsam
 import numpy as np
 import pytest
 
@@ -15,10 +12,8 @@ from alidade.pipelines.estimation.problem import Array, Problem
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import solve_incremental
-from alidade.pipelines.solvers.layout import Layout
-from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.posterior import counted
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
 from alidade.pipelines.solvers.weak_directions import (
     MAX_SIGMA,
@@ -39,23 +34,12 @@ def root(*rows: Array) -> Array:
 
 def posterior(recorded: Problem, until: float) -> Posterior:
     """The posterior of a problem's steps until a time, s."""
-    initial, factors, current = gtsam.Values(), [], dict[int, int]()
-    for step in recorded.steps(1):
-        initial.insert(step.initial)
-        factors += step.factors
-        current.update(step.current_keys)
-        if step.time >= until:
-            break
-    assert recorded.layout is not None
-    layout, values = Layout.of(recorded.layout, initial)
-    solution = solve_robust(Linearization.of(factors, layout), values, recorded.loss, RobustConfig())
+    steps = list(recorded.steps(1))
+    end = next((i for i, step in enumerate(steps) if step.time >= until), len(steps))
+    compiled = Compiled.of(recorded, "chain", steps[: end + 1])
+    solution = solve_robust(compiled.engine, compiled.initial, recorded.loss, RobustConfig())
     assert solution.converged, solution.message
-    groups = [
-        replace(g, weights=counted(g, solution.values)[:, None] * np.asarray(1.0 if g.weights is None else g.weights))
-        for g in solution.engine.groups
-    ]
-    engine = solution.engine.with_groups(groups).under(None)
-    return constrained_solution(recorded, replace(solution, engine=engine), current)
+    return constrained_solution(compiled, solution.at_inliers)
 
 
 def errors(method: str, case: str, share: float, seeds: range) -> tuple[list[float], int, int]:
@@ -149,7 +133,7 @@ def test_linear_system_has_no_curvature() -> None:
 def test_ordinary_recording_has_the_linear_covariance(name: str) -> None:
     """Assumed sensor errors that a recording hardly determines are jointly Gaussian with the rest: nothing is lost."""
     known = posterior(problem(name), np.inf)
-    linear = known.reported.root(known.factorization.root).covariance()
+    linear = known.reported.root(known.at.factorization.root).covariance()
     assert known.directions.weak.shape[1] == 0
     sigmas = np.sqrt(np.diag(linear))
     np.testing.assert_allclose(

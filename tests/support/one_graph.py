@@ -91,7 +91,7 @@ def solved(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     compiled = Compiled.of(problem)
     found = minimum(compiled, problem.noises)
     found = minimize(found.engine, found.values, LevenbergConfig(cost_tolerance=1e-14))
-    reported = Reported.of(problem, compiled.layout, found.values, compiled.current_keys)
+    reported = Reported.of(compiled, found.values)
     covariance = reported.covariance(reported.root(found.factorization.root).covariance())
     numbers, sigmas = reported.numbers.tolist(), np.sqrt(np.diag(covariance)).tolist()
     return dict(zip(reported.names, numbers, strict=True)), dict(zip(reported.names, sigmas, strict=True))
