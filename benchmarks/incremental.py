@@ -125,7 +125,7 @@ def _measured(problem: Problem) -> _Measured:
         solver.add_step(step)
         done = time.process_time()
         pictures = sum(len(f.measurement.model.time) for f in step.factors if f.measurement is not None)
-        rows.append((step.time, made - begun, done - made, pictures, solver.marginal is None))
+        rows.append((step.time, made - begun, done - made, pictures, solver.state.marginal is None))
         if len(rows) % 500 == 0:
             memory.append((step.time, resident_mib()))
         begun = time.process_time()

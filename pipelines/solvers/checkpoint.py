@@ -12,7 +12,7 @@ import os
 import zipfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,14 @@ import numpy as np
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import Array, Factor, Step
+from alidade.pipelines.solvers.gating import InnovationGate, RowBuffer
 from alidade.pipelines.solvers.gtsam_engine import undetermined
 from alidade.pipelines.solvers.smoother import ordering_of
-from alidade.pipelines.solvers.window import Keyframes
+from alidade.pipelines.solvers.window import Keyframes, Window
 
-_SCHEMA = "alidade.checkpoint/5"
-_ROWS, _INNOVATIONS, _INFORMATION = "rows/", "innovations/", "information/"
+_SCHEMA = "alidade.checkpoint/6"
+_ROWS = ("history", "attitudes", "moments")
+_INNOVATIONS, _SHARES = "innovations/", "shares/"
 
 
 @dataclass(frozen=True)
@@ -145,51 +147,53 @@ def _is_finite(factor: Factor, values: gtsam.Values) -> bool:
     return linear is None or bool(np.isfinite(linear.augmentedJacobian()).all())
 
 
-@dataclass(frozen=True, eq=False)
-class SavedRun:
-    """An incremental run at a moment at which all but its active variables are marginalised out.
+@dataclass(eq=False)
+class RunState:
+    """What an incremental run knows, beside the steps since its past was marginalised out.
 
     Attributes:
-        window: of the smoother, s or Keyframes.
-        marginal: the Gaussian of the active variables.
-        current_keys: parameter key -> variable that holds its value.
-        keyframes: number added so far.
+        window: how long states are kept, s or Keyframes; None keeps all.
+        levels: noise levels of the last batch solution.
+        marginal: the Gaussian that the run continues from since everything else was marginalised out; None: never.
+        current_keys: parameter key -> variable that holds its value now.
+        keyframes: number added.
         walked: parameter keys whose values other variables held before.
-        levels: noise levels.
         trouble: why the last batch solution did not converge; empty: it did.
-        rejected_in_a_row: steps until now.
-        unusable: family -> number of measurements that gave no finite numbers.
-        rows: rows gathered, by name.
-        innovations: rows of the gate by family.
-        information: information of the gate by family.
+        gate: innovations of all measurements.
+        shares: of the families in the covariance, see `error_budget.variance_shares`.
+        history: rows of time, values and sigmas.
+        attitudes: rows of time and quaternion.
+        moments: rows of time, values and covariance of joint estimates at moments a fixed share of the time apart, so
+            that hours have a few hundred of them; none where the beginning is not known.
     """
 
-    window: Keyframes | float
-    marginal: MarginalState
-    current_keys: Mapping[int, int]
-    keyframes: int
-    walked: frozenset[int]
+    window: Window
     levels: tuple[Level, ...]
-    trouble: str
-    rejected_in_a_row: int
-    unusable: Mapping[str, int]
-    rows: Mapping[str, Array]
-    innovations: Mapping[str, Array]
-    information: Mapping[str, Array]
+    marginal: MarginalState | None = None
+    current_keys: dict[int, int] = field(default_factory=dict)
+    keyframes: int = 0
+    walked: set[int] = field(default_factory=set)
+    trouble: str = ""
+    gate: InnovationGate = field(default_factory=InnovationGate)
+    shares: Mapping[str, Array] = field(default_factory=dict)
+    history: RowBuffer = field(default_factory=RowBuffer)
+    attitudes: RowBuffer = field(default_factory=RowBuffer)
+    moments: RowBuffer = field(default_factory=RowBuffer)
 
 
-def save_checkpoint(path: Path, run: SavedRun, identity: Mapping[str, str]) -> None:
+def save_checkpoint(path: Path, run: RunState, identity: Mapping[str, str]) -> None:
     """Write a run; the file is replaced whole or not at all.
 
     Args:
         path: the file.
-        run: to be saved.
+        run: to be saved, its past just marginalised out.
         identity: what the run belongs to, in words: recording, config, versions. Only a run of the same is resumed.
 
     Raises:
         InputError: the file cannot be written.
     """
     state = run.marginal
+    assert state is not None
     head = {
         "schema": _SCHEMA,
         "identity": dict(identity),
@@ -203,11 +207,12 @@ def save_checkpoint(path: Path, run: SavedRun, identity: Mapping[str, str]) -> N
         "walked": sorted(run.walked),
         "levels": [asdict(level) for level in run.levels],
         "trouble": run.trouble,
-        "rejected_in_a_row": run.rejected_in_a_row,
-        "unusable": dict(run.unusable),
+        "rejected_in_a_row": run.gate.rejected_in_a_row,
+        "unusable": run.gate.unusable,
     }
-    groups = {_ROWS: run.rows, _INNOVATIONS: run.innovations, _INFORMATION: run.information}
-    arrays: dict[str, Any] = {prefix + name: array for prefix, of in groups.items() for name, array in of.items()}
+    rows = {name: getattr(run, name) for name in _ROWS} | {_INNOVATIONS + f: r for f, r in run.gate.families.items()}
+    arrays: dict[str, Any] = {name: buffer.array for name, buffer in rows.items()}
+    arrays |= {_SHARES + family: share for family, share in run.shares.items()}
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as stream:
@@ -221,7 +226,7 @@ def save_checkpoint(path: Path, run: SavedRun, identity: Mapping[str, str]) -> N
         part.unlink(missing_ok=True)
 
 
-def load_checkpoint(path: Path, identity: Mapping[str, str]) -> SavedRun:
+def load_checkpoint(path: Path, identity: Mapping[str, str]) -> RunState:
     """The run as it was saved; it continues with the steps later than its marginal's time.
 
     Raises:
@@ -246,30 +251,29 @@ def load_checkpoint(path: Path, identity: Mapping[str, str]) -> SavedRun:
         raise InputError(f"{path}: no checkpoint, or a damaged one ({error}); delete it") from error
 
 
-def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> SavedRun:
+def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> RunState:
     """A run from the parts of its file."""
     values, linear = gtsam.Values(), gtsam.JacobianFactor()
     values.deserialize(head["values"])
     linear.deserialize(head["linear"])
-    rows, innovations, information = (
+    innovations, shares = (
         {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-        for prefix in (_ROWS, _INNOVATIONS, _INFORMATION)
+        for prefix in (_INNOVATIONS, _SHARES)
     )
     stamps = {int(key): float(stamp) for key, stamp in head["stamps"]}
-    return SavedRun(
+    families = {family: RowBuffer(rows) for family, rows in innovations.items()}
+    return RunState(
         # A whole number is a number of keyframes.
         window=Keyframes(head["window"]) if isinstance(head["window"], int) else float(head["window"]),
         marginal=MarginalState(head["time"], values, linear, stamps),
         current_keys={int(key): int(held) for key, held in head["current_keys"]},
         keyframes=head["keyframes"],
-        walked=frozenset(head["walked"]),
+        walked=set(head["walked"]),
         levels=tuple(_level_of(**level) for level in head["levels"]),
         trouble=head["trouble"],
-        rejected_in_a_row=head["rejected_in_a_row"],
-        unusable=head["unusable"],
-        rows=rows,
-        innovations=innovations,
-        information=information,
+        gate=InnovationGate(families, head["unusable"], head["rejected_in_a_row"]),
+        shares=shares,
+        **{name: RowBuffer(arrays[name]) for name in _ROWS},
     )
 
 

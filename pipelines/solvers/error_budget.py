@@ -39,6 +39,8 @@ DIED_OUT, CORRELATED = 2.0, 4.0
 MAX_LAG = 0.25
 # Blocks of a recording by which variances are judged, each with as many measurements as there are numbers at least.
 _BLOCKS = 16
+# Variances in units of the priors' below which those of free numbers are rounding.
+LEAST_VARIANCE = 1e-24
 # Coefficients of a prior's row below this share of its largest are rounding.
 ROUNDING = 1e-9
 
@@ -246,6 +248,42 @@ def added_covariance(influence: Influence, correlations: Mapping[str, Array]) ->
         root = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
         added[family] = root @ root.T
     return added
+
+
+def variance_shares(posterior: Posterior) -> dict[str, Array]:
+    """Family of measurements -> its share (m, m) of the covariance C of the free numbers, in units of their priors.
+
+    With L'L the part of C that white noise of a family causes, and symmetric roots of C, it is C^-1/2 L'L C^-1/2.
+    """
+    influence, parts = Influence.of(posterior), dict[str, Array]()
+    inverse = _symmetric_root(posterior.directions.covariance(), -0.5) / posterior.reported.scale
+    for family, groups in _measured(posterior.at.engine).items():
+        rows = [influence.rows(group)[0].reshape(-1, len(inverse)) @ inverse.T for group in groups]
+        parts[family] = sum((each.T @ each for each in rows), np.zeros(inverse.shape))
+    return parts
+
+
+def added_to(covariance: Array, shares: Mapping[str, Array], lengths: Mapping[str, float]) -> Array:
+    """Covariance (m, m) that correlation of residuals adds to one of free numbers, in units of their priors.
+
+    For a filter, whose measurements are gone: of them families have the shares of the covariance that they had once.
+
+    Args:
+        covariance: (m, m) that white noise leaves.
+        shares: see `variance_shares`; a family that has none may have caused all.
+        lengths: family -> how many of its residuals in a row count as one.
+    """
+    root = _symmetric_root(covariance, 0.5)
+    return sum(
+        ((length - 1.0) * root @ shares.get(family, np.eye(len(root))) @ root for family, length in lengths.items()),
+        np.zeros(root.shape),
+    )
+
+
+def _symmetric_root(covariance: Array, power: float) -> Array:
+    """Power of a covariance (m, m)."""
+    variances, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.maximum(variances, LEAST_VARIANCE) ** power) @ axes.T)
 
 
 def _correlated(L: Array, correlation: Array) -> Array:

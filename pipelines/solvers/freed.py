@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from alidade.pipelines.estimation.problem import Estimate, Problem, SqrtInformation
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels
 from alidade.pipelines.solvers.noise_estimation import apply_levels
-from alidade.pipelines.solvers.posterior import Reported, followed, sqrt_information
+from alidade.pipelines.solvers.posterior import moved_to, sqrt_information
 
-# Steps to the states that are optimal for given parameters; first values are near them.
+# Steps to the states that are optimal for the parameters as estimated; first values are near them.
 _STEPS = 3
 
 
@@ -35,10 +34,13 @@ def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | N
     """
     levels = estimate.levels
     compiled = Compiled.of((freed.finer and freed.finer(levels)) or freed)
-    used = _used(compiled.engine.groups, estimate)
+    used, values = _used(compiled.engine.groups, estimate), compiled.initial
+    numbers = {q.name: q.prior_mean for q in compiled.problem.quantities}
+    numbers |= zip(estimate.names, estimate.values.tolist(), strict=True)
     try:
         engine = _without_rejected(apply_levels(compiled.engine, levels), used)
-        values = _with_optimal_states(engine, _at(compiled, estimate))
+        for _ in range(_STEPS):
+            values = moved_to(compiled, engine, values, numbers)
         if freed.marginal_likelihood and compiled.engine.is_chain:
             out = {i: ~used[i] for i, group in enumerate(engine.groups) if group.is_measurement}
             found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
@@ -67,25 +69,3 @@ def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]
 def _without_rejected(engine: Linearization, used: Sequence[NDArray[np.bool_]]) -> Linearization:
     """The engine with measurements that count in full or not at all."""
     return engine.with_groups([group.counting(own) for group, own in zip(engine.groups, used, strict=True)])
-
-
-def _at(compiled: Compiled, estimate: Estimate) -> Values:
-    """First values with the parameters as estimated."""
-    numbers = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
-    layout, values = compiled.layout, compiled.initial
-    N, d, J, c, _ = layout.sizes
-    for _ in range(_STEPS):  # rotation vectors are not linear
-        here = Reported.of(compiled, values)
-        means = [numbers.get(q.name, q.prior_mean) for q in compiled.problem.quantities]
-        move = np.linalg.pinv(here.jacobian[:, c:]) @ (np.array(means) - here.numbers)
-        values = layout.retract(values, Tangent(np.zeros((N, d)), np.zeros((J, c)), move))
-    return values
-
-
-def _with_optimal_states(engine: Linearization, values: Values) -> Values:
-    """Values with the states optimal for the parameters as they are."""
-    *_, c, s = engine.layout.sizes
-    for _ in range(_STEPS):
-        factorization = engine.at(values)[0].eliminate()
-        values = engine.layout.retract(values, followed(factorization, np.zeros((c + s, 1))))
-    return values

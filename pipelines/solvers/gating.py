@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors.chi_square import gate
-from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Problem, Residuals
+from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Residuals
 from alidade.pipelines.solvers.error_budget import autocorrelation
 from alidade.pipelines.solvers.smoother import Smoother, linear_graph_of, ordering_of, slices
 
@@ -29,10 +29,6 @@ MAX_REJECTED_IN_A_ROW = 10
 FALSE_ALARM = 1e-3
 # Outliers are a minority of every family of measurements.
 MAX_OUTLIER_SHARE = 0.5
-# Variance, in units of the priors', of which the inverse less the priors' still has four digits of these.
-_LEAST_VARIANCE = 1e-12
-# Information in units of that of the priors below which it is rounding.
-_ROUNDING = 1e-9
 
 
 class RowBuffer:
@@ -129,14 +125,11 @@ class InnovationGate:
         families: family -> rows of time, 1 if used, and the innovation whitened by its own covariance, whose norm
             squared is the NIS.
         unusable: family -> number of measurements left out because they gave no finite numbers.
-        information: family -> information (d, d) that its measurements added about the parameters' tangents, all else
-            marginalised out.
         rejected_in_a_row: number of steps until now.
     """
 
     families: dict[str, RowBuffer] = field(default_factory=dict)
     unusable: dict[str, int] = field(default_factory=dict)
-    information: dict[str, Array] = field(default_factory=dict)
     rejected_in_a_row: int = 0
 
     def too_few_to_decide(self) -> bool:
@@ -149,16 +142,13 @@ class InnovationGate:
             for count, rejected in self._counts().values()
         )
 
-    def select(
-        self, factor: Factor, prediction: Prediction, gated: bool, parameters: Sequence[int] = ()
-    ) -> Factor | None:
+    def select(self, factor: Factor, prediction: Prediction, gated: bool) -> Factor | None:
         """Select the measurements of a factor whose innovation lies within the gate, and record all innovations.
 
         Args:
             factor: with a measurement.
             prediction: of its variables.
             gated: whether innovations outside the gate are rejected.
-            parameters: variables about which the information that the measurements add is recorded; none: not recorded.
 
         Returns:
             The factor on the measurements used; None: none is.
@@ -170,10 +160,8 @@ class InnovationGate:
         if not (np.isfinite(error).all() and np.isfinite(A).all()):
             self.unusable[factor.family] = self.unusable.get(factor.family, 0) + n
             return None
-        other = [key for key in parameters if key not in measurement.keys]
-        moves, P = prediction.of([*measurement.keys, *other])
-        own = A.shape[1]
-        error, S = error + A @ moves[:own], A @ P[:own, :own] @ A.T + np.eye(len(error))
+        moves, P = prediction.of(measurement.keys)
+        error, S = error + A @ moves, A @ P @ A.T + np.eye(len(error))
         parts = n if measurement.divisible else 1
         rows = np.arange(len(error)).reshape(parts, -1)
         used = self._within_gate(error[rows], S[rows[:, :, None], rows[:, None, :]], gated)
@@ -181,12 +169,6 @@ class InnovationGate:
         for block in (rows[used].ravel(), *rows[~used]):
             whitened[block] = np.linalg.solve(np.linalg.cholesky(S[np.ix_(block, block)]), error[block])
         self.record(factor, whitened.reshape(n, -1), np.repeat(used, n // parts))
-        if len(parameters) and used.any():
-            kept = rows[used].ravel()
-            where = slices([*measurement.keys, *other], prediction.about.dims())
-            of = np.concatenate([np.arange(P.shape[0])[where[key]] for key in parameters])
-            added = _added_information(P[np.ix_(of, of)], P[of, :own] @ A[kept].T, S[np.ix_(kept, kept)])
-            self.information[factor.family] = self.information.get(factor.family, 0.0) + added
         if used.all() or not used.any():
             return factor if used.all() else None
         return Factor.of(factor.family, measurement.only(used))
@@ -229,6 +211,14 @@ class InnovationGate:
             for family, rows in self.families.items()
         }
 
+    def correlation_lengths(self) -> dict[str, float]:
+        """Family -> how many innovations in a row count as one, of those whose innovations are correlated in time."""
+        found = {
+            family: autocorrelation(np.where(each.used[:, None], each.whitened, 0.0))
+            for family, each in self.residuals().items()
+        }
+        return {family: 1.0 + 2.0 * float(lags.sum()) for family, lags in found.items() if len(lags)}
+
     def rejected(self) -> dict[str, int]:
         """Family -> number of measurements left out."""
         return {family: rejected + self.unusable.get(family, 0) for family, (_, rejected) in self._counts().items()}
@@ -236,76 +226,3 @@ class InnovationGate:
     def _counts(self) -> dict[str, tuple[int, int]]:
         """Family -> number of measurements, and of those rejected."""
         return {family: (len(rows), int((rows.array[:, 1] == 0.0).sum())) for family, rows in self.families.items()}
-
-
-def _added_information(C: Array, across: Array, S: Array) -> Array:
-    """Information (d, d) that a measurement adds about numbers.
-
-    It is J+ - J with J = C^-1 and J+ = (C - across S^-1 across')^-1, by the matrix inversion lemma.
-
-    Args:
-        C: (d, d) covariance of the numbers before.
-        across: (d, m) their covariance with the innovation.
-        S: (m, m) covariance of the innovation.
-    """
-    sigmas = np.sqrt(np.diag(C))
-    gain = np.linalg.solve(C / np.outer(sigmas, sigmas), across / sigmas[:, None]) / sigmas[:, None]
-    return np.asarray(gain @ np.linalg.solve(S - across.T @ gain, gain.T))
-
-
-def correlation_inflation(
-    problem: Problem, covariance: Array, gate: InnovationGate, to_tangents: Array
-) -> tuple[Array, dict[str, float]]:
-    """Covariance (n, n) of a filter whose innovations are correlated in time, and the correlation lengths by family.
-
-    Where innovations of a family are correlated over L measurements, L of them count as one: the information that the
-    family added is divided by L. Information of priors, and of families with white innovations, stays.
-
-    Args:
-        problem: gives the priors.
-        covariance: (n, n) of the reported numbers for white noise.
-        gate: with the innovations.
-        to_tangents: (d, n) Jacobian of the parameters' tangents by the reported numbers.
-    """
-    lengths = {}
-    for family, found in gate.residuals().items():
-        lags = autocorrelation(np.where(found.used[:, None], found.whitened, 0.0))
-        if len(lags):
-            lengths[family] = 1.0 + 2.0 * float(lags.sum())
-    if not lengths:
-        return covariance, lengths
-    free = np.flatnonzero(np.diag(covariance) > 0.0)
-    scale, extra = np.array([(problem.quantities[i].scale, problem.quantities[i].extra_sigma) for i in free]).T
-    block = np.ix_(free, free)
-    variance, vectors = np.linalg.eigh((covariance[block] - np.diag(extra**2)) / np.outer(scale, scale))
-    own = problem.prior_covariance([problem.quantities[i].name for i in free], scale) / np.outer(scale, scale)
-    known = np.array([problem.quantities[i].prior_sigma is not None for i in free], dtype=float)
-    prior = np.linalg.inv(own) * np.outer(known, known)
-    measured = (vectors / np.maximum(variance, _LEAST_VARIANCE)) @ vectors.T - prior
-    unit = to_tangents[:, free] * scale
-    added = {family: unit.T @ each @ unit for family, each in gate.information.items()}
-    # With C the covariance and L what is lost of its information, (C^-1 - L)^-1 is C^1/2 (1 - C^1/2 L C^1/2)^-1 C^1/2.
-    root = vectors * np.sqrt(np.maximum(variance, 0.0))
-    left, axes = np.linalg.eigh(np.eye(len(root)) - root.T @ (measured - _divided(measured, added, lengths)) @ root)
-    root = root @ (axes / np.sqrt(np.maximum(left, 1.0 / max(lengths.values()))))
-    grown = covariance.copy()
-    grown[block] = root @ root.T * np.outer(scale, scale) + np.diag(extra**2)
-    return grown, lengths
-
-
-def _divided(measured: Array, added: Mapping[str, Array], lengths: Mapping[str, float]) -> Array:
-    """Information (n, n) with the share of each family divided by its correlation length.
-
-    Directions to which no family has added count with the longest.
-    """
-    longest = max(lengths.values())
-    least = _ROUNDING * max((float(np.trace(each)) for each in added.values()), default=1.0)
-    whole, parts = least * np.eye(len(measured)), least / longest * np.eye(len(measured))
-    for family, each in added.items():
-        whole += each
-        parts += each / lengths.get(family, 1.0)
-    values, vectors = np.linalg.eigh(whole)
-    inverse_root = (vectors / np.sqrt(np.maximum(values, least))) @ vectors.T  # below it is rounding
-    values, vectors = np.linalg.eigh(measured)
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return np.asarray(root @ inverse_root @ parts @ inverse_root @ root)

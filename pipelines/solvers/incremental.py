@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import (
     Array,
@@ -39,15 +38,15 @@ from alidade.pipelines.solvers.batch import BatchConfig, Solved, residuals_by_fa
 from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.checkpoint import (
     MarginalState,
-    SavedRun,
+    RunState,
     counted_apart,
     finite_measurements,
     require_finite,
     require_known_variables,
 )
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.error_budget import sigma_ratio
-from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
+from alidade.pipelines.solvers.error_budget import LEAST_VARIANCE, added_to, sigma_ratio, variance_shares
+from alidade.pipelines.solvers.gating import Prediction, RowBuffer
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem, undetermined
 from alidade.pipelines.solvers.posterior import WIDEST, Reported
 from alidade.pipelines.solvers.smoother import (
@@ -72,8 +71,6 @@ from alidade.pipelines.solvers.window import Keyframes, Window
 DEFAULT_WINDOW = 1.0
 # Steps freed with each new one, of those marginalised out: a thousand at once take longer than an update.
 _FREED = 10
-# Variance, in units of the priors', below which that of a smoother is rounding.
-_LEAST_VARIANCE = 1e-24
 
 
 @dataclass(frozen=True)
@@ -126,87 +123,25 @@ def solve_incremental(
     return solver.finish(time.perf_counter() - start)
 
 
-class MomentRecorder:
-    """Joint estimates at moments a fixed share of the time apart, so that hours have a few hundred of them.
-
-    Attributes:
-        rows: time, values (n,) and covariance (n * n,) of each; none where the beginning is not known.
-    """
-
-    def __init__(self, rows: RowBuffer | None = None) -> None:
-        self.rows = RowBuffer() if rows is None else rows
-
-    @classmethod
-    def after(cls, posterior_history: PosteriorHistory | None) -> MomentRecorder:
-        """A recorder that continues from the moments of a batch solution."""
-        if posterior_history is None:
-            return cls()
-        covariance = posterior_history.covariance.reshape(len(posterior_history.time), -1)
-        return cls(RowBuffer(np.column_stack([posterior_history.time, posterior_history.values, covariance])))
-
-    def is_due(self, time: float, spacing: float) -> bool:
-        """Whether a moment is to be added at a time, s."""
-        past = self.rows.array
-        return len(past) > 0 and time - past[-1, 0] >= spacing * (time - past[0, 0])
-
-    def add(self, time: float, values: Array, covariance: Array) -> None:
-        """Add a moment."""
-        self.rows.add(np.concatenate([[time], values, covariance.ravel()])[None])
-
-    def posterior_history(
-        self, time: float, values: Array, covariance: Array, steady: NDArray[np.bool_]
-    ) -> PosteriorHistory | None:
-        """The moments before a time, s, with the estimate then as the last; None: the beginning is not known."""
-        past, n = self.rows.array, len(values)
-        if not len(past):
-            return None
-        past = past[past[:, 0] < time]
-        return PosteriorHistory(
-            np.append(past[:, 0], time),
-            np.vstack([past[:, 1 : 1 + n], values]),
-            np.concatenate([past[:, 1 + n :].reshape(-1, n, n), covariance[None]]),
-            steady,
-        )
-
-
 class IncrementalSolver:
     """One pass of a smoother through the steps.
 
     Attributes:
         problem: the graph.
-        window: how long states are kept, s or Keyframes; None keeps all.
         config: of the solver.
+        state: what it knows.
         initialising: whether the run is in its initialisation phase.
-        marginal: the Gaussian that the run continues from since everything else was marginalised out; None: never.
-        steps_since: the steps added since then.
-        current_keys: parameter key -> variable that holds its value now.
-        keyframes: number added.
-        gate: innovations of all measurements.
-        levels: noise levels of the last batch solution.
-        trouble: why the last batch solution did not converge; empty: it did.
-        history: rows of time, values and sigmas.
-        attitudes: rows of time and quaternion.
-        recorder: joint estimates at moments after the initialisation phase.
+        steps_since: the steps added since its past was marginalised out.
         moments: number of moments, or in the initialisation phase of batch solutions, so far.
-        walked: parameter keys whose values other variables held before.
     """
 
     def __init__(self, problem: Problem, window: Window, config: IncrementalConfig = IncrementalConfig()) -> None:
         self.problem, self.config = problem, config
-        self.window = window if window is None or isinstance(window, Keyframes) else float(window)
+        window = window if window is None or isinstance(window, Keyframes) else float(window)
+        self.state = RunState(window, problem.noises)
         self.initialising = True
-        self.marginal: MarginalState | None = None
         self.steps_since: list[Step] = []
-        self.current_keys: dict[int, int] = {}
-        self.keyframes = 0
-        self.gate = InnovationGate()
-        self.levels = problem.noises
-        self.trouble = ""
-        self.history = RowBuffer()
-        self.attitudes = RowBuffer()
-        self.recorder = MomentRecorder()
         self.moments = 0
-        self.walked: set[int] = set()
         self._outdated: list[Step] = []  # steps no longer needed, yet to be freed
         self._smoother: Smoother | None = None  # None in the initialisation phase
         self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
@@ -219,53 +154,20 @@ class IncrementalSolver:
 
     @classmethod
     def resumed(
-        cls, problem: Problem, saved: SavedRun, config: IncrementalConfig = IncrementalConfig()
+        cls, problem: Problem, saved: RunState, config: IncrementalConfig = IncrementalConfig()
     ) -> IncrementalSolver:
         """A run that continues from a saved one."""
+        assert saved.marginal is not None
         solver = cls(problem, saved.window, config)
-        solver.initialising = False
-        solver.levels, solver.trouble = saved.levels, saved.trouble
-        solver.current_keys, solver.keyframes = dict(saved.current_keys), saved.keyframes
-        solver.walked = set(saved.walked)
-        solver.history, solver.attitudes = RowBuffer(saved.rows["history"]), RowBuffer(saved.rows["attitudes"])
-        solver.recorder = MomentRecorder(RowBuffer(saved.rows["moments"]))
-        solver.gate = InnovationGate(
-            {family: RowBuffer(rows) for family, rows in saved.innovations.items()},
-            dict(saved.unusable),
-            dict(saved.information),
-            saved.rejected_in_a_row,
-        )
+        solver.state, solver.initialising = saved, False
         solver._before = 1.0 + max(saved.marginal.stamps.values(), default=-1.0)
         solver._continue_from(saved.marginal)
         return solver
 
-    def saved(self) -> SavedRun:
-        """The run as it is to be saved. Raises ValueError unless `can_checkpoint`."""
-        if self.marginal is None or self.steps_since or self.window is None:
-            raise ValueError("a run can be saved only where its past was just marginalised out")
-        return SavedRun(
-            window=self.window,
-            marginal=self.marginal,
-            current_keys=self.current_keys,
-            keyframes=self.keyframes,
-            walked=frozenset(self.walked),
-            levels=self.levels,
-            trouble=self.trouble,
-            rejected_in_a_row=self.gate.rejected_in_a_row,
-            unusable=self.gate.unusable,
-            rows={
-                "history": self.history.array,
-                "attitudes": self.attitudes.array,
-                "moments": self.recorder.rows.array,
-            },
-            innovations={family: rows.array for family, rows in self.gate.families.items()},
-            information=self.gate.information,
-        )
-
     @property
     def can_checkpoint(self) -> bool:
         """Whether the run is at a point where it can be saved."""
-        return self.marginal is not None and not self.steps_since
+        return self.state.marginal is not None and not self.steps_since
 
     def update_problem(self, problem: Problem) -> None:
         """Continue with the graph of the same recording, grown: the steps added are among its own."""
@@ -276,7 +178,7 @@ class IncrementalSolver:
         """Time of the last step, s; -inf before the first."""
         if self.steps_since:
             return self.steps_since[-1].time
-        return -np.inf if self.marginal is None else self.marginal.time
+        return -np.inf if self.state.marginal is None else self.state.marginal.time
 
     @property
     def started(self) -> bool:
@@ -286,27 +188,28 @@ class IncrementalSolver:
     @property
     def keys(self) -> list[int]:
         """The variables that hold the parameters now."""
-        return [self.current_keys.get(p.key, p.key) for p in self.problem.parameters]
+        return [self.state.current_keys.get(p.key, p.key) for p in self.problem.parameters]
 
     def add_step(self, step: Step) -> None:
         """Add a step. Raises as solve_incremental does; the solver cannot be used any more then."""
-        self.walked.update(key for key, held in step.current_keys.items() if self.current_keys.get(key, held) != held)
-        self.current_keys.update(step.current_keys)
-        self.keyframes = max(self.keyframes, step.keyframes.stop)
+        state = self.state
+        state.walked.update(key for key, held in step.current_keys.items() if state.current_keys.get(key, held) != held)
+        state.current_keys.update(step.current_keys)
+        state.keyframes = max(state.keyframes, step.keyframes.stop)
         self.steps_since.append(step)
         del self._outdated[-_FREED:]
-        if isinstance(self.window, Keyframes):
+        if isinstance(self.state.window, Keyframes):
             self._times.extend(sorted({*step.timestamps.values(), step.time}))
         if self._smoother is not None:
             self._advance(self._smoother, step)
-        since = step.time - (self.steps_since[0].time if self.marginal is None else self.marginal.time)
+        since = step.time - (self.steps_since[0].time if self.state.marginal is None else self.state.marginal.time)
         if self.initialising:
             if since >= max(self.config.first_solve, self.config.solve_growth * self._of[1]):
                 self._solve_batch()
         elif since >= self.config.marginalize_every and isinstance(self._smoother, FixedLagSmoother):
             graph, values = self._smoother.active_variables()
-            state = MarginalState.of(step.time, graph, values, list(graph.keyVector()), self._stamps)
-            self._continue_from(state)
+            marginal = MarginalState.of(step.time, graph, values, list(graph.keyVector()), self._stamps)
+            self._continue_from(marginal)
 
     # -- what is reported
 
@@ -323,15 +226,24 @@ class IncrementalSolver:
         if self.initialising:
             return self.estimate().posterior_history
         steady = np.repeat(
-            [p.key not in self.walked for p in self.problem.parameters],
+            [p.key not in self.state.walked for p in self.problem.parameters],
             [len(p.quantities) for p in self.problem.parameters],
         )
-        return self.recorder.posterior_history(self.time, *self._constrained(), steady)
+        (numbers, covariance), past, n = self._constrained(), self.state.moments.array, len(steady)
+        if not len(past):
+            return None
+        past = past[past[:, 0] < self.time]
+        return PosteriorHistory(
+            np.append(past[:, 0], self.time),
+            np.vstack([past[:, 1 : 1 + n], numbers]),
+            np.concatenate([past[:, 1 + n :].reshape(-1, n, n), covariance[None]]),
+            steady,
+        )
 
     def chi_square(self) -> ChiSquare:
         """Squared residuals of the last batch solution, after the initialisation phase squared innovations."""
         found = self.estimate().chi_square if self.initialising else None
-        return self.gate.chi_square() if found is None else found
+        return self.state.gate.chi_square() if found is None else found
 
     def finish(self, seconds: float) -> Estimate:
         """The estimate after the last step, as batch has it. More steps may follow."""
@@ -356,14 +268,14 @@ class IncrementalSolver:
         return replace(
             estimate,
             solver="incremental",
-            message=self.trouble or "all steps taken",
+            message=self.state.trouble or "all steps taken",
             history=self._history(estimate.inflation),
-            rejected=self.gate.rejected(),
+            rejected=self.state.gate.rejected(),
         )
 
     def _history(self, inflation: Array | None) -> History:
         """What was known over time, with sigmas (n,) times as wide."""
-        rows, n = self.history.array.copy(), len(self.problem.quantities)
+        rows, n = self.state.history.array.copy(), len(self.problem.quantities)
         history = History(rows[:, 0], rows[:, 1 : 1 + n], rows[:, 1 + n :])
         return history if inflation is None else history.inflated(inflation)
 
@@ -372,10 +284,10 @@ class IncrementalSolver:
         values, covariance = self._constrained()
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
-        to_tangents = np.asarray(np.linalg.pinv(self._reported().jacobian), dtype=float)
-        grown, lengths = correlation_inflation(self.problem, covariance, self.gate, to_tangents)
+        lengths = self.state.gate.correlation_lengths()
+        grown = self._grown(covariance, lengths)
         inflation = sigma_ratio(np.diag(covariance), np.diag(grown))
-        attitudes = self.attitudes.array.copy()
+        attitudes = self.state.attitudes.array.copy()
         return Estimate(
             solver="incremental",
             names=tuple(q.name for q in self.problem.quantities),
@@ -383,16 +295,26 @@ class IncrementalSolver:
             covariance=grown,
             inflation=inflation,
             colours=lengths,
-            converged=not self.trouble,
-            message=self.trouble or "all steps taken",
-            residuals=self.gate.residuals(),
-            chi_square=self.gate.chi_square(),
+            converged=not self.state.trouble,
+            message=self.state.trouble or "all steps taken",
+            residuals=self.state.gate.residuals(),
+            chi_square=self.state.gate.chi_square(),
             history=self._history(inflation),
             posterior_history=self.posterior_history(),
             attitudes=None if self.problem.attitudes is None else Attitudes(attitudes[:, 0], attitudes[:, 1:]),
-            rejected=self.gate.rejected(),
-            levels=self.levels,
+            rejected=self.state.gate.rejected(),
+            levels=self.state.levels,
         )
+
+    def _grown(self, covariance: Array, lengths: Mapping[str, float]) -> Array:
+        """Covariance (n, n) with what correlation of innovations adds to it."""
+        if not lengths:
+            return covariance
+        reported, grown = self._reported(), covariance.copy()
+        free, unit = reported.free, np.outer(reported.scale, reported.scale)
+        white = (covariance[np.ix_(free, free)] - np.diag(reported.extra[free] ** 2)) / unit
+        grown[np.ix_(free, free)] += added_to(white, self.state.shares, lengths) * unit
+        return grown
 
     def _batch(self) -> Solved:
         """The last batch solution of the initialisation phase."""
@@ -406,7 +328,7 @@ class IncrementalSolver:
 
         So are numbers for which second order does not go far enough yet.
         """
-        is_undecided = bool(self.trouble) or self.gate.too_few_to_decide()
+        is_undecided = bool(self.state.trouble) or self.state.gate.too_few_to_decide()
         return at_prior(solved.posterior, self._beyond[solved.posterior.reported.free] | is_undecided)
 
     def _constrained(self) -> tuple[Array, Array]:
@@ -420,7 +342,7 @@ class IncrementalSolver:
             return posterior.reported.numbers, posterior.covariance
         reported = self._reported()
         variances, axes = np.linalg.eigh(self._smoothed_covariance(reported))
-        R = axes.T / np.sqrt(np.clip(variances, _LEAST_VARIANCE, WIDEST**2))[:, None]
+        R = axes.T / np.sqrt(np.clip(variances, LEAST_VARIANCE, WIDEST**2))[:, None]
         directions = WeakDirections.of(R, reported.prior, reported.calibrated)
         values = reported.numbers.copy()
         values[reported.free] += reported.scale * constrained_step(directions, R, np.zeros(len(R)), reported.u)
@@ -469,42 +391,42 @@ class IncrementalSolver:
 
     def _selected(self, smoother: Smoother, step: Step, about: gtsam.Values, new: gtsam.Values) -> list[Factor]:
         """The processes of a step and the measurements used, for a window linear about the values."""
-        factors = weigh(step.factors, self.levels)
+        factors = weigh(step.factors, self.state.levels)
         require_known_variables(factors, about, step.time)
         processes = [f for f in factors if f.measurement is None]
-        if self.window is not None:
+        if self.state.window is not None:
             processes = [linearized(f, about) for f in processes]
         require_finite(processes, about, step.time)
         prediction = Prediction(smoother, processes, about, new)
-        # Of a single family all information that was measured is its own.
-        parameters = self.keys if len(self.gate.families) > 1 else []
         measurements = []
         for f in factors:
             if f.measurement is not None:
-                used = self.gate.select(f, prediction, self.problem.loss is not None, parameters)
+                used = self.state.gate.select(f, prediction, self.problem.loss is not None)
                 if used is not None:
                     measurements.append(without_loss(used))
-        if self.window is not None:
+        if self.state.window is not None:
             measurements = [linearized(f, about) for f in measurements]
         return processes + measurements
 
     def _ages(self, timestamps: Mapping[int, float]) -> dict[int, float]:
         """Times of last use, s, in the window's unit: the number of the keyframe, or as they are."""
-        if not isinstance(self.window, Keyframes):
+        if not isinstance(self.state.window, Keyframes):
             return dict(timestamps)
         number = self._before + np.searchsorted(self._times, list(timestamps.values()))
         return dict(zip(timestamps, number.tolist(), strict=True))
 
     def _add_attitudes(self, attitudes: Attitudes) -> None:
-        self.attitudes.add(np.column_stack([attitudes.time, attitudes.wxyz]))
+        self.state.attitudes.add(np.column_stack([attitudes.time, attitudes.wxyz]))
 
     def _record(self) -> None:
         """Add the estimate now to the history, and after the initialisation phase to the moments."""
-        if not len(self.history) or self.time - self.history.array[-1, 0] >= 1.0 / self.config.history_rate:
+        if not len(self.state.history) or self.time - self.state.history.array[-1, 0] >= 1.0 / self.config.history_rate:
             numbers, covariance = self._constrained()
-            self.history.add(np.concatenate([[self.time], numbers, np.sqrt(np.diag(covariance))])[None])
-            if not self.initialising and self.recorder.is_due(self.time, self.config.moment_spacing):
-                self.recorder.add(self.time, numbers, covariance)
+            self.state.history.add(np.concatenate([[self.time], numbers, np.sqrt(np.diag(covariance))])[None])
+            past = self.state.moments.array
+            spacing = self.config.moment_spacing * (self.time - past[0, 0]) if len(past) else np.inf
+            if not self.initialising and len(past) and self.time - past[-1, 0] >= spacing:
+                self.state.moments.add(np.concatenate([[self.time], numbers, covariance.ravel()])[None])
                 self.moments += 1
 
     # -- batch solutions
@@ -512,8 +434,8 @@ class IncrementalSolver:
     def _solve_batch(self) -> None:
         """Solve everything since the marginal in batch; once that is linear enough, start the smoother from it."""
         solved = self._batch_solution(self._all_steps_since())
-        if self.marginal is None:
-            self.gate.adopt(residuals_by_family(solved.engine, solved.solution.values))
+        if self.state.marginal is None:
+            self.state.gate.adopt(residuals_by_family(solved.engine, solved.solution.values))
         if self.initialising:
             since = self.time - self.steps_since[0].time
             self._solved, self._of, self._estimate = solved, (len(self.steps_since), since), None
@@ -525,12 +447,17 @@ class IncrementalSolver:
             if since < self.config.max_initialisation and not self._is_linear(solved):
                 self._record()
                 return
-            self.recorder = MomentRecorder.after(self.estimate().posterior_history)
+            history = self.estimate().posterior_history
+            if history is not None:
+                covariance = history.covariance.reshape(len(history.time), -1)
+                self.state.moments = RowBuffer(np.column_stack([history.time, history.values, covariance]))
             self.initialising, self._solved, self._estimate = False, None, None
+        from_start = self.state.marginal is None
+        if from_start:
+            self.state.shares = variance_shares(solved.posterior)
         if self.problem.attitudes is not None:
-            from_start = self.marginal is None
             if from_start:
-                self.attitudes.clear()
+                self.state.attitudes.clear()
             values = solved.compiled.layout.to_gtsam(solved.solution.values)
             keyframes = solved.compiled.keyframes if from_start else self.steps_since[-1].keyframes
             self._add_attitudes(self.problem.attitudes(keyframes, values))
@@ -539,17 +466,17 @@ class IncrementalSolver:
 
     def _is_linear(self, solved: Solved) -> bool:
         """Whether a smoother can continue from a solution: no weak direction, a small share of second order."""
-        if self.trouble or len(self.steps_since) < self.config.min_steps or self.gate.too_few_to_decide():
+        if self.state.trouble or len(self.steps_since) < self.config.min_steps or self.state.gate.too_few_to_decide():
             return False
         posterior = solved.posterior
         return not posterior.directions.weak.shape[1] and posterior.second_order_share() < self.config.max_curvature
 
     def _all_steps_since(self) -> list[Step]:
         """The steps since the marginal, the marginal as the first of them."""
-        if self.marginal is None:
+        if self.state.marginal is None:
             return self.steps_since
-        start = Step(self.marginal.time, self.marginal.estimate, [self.marginal.factor])
-        start.current_keys.update(self.current_keys)
+        start = Step(self.state.marginal.time, self.state.marginal.estimate, [self.state.marginal.factor])
+        start.current_keys.update(self.state.current_keys)
         return [start, *self.steps_since]
 
     def _batch_solution(self, steps: Sequence[Step]) -> Solved:
@@ -564,12 +491,12 @@ class IncrementalSolver:
         if not np.isfinite(compiled.engine.cost(compiled.initial)):
             compiled = Compiled.of(problem, steps=self._finite(steps, compiled.layout.to_gtsam(compiled.initial)))
         try:
-            solved = solve(compiled, levels=None if self.marginal is None else self.levels)
+            solved = solve(compiled, levels=None if self.state.marginal is None else self.state.levels)
         except (IndeterminateError, np.linalg.LinAlgError) as error:
             raise IndeterminateError(f"the first {self.time:.3f} s do not determine the parameters: {error}") from error
-        self.levels = solved.levels
+        self.state.levels = solved.levels
         found = solved.solution
-        self.trouble = "" if found.converged else f"the first {self.time:.1f} s: {found.message}"
+        self.state.trouble = "" if found.converged else f"the first {self.time:.1f} s: {found.message}"
         return solved
 
     def _finite(self, steps: Sequence[Step], values: gtsam.Values) -> list[Step]:
@@ -580,8 +507,8 @@ class IncrementalSolver:
         """
         if self.started:
             kept = [finite_measurements(step, values) for step in steps]
-            if self.marginal is None:
-                self.gate.unusable = counted_apart(steps, kept)
+            if self.state.marginal is None:
+                self.state.gate.unusable = counted_apart(steps, kept)
             steps = kept
         for step in steps:
             require_finite(step.factors, values, step.time)
@@ -591,10 +518,10 @@ class IncrementalSolver:
         """Start the smoother from a solution: from its active variables alone, or without a window from all of it."""
         values = solved.compiled.layout.to_gtsam(solved.solution.values)
         stamps = self._ages({key: time for step in self.steps_since for key, time in step.timestamps.items()})
-        if self.marginal is not None:
-            stamps = {**self.marginal.stamps, **stamps}
-        if self.window is None:
-            factors = (f for step in self.steps_since for f in weigh(step.factors, self.levels))
+        if self.state.marginal is not None:
+            stamps = {**self.state.marginal.stamps, **stamps}
+        if self.state.window is None:
+            factors = (f for step in self.steps_since for f in weigh(step.factors, self.state.levels))
             used = [without_loss(f) for f in (inliers(f, values, self.problem.loss) for f in factors) if f is not None]
             self._start(used, values, stamps)
             return
@@ -605,11 +532,11 @@ class IncrementalSolver:
 
     def _continue_from(self, state: MarginalState) -> None:
         """Continue from a Gaussian alone."""
-        self.marginal, self._outdated, self.steps_since = state, self.steps_since, []
+        self.state.marginal, self._outdated, self.steps_since = state, self.steps_since, []
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        self._smoother = Isam2() if self.window is None else FixedLagSmoother(self.window)
+        self._smoother = Isam2() if self.state.window is None else FixedLagSmoother(self.state.window)
         self._stamps = dict(stamps)
         try:
             self._smoother.update(factors, values, stamps)

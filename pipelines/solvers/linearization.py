@@ -336,20 +336,13 @@ class _Draft:
     """A group before its rows have places.
 
     Attributes:
-        at: for each block the positions (n or 1,) of its variables in the layout.
+        group: without target, rows and columns.
         last, count: (n,) the last keyframe of each measurement, -1: none, and how many it joins, at most two.
         node: (n,) the node that each takes, -1: none; `pair`: whether it joins that to the one before.
         whole: for each block whether it is the first node as the bias as a whole, wherever the measurement is.
     """
 
-    family: str
-    model: Model
-    loss: TruncatedLoss | None
-    weights: Array | None
-    factors: Index
-    is_measurement: bool
-    beside: Array | None
-    at: list[Index]
+    group: Group
     last: Index
     count: Index
     node: Index
@@ -391,7 +384,7 @@ class _Draft:
             raise NotAChainError(f"{first.family}: a factor joins keyframes that are not neighbours")
         if chain and reach.max(initial=0) > (0 if frames else 1):
             raise NotAChainError(f"{first.family}: a factor joins bias nodes that are not neighbours")
-        return cls(
+        group = Group(
             family=first.family,
             model=model,
             loss=v.loss,
@@ -399,57 +392,46 @@ class _Draft:
             factors=np.repeat([i for i, *_ in kind], lengths),
             is_measurement=first.measurement is not None,
             beside=beside,
+            gather=[(layout.blocks[layout.block[each[0]]], layout.row[each]) for each in at],
             at=at,
-            last=last,
-            count=span + 1,
-            node=node,
-            pair=bool(reach.any()),
-            whole=whole,
+            target="",
+            place=last,
+            row=np.zeros(n, dtype=np.intp),
+            columns=[],
+            deviates=[layout.node[each] > 0 for each in at],
         )
+        return cls(group, last, span + 1, node, bool(reach.any()), whole)
 
     def placed(self, layout: Layout, piece: Index, used: Index, chain: bool) -> Group:
         """The group, its rows below those of others that are already there."""
-        c, n = layout.sizes[3], len(self.model.time)
-        target, place, row = "shared", np.full(n, -1), np.zeros(n, dtype=np.intp)
+        c, group, rows = layout.sizes[3], self.group, self.group.model.rows
+        n = len(self.last)
+        target, place, row = "shared", np.full(n, -1), group.row
         if not chain:
             target, place = "shared" if self.last.max() < 0 and self.node.max() <= 0 else "", self.last
         elif self.last.max(initial=-1) >= 0:
             target, place = ("pair" if (self.count > 1).any() else "state"), self.last
         elif c and self._is_walk(layout):
             target, place = "walk", self.node
-        elif c and self.node.max(initial=-1) >= (0 if self.is_measurement else 1):
+        elif c and self.node.max(initial=-1) >= (0 if group.is_measurement else 1):
             if self.pair:
-                raise NotAChainError(f"{self.family}: a factor joins two bias nodes and shared variables")
+                raise NotAChainError(f"{group.family}: a factor joins two bias nodes and shared variables")
             target, place = "state", np.searchsorted(piece, np.maximum(self.node, 0), side="right") - 1
-        if target == "state" and (used[1][place] + self.model.rows <= used[1].max()).all() and len(set(place)) == n:
+        if target == "state" and (used[1][place] + rows <= used[1].max()).all() and len(set(place)) == n:
             target = "pair"
         if target in ("state", "pair"):
-            row = _below(place, self.model.rows, used[int(target == "pair")])
-        return Group(
-            family=self.family,
-            model=self.model,
-            loss=self.loss,
-            weights=self.weights,
-            factors=self.factors,
-            is_measurement=self.is_measurement,
-            beside=self.beside,
-            gather=[(layout.blocks[layout.block[each[0]]], layout.row[each]) for each in self.at],
-            at=self.at,
-            target=target,
-            place=place,
-            row=row,
-            columns=[self._columns(i, layout, target, piece) for i in range(len(self.at))] if target else [],
-            deviates=[layout.node[each] > 0 for each in self.at],
-        )
+            row = _below(place, rows, used[int(target == "pair")])
+        columns = [self._columns(i, layout, target, piece) for i in range(len(group.at))] if target else []
+        return replace(group, target=target, place=place, row=row, columns=columns)
 
     def _is_walk(self, layout: Layout) -> bool:
         """Whether every measurement is about differences of nodes and means alone."""
-        return self.pair and all((layout.node[each] >= 0).all() for each in self.at)
+        return self.pair and all((layout.node[each] >= 0).all() for each in self.group.at)
 
     def _columns(self, i: int, layout: Layout, target: str, piece: Index) -> list[Index]:
         """Columns of a block on its target; see Group."""
         d, c = layout.sizes[1], layout.sizes[3]
-        at = self.at[i]
+        at = self.group.at[i]
         span = np.arange(dimension(layout.blocks[layout.block[at[0]]]))
         begin = {"shared": 0, "walk": 2 * c, "state": d + c, "pair": 2 * d + c}[target]
         if layout.keyframe[at[0]] >= 0:
@@ -462,7 +444,9 @@ class _Draft:
             else:
                 first = begin - c + layout.part[at]
                 if (piece[self.last] != self.node)[self.last >= 0].any():
-                    raise NotAChainError(f"{self.family}: a factor takes another bias node than its keyframe's others")
+                    raise NotAChainError(
+                        f"{self.group.family}: a factor takes another bias node than its keyframe's others"
+                    )
             out.append(_single(first)[:, None] + span)
         return out
 

@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.model import ROT3
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
-from alidade.pipelines.estimation.problem import APART, Parameter, StepEstimate
+from alidade.pipelines.estimation.problem import APART, Factor, Parameter, StepEstimate
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.layout import Layout, Values
+from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Solution
-from alidade.pipelines.solvers.linearization import Group, Linearization, NativeModel
+from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import (
     NO_SAY,
     LinearChain,
@@ -454,6 +454,8 @@ def split(
         time: s; measurements from it on have the new one.
         step: (3,) first guess of Log(R^-1 R_late); R and R_late are joined by a prior of `STEP_PRIOR`.
     """
+    import gtsam
+
     layout = engine.layout
     (at,) = layout.at([key]).tolist()
     late, begin, columns = len(layout.key), int(layout.shared[at]), layout.sizes[4]
@@ -473,8 +475,10 @@ def split(
     moved = so3.multiply(array[layout.row[at]], so3.exp(step))
     arrays = {**values.arrays, ROT3: np.vstack([array, moved])}
     groups = [_with_late(group, at, late, len(array), columns - begin, time) for group in engine.groups]
-    prior = _prior(key, int(grown.key[late]), grown, at, late)
-    return replace(engine, layout=grown, groups=[*groups, prior]), Values(arrays), int(grown.key[late])
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, STEP_PRIOR)
+    joined = Factor("prior", gtsam.BetweenFactorRot3(key, int(grown.key[late]), gtsam.Rot3(), noise))
+    prior = Linearization.of([joined], grown, chain=False).groups
+    return replace(engine, layout=grown, groups=[*groups, *prior]), Values(arrays), int(grown.key[late])
 
 
 def _with_late(group: Group, at: int, late: int, row: int, further: int, time: float) -> Group:
@@ -489,27 +493,3 @@ def _with_late(group: Group, at: int, late: int, row: int, further: int, time: f
     gather[i] = (gather[i][0], np.where(after, row, gather[i][1]))
     columns[i] = [columns[i][0] + further * after[:, None]]
     return replace(group, at=positions, gather=gather, columns=columns)
-
-
-def _prior(key: int, late_key: int, layout: Layout, at: int, late: int) -> Group:
-    """Prior of the state before the step."""
-    import gtsam
-
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, STEP_PRIOR)
-    factor = gtsam.BetweenFactorRot3(key, late_key, gtsam.Rot3(), noise)
-    return Group(
-        family="prior",
-        model=NativeModel(factor, np.zeros(1), 3, (ROT3, ROT3)),
-        loss=None,
-        weights=None,
-        factors=np.array([-1]),
-        is_measurement=False,
-        beside=None,
-        gather=[(ROT3, layout.row[[each]]) for each in (at, late)],
-        at=[np.array([each]) for each in (at, late)],
-        target="shared",
-        place=np.array([-1]),
-        row=np.zeros(1, dtype=np.intp),
-        columns=[[int(layout.shared[each]) + np.arange(3)[None]] for each in (at, late)],
-        deviates=[np.zeros(1, dtype=bool)] * 2,
-    )

@@ -237,7 +237,7 @@ def test_a_mount_that_stays_is_calibrated() -> None:
 def test_a_slip_is_seen_while_it_is_recorded() -> None:
     """In the initialisation phase, and the same after the run has continued from a Gaussian."""
     run, alarms = watched(session(0, 0.8, IDEAL, vision_rate_hz=4.0))
-    assert run.recorder.rows.array[-1, 0] > 55.0
+    assert run.state.moments.array[-1, 0] > 55.0
     assert alarms
     sqrt_info, when = alarms[0]
     assert sqrt_info < 46.0

@@ -87,8 +87,8 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
         if run.can_checkpoint:
             times += 1
             if times == 1:
-                save_checkpoint(checkpoint, run.saved(), IDENTITY)
-                levels = run.levels
+                save_checkpoint(checkpoint, run.state, IDENTITY)
+                levels = run.state.levels
     assert times > 1, "the past has to be marginalised out again after the one that is saved"
     return Saved(session, checkpoint, made, levels, run.finish(0.0))
 
@@ -109,16 +109,16 @@ def test_a_new_process_ends_at_the_same_estimates(saved: Saved) -> None:
 def test_a_resumed_run_keeps_noise_levels_and_the_reason_for_not_converging(saved: Saved, tmp_path: Path) -> None:
     """Noise section, verdict and exit code follow from these."""
     run = IncrementalSolver.resumed(saved.made, load_checkpoint(saved.checkpoint, IDENTITY))
-    assert run.levels == saved.levels
-    assert {level.noise.name for level in run.levels if level.found is not None} == {"los_error", "gyro_density"}
-    run.trouble = "the first 40.0 s: no step lowers the error"
-    save_checkpoint(tmp_path / "c", run.saved(), IDENTITY)
+    assert run.state.levels == saved.levels
+    assert {level.noise.name for level in run.state.levels if level.found is not None} == {"los_error", "gyro_density"}
+    run.state.trouble = "the first 40.0 s: no step lowers the error"
+    save_checkpoint(tmp_path / "c", run.state, IDENTITY)
     resumed = IncrementalSolver.resumed(saved.made, load_checkpoint(tmp_path / "c", IDENTITY))
     for step in saved.made.steps(1):
         if step.time > resumed.time:
             resumed.add_step(step)
     end = resumed.finish(0.0)
-    assert (end.converged, end.message) == (False, run.trouble)
+    assert (end.converged, end.message) == (False, run.state.trouble)
     assert end.levels == saved.end.levels
 
 

@@ -204,15 +204,15 @@ class Follower:
     def _end_alone(self) -> tuple[Problem, Iterator[Step]] | None:
         """The graph from where the past was marginalised out, and its new steps; None where that is too little."""
         run, session = self._run, self._session
-        if run is None or run.marginal is None or run.problem.continuation is None or session is None:
+        if run is None or run.state.marginal is None or run.problem.continuation is None or session is None:
             return None
         for margin in _MARGINS:
-            since = self._epoch_ns + self._delay_ns + round((run.marginal.time - margin) * 1e9)
+            since = self._epoch_ns + self._delay_ns + round((run.state.marginal.time - margin) * 1e9)
             recording = Recording(self._growing.refresh(self.source.parts, since), self._epoch_ns)
             if len(self._growing.attachments) != self._attachments:
                 return None
             late = session.again(recording)
-            problem = run.problem.continuation(late.data, run.marginal.time)
+            problem = run.problem.continuation(late.data, run.state.marginal.time)
             if problem is not None and problem.steps_after is not None:
                 self._delay_ns = _min_delay_ns(late)
                 self._collect(late)
@@ -244,7 +244,7 @@ class Follower:
             return problem.steps(1)
         assert problem.steps_after is not None
         first = next(problem.steps_after(self._run.time), None)
-        if first is not None and first.keyframes.start != self._run.keyframes:
+        if first is not None and first.keyframes.start != self._run.state.keyframes:
             self._say("what was recorded before now reads otherwise: beginning anew")
             self._run = IncrementalSolver(problem, self.settings.window)
             return problem.steps(1)
@@ -285,7 +285,7 @@ class Follower:
         if self.settings.checkpoint is None:
             return
         try:
-            save_checkpoint(self.settings.checkpoint, run.saved(), self._identity)
+            save_checkpoint(self.settings.checkpoint, run.state, self._identity)
         except InputError as error:  # a full disk is no reason to stop
             self._say(str(error))
 

@@ -192,5 +192,7 @@ def view_of(
     if not run.started:
         return View(time, epoch_ns, quantities, None, None, checklist, change)
     covariance = finite_covariance(quantities, run.covariance())
-    findings = by_severity([*weak_directions(quantities, covariance, advise), *misfits(run.chi_square(), run.levels)])
+    findings = by_severity(
+        [*weak_directions(quantities, covariance, advise), *misfits(run.chi_square(), run.state.levels)]
+    )
     return View(time, epoch_ns, quantities, run.values(), covariance, checklist, change, findings, advise)
