@@ -15,10 +15,8 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import Level
@@ -284,17 +282,11 @@ def _attitudes(solved: Solved) -> Attitudes | None:
 
 def residuals_by_family(engine: Linearization, values: Values) -> dict[str, Residuals]:
     """Family -> whitened residuals of its measurements at some values, in the order of the problem's factors."""
-    parts: dict[str, list[tuple[NDArray[Any], ...]]] = {}
-    for group in engine.groups:
-        if group.is_measurement:
-            residuals = group.evaluate(values)[0]
-            each = group.factors, group.model.time, group.weighted(residuals), group.used(residuals) > 0.5
-            parts.setdefault(group.family, []).append(each)
     out = {}
-    for family, found in parts.items():
-        factors, times, whitened, used = (np.concatenate(column) for column in zip(*found, strict=True))
-        order = np.argsort(factors, kind="stable")
-        out[family] = Residuals(times[order], whitened[order], used[order])
+    for family, groups in engine.measured.items():
+        order = np.argsort(np.concatenate([g.factors for g in groups]), kind="stable")
+        each = [(g.model.time, g.weighted(g.evaluate(values)[0]), g.inliers(values)) for g in groups]
+        out[family] = Residuals(*(np.concatenate(column)[order] for column in zip(*each, strict=True)))
     return out
 
 
@@ -309,7 +301,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     shapes = [[(g.family, g.target, len(g.model.time), g.model.rows) for g in e.groups] for e in (own, engine)]
     if not np.array_equal(other.layout.key, solved.compiled.layout.key) or shapes[0] != shapes[1]:
         return {}
-    kept = [new.counting(g.used(g.evaluate(values)[0]) > 0.5) for g, new in zip(own.groups, engine.groups, strict=True)]
+    kept = [new.counting(g.inliers(values)) for g, new in zip(own.groups, engine.groups, strict=True)]
     moves = influence.moves(engine.with_groups(kept))
     return dict(zip(influence.names, moves.tolist(), strict=True))
 

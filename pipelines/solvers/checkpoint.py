@@ -123,23 +123,18 @@ def require_finite(factors: Sequence[Factor], values: gtsam.Values, time: float)
             )
 
 
-def finite_measurements(step: Step, values: gtsam.Values) -> Step:
-    """A step without the measurements that give no finite numbers at the values."""
-    return replace(step, factors=[f for f in step.factors if f.measurement is None or _is_finite(f, values)])
-
-
-def counted_apart(steps: Sequence[Step], kept: Sequence[Step]) -> dict[str, int]:
-    """Family -> number of measurements of some steps that are not in those kept."""
-    return dict(_measurements(steps) - _measurements(kept))
-
-
-def _measurements(steps: Sequence[Step]) -> Counter[str]:
-    """Number of measurements by family."""
-    count: Counter[str] = Counter()
+def without_infinite(steps: Sequence[Step], values: gtsam.Values) -> tuple[list[Step], dict[str, int]]:
+    """Steps without the measurements that give no finite numbers at the values, and their number by family."""
+    kept, left_out = list[Step](), Counter[str]()
     for step in steps:
+        used = []
         for f in step.factors:
-            count[f.family] += 0 if f.measurement is None else len(f.measurement.model.time)
-    return count
+            if f.measurement is None or _is_finite(f, values):
+                used.append(f)
+            else:
+                left_out[f.family] += len(f.measurement.model.time)
+        kept.append(replace(step, factors=used))
+    return kept, dict(left_out)
 
 
 def _is_finite(factor: Factor, values: gtsam.Values) -> bool:

@@ -28,7 +28,7 @@ from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import Group, Linearization
-from alidade.pipelines.solvers.posterior import Reported, counted, responses
+from alidade.pipelines.solvers.posterior import Reported, responses
 from alidade.pipelines.solvers.weak_directions import Posterior
 
 # Fewer measurements show no autocorrelation.
@@ -215,9 +215,9 @@ def autocorrelation(whitened: Array) -> Array:
 def autocorrelations(engine: Linearization, values: Values) -> dict[str, Array]:
     """Family of measurements -> autocorrelation of its residuals where they are not white; rejected ones are zero."""
     found = {}
-    for family, groups in _measured(engine).items():
+    for family, groups in engine.measured.items():
         if len({group.model.rows for group in groups}) == 1:
-            whitened = [g.weighted(g.evaluate(values)[0]) * counted(g, values)[:, None] for g in groups]
+            whitened = [g.weighted(g.evaluate(values)[0]) * g.inliers(values)[:, None] for g in groups]
             if len(lags := autocorrelation(np.concatenate(whitened)[_in_time(groups)])):
                 found[family] = lags
     return found
@@ -235,7 +235,7 @@ def added_covariance(influence: Influence, correlations: Mapping[str, Array]) ->
         influence: of the residuals.
         correlations: see `autocorrelations`.
     """
-    added, groups, scale = {}, _measured(influence.at.engine), influence.reported.scale
+    added, groups, scale = {}, influence.at.engine.measured, influence.reported.scale
     for family, correlation in correlations.items():
         found, order = [influence.rows(group) for group in groups[family]], _in_time(groups[family])
         L, right = (np.concatenate([each[i] for each in found])[order] for i in (0, 1))
@@ -257,7 +257,7 @@ def variance_shares(posterior: Posterior) -> dict[str, Array]:
     """
     influence, parts = Influence.of(posterior), dict[str, Array]()
     inverse = _symmetric_root(posterior.directions.covariance(), -0.5) / posterior.reported.scale
-    for family, groups in _measured(posterior.at.engine).items():
+    for family, groups in posterior.at.engine.measured.items():
         rows = [influence.rows(group)[0].reshape(-1, len(inverse)) @ inverse.T for group in groups]
         parts[family] = sum((each.T @ each for each in rows), np.zeros(inverse.shape))
     return parts
@@ -316,15 +316,6 @@ def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
     ratio = sigma_ratio(expected, found)
     certain = ratio.max(initial=1.0) > certain_ratio(_BLOCKS)
     return np.maximum(ratio, 1.0) if certain else np.ones(len(ratio))
-
-
-def _measured(engine: Linearization) -> dict[str, list[Group]]:
-    """Family -> its groups of measurements."""
-    found: dict[str, list[Group]] = {}
-    for group in engine.groups:
-        if group.is_measurement:
-            found.setdefault(group.family, []).append(group)
-    return found
 
 
 def _in_time(groups: Sequence[Group]) -> NDArray[np.intp]:

@@ -39,10 +39,9 @@ from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.checkpoint import (
     MarginalState,
     RunState,
-    counted_apart,
-    finite_measurements,
     require_finite,
     require_known_variables,
+    without_infinite,
 )
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import LEAST_VARIANCE, added_to, sigma_ratio, variance_shares
@@ -127,7 +126,7 @@ class IncrementalSolver:
     """One pass of a smoother through the steps.
 
     Attributes:
-        problem: the graph.
+        problem: the graph, or a later one of the same recording, grown: the steps added are among its own.
         config: of the solver.
         state: what it knows.
         initialising: whether the run is in its initialisation phase.
@@ -153,12 +152,10 @@ class IncrementalSolver:
         self._beyond = np.ones(len(problem.quantities), dtype=bool)  # numbers that need more than second order
 
     @classmethod
-    def resumed(
-        cls, problem: Problem, saved: RunState, config: IncrementalConfig = IncrementalConfig()
-    ) -> IncrementalSolver:
+    def resumed(cls, problem: Problem, saved: RunState) -> IncrementalSolver:
         """A run that continues from a saved one."""
         assert saved.marginal is not None
-        solver = cls(problem, saved.window, config)
+        solver = cls(problem, saved.window)
         solver.state, solver.initialising = saved, False
         solver._before = 1.0 + max(saved.marginal.stamps.values(), default=-1.0)
         solver._continue_from(saved.marginal)
@@ -168,10 +165,6 @@ class IncrementalSolver:
     def can_checkpoint(self) -> bool:
         """Whether the run is at a point where it can be saved."""
         return self.state.marginal is not None and not self.steps_since
-
-    def update_problem(self, problem: Problem) -> None:
-        """Continue with the graph of the same recording, grown: the steps added are among its own."""
-        self.problem = problem
 
     @property
     def time(self) -> float:
@@ -506,10 +499,9 @@ class IncrementalSolver:
             InputError: another factor gives none, or a measurement before the first solution.
         """
         if self.started:
-            kept = [finite_measurements(step, values) for step in steps]
+            steps, unusable = without_infinite(steps, values)
             if self.state.marginal is None:
-                self.state.gate.unusable = counted_apart(steps, kept)
-            steps = kept
+                self.state.gate.unusable = unusable
         for step in steps:
             require_finite(step.factors, values, step.time)
         return list(steps)

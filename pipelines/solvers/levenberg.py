@@ -193,7 +193,7 @@ def _reached(
 
 def without_rejected(engine: Linearization, values: Values) -> Linearization:
     """The measurements that count at some values, in full, whatever they are elsewhere."""
-    groups = [g if g.loss is None else g.counting(g.used(g.evaluate(values)[0]) > 0.5) for g in engine.groups]
+    groups = [g if g.loss is None else g.counting(g.inliers(values)) for g in engine.groups]
     return engine.with_groups(groups)
 
 

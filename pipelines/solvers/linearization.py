@@ -148,6 +148,12 @@ class Group:
             return self._included(np.ones(len(residuals)))
         return self._included(self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)]))))
 
+    def inliers(self, values: Values) -> NDArray[np.bool_]:
+        """Mask (n,) of the measurements that count at some values: neither rejected by the loss nor excluded."""
+        if self.loss is None:
+            return np.ones(len(self.model.time), dtype=bool) if self.excluded is None else ~self.excluded
+        return np.asarray(self.used(self.evaluate(values)[0]) > 0.5)
+
     def _included(self, each: Array) -> Array:
         """Numbers (n,), zero for what is excluded."""
         return each if self.excluded is None else np.where(self.excluded, 0.0, each)
@@ -255,6 +261,15 @@ class Linearization:
     def residuals(self, values: Values) -> list[Array]:
         """Weighted whitened residuals (n, m) of each group, outliers included."""
         return [group.weighted(group.evaluate(values)[0]) for group in self.groups]
+
+    @property
+    def measured(self) -> dict[str, list[Group]]:
+        """Family -> its groups of measurements."""
+        found: dict[str, list[Group]] = {}
+        for group in self.groups:
+            if group.is_measurement:
+                found.setdefault(group.family, []).append(group)
+        return found
 
     def with_groups(self, groups: Sequence[Group]) -> Linearization:
         """The linearisation with other measurements at the same variables."""

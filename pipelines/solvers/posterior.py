@@ -217,13 +217,6 @@ class Leverage:
     squares: Array
 
 
-def counted(group: Group, values: Values) -> NDArray[np.bool_]:
-    """Mask (n,) of a group's measurements that count: neither rejected by its loss nor excluded."""
-    if group.loss is None and group.excluded is None:
-        return np.ones(len(group.model.time), dtype=bool)
-    return np.asarray(group.used(group.evaluate(values)[0]) > 0.0)
-
-
 def leverages(engine: Linearization, system: System, factorization: Factorization, values: Values) -> list[Leverage]:
     """Leverages of all measurements, processes and priors.
 
@@ -245,7 +238,7 @@ def leverages(engine: Linearization, system: System, factorization: Factorizatio
             h = np.square(moves).mean(axis=2)
             if group.target == "shared":
                 h = _of_shared(engine.layout, factorization, group, values)
-            found.append(Leverage(group, counted(group, values), h, np.square(right)))
+            found.append(Leverage(group, group.inliers(values), h, np.square(right)))
         return _summing_to(found, _unknowns(engine.layout))
     variances, begin, found = _Variances.of(system, factorization), 0, []
     for group in engine.groups:
@@ -261,7 +254,7 @@ def leverages(engine: Linearization, system: System, factorization: Factorizatio
             state = group.target == "state"
             h = (variances.measured if state else variances.between)[at]
             right = (system.measured if state else system.between)[(*at, -1)]
-        found.append(Leverage(group, counted(group, values), h, np.square(right)))
+        found.append(Leverage(group, group.inliers(values), h, np.square(right)))
     return found
 
 

@@ -1,8 +1,7 @@
 """Posterior of the reported numbers at moments of the recording, and a walking bias over time.
 
 The last few dozen states of the chain are eliminated in time order; `ChainFactorization.prefix_roots` has the
-square-root information of (node, shared unknowns) after each of them, all linearised at the final estimate. Where a
-walking bias has few pieces these are few (one a piece): short recordings are then eliminated anew until each moment.
+square-root information of (node, shared unknowns) after each of them, all linearised at the final estimate.
 """
 
 from __future__ import annotations
@@ -13,14 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.pipelines.estimation.problem import History, PosteriorHistory, Problem
-from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, IndeterminateStateError, Index
+from alidade.pipelines.solvers.chain import Array, ChainFactorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.posterior import Reported
 from alidade.pipelines.solvers.weak_directions import Posterior, WeakDirections, constrained_step
-
-# Moments of the history, and how many keyframes may be eliminated once more for them (2 s at 20 us each).
-MOMENTS, ELIMINATED = 48, 100_000
 
 
 def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHistory | None:
@@ -29,9 +25,9 @@ def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHist
     The last moment has the posterior's own. None where there is but one, or no chain.
     """
     at, problem, layout = posterior.at, compiled.problem, compiled.layout
-    if not (isinstance(at.system, ChainSystem) and isinstance(at.factorization, ChainFactorization)):
+    if not isinstance(at.factorization, ChainFactorization):
         return None
-    keyframes, roots = prefix_roots(at.system, at.factorization)
+    keyframes, roots = at.factorization.prefix_roots()
     if len(keyframes) < 2:
         return None
     keys = compiled.keys
@@ -44,43 +40,6 @@ def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHist
     moving = layout.node[layout.at(keys)] >= 0
     steady = ~np.repeat(moving, [len(p.quantities) for p in problem.parameters])
     return PosteriorHistory(at.engine.time[keyframes], numbers, covariances, steady)
-
-
-def prefix_roots(system: ChainSystem, factorization: ChainFactorization) -> tuple[Index, list[Array]]:
-    """Keyframes (M,), and R of (node, shared unknowns, right side) given all until each.
-
-    The coarse chain of few pieces of a walking bias has few states; of short recordings prefixes are eliminated anew.
-    """
-    keyframes, roots = factorization.prefix_roots()
-    n = len(system.measured)
-    count = min(MOMENTS, ELIMINATED // (n // 2 + 1))
-    if count <= len(keyframes) or n < 2:
-        return keyframes, roots
-    wanted = np.unique(np.linspace(0, n - 1, count + 1).astype(np.intp)[1:])
-    found, known = [], []
-    for keyframe in wanted.tolist():
-        try:
-            known.append(ChainFactorization.of(_until(system, keyframe)).root)
-        except IndeterminateStateError:
-            continue
-        found.append(keyframe)
-    return np.array(found, dtype=np.intp), known
-
-
-def _until(system: ChainSystem, keyframe: int) -> ChainSystem:
-    """The system of the recording until a keyframe."""
-    end = keyframe + 1
-    piece, walk = system.piece, system.walk
-    if piece is not None and walk is not None:
-        piece, walk = piece[:end], walk[: piece[keyframe] + 1]
-    return replace(
-        system,
-        measured=system.measured[:end],
-        between=system.between[:end],
-        beside=system.beside[:end],
-        piece=piece,
-        walk=walk,
-    )
 
 
 def _known(

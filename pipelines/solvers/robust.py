@@ -197,7 +197,7 @@ def _mostly_rejected(engine: Linearization, values: Values, chance: float) -> se
     counts: dict[str, list[int]] = {}
     for group in engine.groups:
         if group.loss is not None:
-            used = group.used(group.evaluate(values)[0]) > 0.0
+            used = group.inliers(values)
             each = counts.setdefault(group.family, [0, 0])
             each[0] += int((~used).sum())
             each[1] += len(used)

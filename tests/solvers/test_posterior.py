@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from alidade.pipelines.estimation.problem import Array, Factor, Problem
-from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, Factorization
+from alidade.pipelines.solvers.chain import ChainFactorization, Factorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
     Influence,
@@ -34,7 +34,7 @@ from alidade.pipelines.solvers.posterior import (
     moved_to,
     sqrt_information,
 )
-from alidade.pipelines.solvers.posterior_history import posterior_history, prefix_roots, smoothed
+from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
 from alidade.pipelines.solvers.weak_directions import Posterior, WeakDirections
 from tests.support.problems import SCENARIOS, problem
 
@@ -274,15 +274,14 @@ def test_square_root_information_elsewhere_is_linear_there() -> None:
 @pytest.mark.parametrize("name", ["los", "head with a bias that walks"])
 def test_history_ends_with_the_estimate(name: str) -> None:
     case = dense(name)
-    reported, system = case.reported, case.point.system
+    reported = case.reported
     R = reported.root(case.factorization.root).R
     directions = WeakDirections.of(R, reported.prior, reported.calibrated)
     course = posterior_history(case.compiled, Posterior(case.point, reported, directions, True))
     assert course is not None
     np.testing.assert_array_equal(course.covariance[-1], reported.covariance(directions.covariance()))
-    assert isinstance(system, ChainSystem)
     assert isinstance(case.factorization, ChainFactorization)
-    keyframes, roots = prefix_roots(system, case.factorization)
+    keyframes, roots = case.factorization.prefix_roots()
     assert keyframes[-1] == case.linearization.layout.sizes[0] - 1
     last = WeakDirections.of(reported.root(roots[-1]).R, reported.prior, reported.calibrated).covariance()
     np.testing.assert_allclose(last, directions.covariance(), rtol=1e-6, atol=1e-9)

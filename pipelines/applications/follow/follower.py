@@ -216,7 +216,7 @@ class Follower:
             if problem is not None and problem.steps_after is not None:
                 self._delay_ns = _min_delay_ns(late)
                 self._collect(late)
-                run.update_problem(problem)
+                run.problem = problem
                 return problem, problem.steps_after(run.time)
         return None
 
@@ -248,7 +248,7 @@ class Follower:
             self._say("what was recorded before now reads otherwise: beginning anew")
             self._run = IncrementalSolver(problem, self.settings.window)
             return problem.steps(1)
-        self._run.update_problem(problem)
+        self._run.problem = problem
         return problem.steps_after(self._run.time)
 
     def _collect(self, session: Session) -> None:
