@@ -374,11 +374,6 @@ class Problem:
             covariance[np.ix_(at, at)] = known.covariance
         return covariance
 
-    @property
-    def assumed(self) -> tuple[int, ...]:
-        """Keys of the variables that hold assumptions alone."""
-        return tuple(p.key for p in self.parameters if all(q.group is not None for q in p.quantities))
-
 
 @dataclass(frozen=True)
 class Residuals:

@@ -117,7 +117,7 @@ class Solved:
 def minimum(compiled: Compiled, levels: Sequence[Level]) -> Solution:
     """The solution with noise levels that are known, rejected measurements left out."""
     engine = apply_levels(compiled.engine, levels)
-    return solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig()).at_inliers
+    return solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig()).at_inliers()
 
 
 def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[Level, ...] | None = None) -> Solved:
@@ -151,7 +151,7 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
             if levels is None:
                 solution, start = estimate_noise(rest, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
-    return Solved(compiled, solution, start, constrained_solution(compiled, solution.at_inliers), second)
+    return Solved(compiled, solution, start, constrained_solution(compiled, solution.at_inliers()), second)
 
 
 def solve_batch(

@@ -108,7 +108,6 @@ class Solution(Point):
     message: str
     iterations: int
 
-    @property
     def at_inliers(self) -> Solution:
         """The same system, of an engine without what the loss rejects here. Raises IndeterminateStateError."""
         engine = without_rejected(self.engine, self.values)

@@ -39,7 +39,7 @@ def posterior(recorded: Problem, until: float) -> Posterior:
     compiled = Compiled.of(recorded, "chain", steps[: end + 1])
     solution = solve_robust(compiled.engine, compiled.initial, recorded.loss, RobustConfig())
     assert solution.converged, solution.message
-    return constrained_solution(compiled, solution.at_inliers)
+    return constrained_solution(compiled, solution.at_inliers())
 
 
 def errors(method: str, case: str, share: float, seeds: range) -> tuple[list[float], int, int]:
