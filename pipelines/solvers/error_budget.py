@@ -29,7 +29,7 @@ from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.posterior import Reported, responses
-from alidade.pipelines.solvers.weak_directions import Posterior
+from alidade.pipelines.solvers.weak_directions import Posterior, WeakDirections
 
 # Fewer measurements show no autocorrelation.
 MIN_MEASUREMENTS = 100
@@ -39,8 +39,6 @@ DIED_OUT, CORRELATED = 2.0, 4.0
 MAX_LAG = 0.25
 # Blocks of a recording by which variances are judged, each with as many measurements as there are numbers at least.
 _BLOCKS = 16
-# Variances in units of the priors' below which those of free numbers are rounding.
-LEAST_VARIANCE = 1e-24
 # Coefficients of a prior's row below this share of its largest are rounding.
 ROUNDING = 1e-9
 
@@ -251,39 +249,32 @@ def added_covariance(influence: Influence, correlations: Mapping[str, Array]) ->
 
 
 def variance_shares(posterior: Posterior) -> dict[str, Array]:
-    """Family of measurements -> its share (m, m) of the covariance C of the free numbers, in units of their priors.
+    """Family of measurements -> its share (m, m) of the covariance of the free numbers.
 
-    With L'L the part of C that white noise of a family causes, and symmetric roots of C, it is C^-1/2 L'L C^-1/2.
+    With C the covariance of the strong directions and L'L the part of it that white noise of a family causes, both in
+    units of the priors, and symmetric roots, it is C^-1/2 L'L C^-1/2.
     """
     influence, parts = Influence.of(posterior), dict[str, Array]()
-    inverse = _symmetric_root(posterior.directions.covariance(), -0.5) / posterior.reported.scale
+    inverse = posterior.directions.root(-1.0) / posterior.reported.scale
     for family, groups in posterior.at.engine.measured.items():
         rows = [influence.rows(group)[0].reshape(-1, len(inverse)) @ inverse.T for group in groups]
         parts[family] = sum((each.T @ each for each in rows), np.zeros(inverse.shape))
     return parts
 
 
-def added_to(covariance: Array, shares: Mapping[str, Array], lengths: Mapping[str, float]) -> Array:
-    """Covariance (m, m) that correlation of residuals adds to one of free numbers, in units of their priors.
+def added_by_shares(directions: WeakDirections, shares: Mapping[str, Array], lengths: Mapping[str, float]) -> Array:
+    """Covariance (m, m) that correlation of a filter's innovations adds to the free numbers, in units of the priors.
 
-    For a filter, whose measurements are gone: of them families have the shares of the covariance that they had once.
+    Its measurements are gone: families have the shares of the covariance that they once had.
 
     Args:
-        covariance: (m, m) that white noise leaves.
+        directions: of the covariance that white noise leaves.
         shares: see `variance_shares`; a family that has none may have caused all.
-        lengths: family -> how many of its residuals in a row count as one.
+        lengths: family -> how many of its innovations in a row count as one.
     """
-    root = _symmetric_root(covariance, 0.5)
-    return sum(
-        ((length - 1.0) * root @ shares.get(family, np.eye(len(root))) @ root for family, length in lengths.items()),
-        np.zeros(root.shape),
-    )
-
-
-def _symmetric_root(covariance: Array, power: float) -> Array:
-    """Power of a covariance (m, m)."""
-    variances, axes = np.linalg.eigh(covariance)
-    return np.asarray((axes * np.maximum(variances, LEAST_VARIANCE) ** power) @ axes.T)
+    root = directions.root(1.0)
+    each = [(length - 1.0) * shares.get(family, np.eye(len(root))) for family, length in lengths.items()]
+    return np.asarray(root @ sum(each, np.zeros(root.shape)) @ root)
 
 
 def _correlated(L: Array, correlation: Array) -> Array:

@@ -44,7 +44,7 @@ from alidade.pipelines.solvers.checkpoint import (
     without_infinite,
 )
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.error_budget import LEAST_VARIANCE, added_to, sigma_ratio, variance_shares
+from alidade.pipelines.solvers.error_budget import added_by_shares, sigma_ratio, variance_shares
 from alidade.pipelines.solvers.gating import Prediction, RowBuffer
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem, undetermined
 from alidade.pipelines.solvers.posterior import WIDEST, Reported
@@ -68,6 +68,8 @@ from alidade.pipelines.solvers.weak_directions import (
 from alidade.pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
+# Variance, in units of the priors', below which that of a smoother is rounding.
+_LEAST_VARIANCE = 1e-24
 # Steps freed with each new one, of those marginalised out: a thousand at once take longer than an update.
 _FREED = 10
 
@@ -274,11 +276,13 @@ class IncrementalSolver:
 
     def _filtered(self) -> Estimate:
         """The estimate of the smoother."""
-        values, covariance = self._constrained()
+        reported, directions = self._smoothed()
+        values, covariance = reported.numbers, reported.covariance(directions.covariance())
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
         lengths = self.state.gate.correlation_lengths()
-        grown = self._grown(covariance, lengths)
+        added = added_by_shares(directions, self.state.shares, lengths)
+        grown = reported.covariance(directions.covariance() + added)
         inflation = sigma_ratio(np.diag(covariance), np.diag(grown))
         attitudes = self.state.attitudes.array.copy()
         return Estimate(
@@ -298,16 +302,6 @@ class IncrementalSolver:
             rejected=self.state.gate.rejected(),
             levels=self.state.levels,
         )
-
-    def _grown(self, covariance: Array, lengths: Mapping[str, float]) -> Array:
-        """Covariance (n, n) with what correlation of innovations adds to it."""
-        if not lengths:
-            return covariance
-        reported, grown = self._reported(), covariance.copy()
-        free, unit = reported.free, np.outer(reported.scale, reported.scale)
-        white = (covariance[np.ix_(free, free)] - np.diag(reported.extra[free] ** 2)) / unit
-        grown[np.ix_(free, free)] += added_to(white, self.state.shares, lengths) * unit
-        return grown
 
     def _batch(self) -> Solved:
         """The last batch solution of the initialisation phase."""
@@ -333,13 +327,18 @@ class IncrementalSolver:
         if self.initialising:
             posterior = self._posterior_of(self._batch())
             return posterior.reported.numbers, posterior.covariance
+        reported, directions = self._smoothed()
+        return reported.numbers, reported.covariance(directions.covariance())
+
+    def _smoothed(self) -> tuple[Reported, WeakDirections]:
+        """The numbers of the smoother, weak directions at their priors, and the directions of their covariance."""
         reported = self._reported()
         variances, axes = np.linalg.eigh(self._smoothed_covariance(reported))
-        R = axes.T / np.sqrt(np.clip(variances, LEAST_VARIANCE, WIDEST**2))[:, None]
+        R = axes.T / np.sqrt(np.clip(variances, _LEAST_VARIANCE, WIDEST**2))[:, None]
         directions = WeakDirections.of(R, reported.prior, reported.calibrated)
         values = reported.numbers.copy()
         values[reported.free] += reported.scale * constrained_step(directions, R, np.zeros(len(R)), reported.u)
-        return values, reported.covariance(directions.covariance())
+        return replace(reported, numbers=values), directions
 
     def _smoothed_covariance(self, reported: Reported) -> Array:
         """The smoother's covariance (m, m) of the free reported numbers, in units of their usual priors' sigmas."""

@@ -166,6 +166,10 @@ class WeakDirections:
         root = self.strong * self.sigmas
         return root @ root.T + self.weak @ self.prior_covariance @ self.weak.T
 
+    def root(self, power: float) -> Array:
+        """Covariance (m, m) of the strong directions to the half of a power."""
+        return np.asarray((self.strong * self.sigmas**power) @ self.strong.T)
+
     def again(self, R: Array) -> WeakDirections:
         """The same weak directions with the strong ones of another square-root information (m, m)."""
         return WeakDirections.given(R, self.weak, self.precision, self.calibrated)

@@ -15,8 +15,8 @@ from alidade.pipelines.solvers.chain import ChainFactorization, Factorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
     Influence,
+    added_by_shares,
     added_covariance,
-    added_to,
     autocorrelation,
     error_budget,
     most_influential,
@@ -376,13 +376,14 @@ def test_added_variance_is_that_of_drawn_noise() -> None:
 def test_correlation_adds_to_what_its_family_causes(name: str) -> None:
     """Of a filter by the shares that families have of the covariance; its noises and its priors cause all of it."""
     posterior, influence = dense(name).posterior, Influence.of(dense(name).posterior)
-    shares, covariance = variance_shares(posterior), posterior.directions.covariance()
-    rest = np.eye(len(covariance)) - sum(shares.values(), np.zeros(covariance.shape))
+    shares, directions = variance_shares(posterior), posterior.directions
+    rest = np.eye(len(directions.sigmas)) - sum(shares.values(), np.zeros(2 * directions.sigmas.shape))
     assert np.linalg.eigvalsh(rest).min() > -1e-6
     unit, correlated = np.outer(posterior.reported.scale, posterior.reported.scale), sorted(shares)[0]
     L = np.concatenate([influence.rows(g)[0] for g in posterior.at.engine.groups if g.family == correlated])
     caused = np.einsum("nri,nrj->ij", L, L) / unit
     for factor in (1.0, 0.25):  # at the time of the shares, and later
-        more = added_to(factor * covariance, shares, {correlated: 9.0})
+        later = replace(directions, sigmas=factor**0.5 * directions.sigmas)
+        more = added_by_shares(later, shares, {correlated: 9.0})
         np.testing.assert_allclose(more, 8.0 * factor * caused, atol=1e-6 * np.abs(caused).max())
-    assert not added_to(covariance, shares, {}).any()
+    assert not added_by_shares(directions, shares, {}).any()
