@@ -23,7 +23,6 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
     SLOW_ERROR,
     Array,
-    Attitudes,
     EngineName,
     Estimate,
     Minimum,
@@ -59,6 +58,9 @@ from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_t
 from alidade.pipelines.solvers.step_test import largest_steps
 from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
+# Number of the most influential measurements that are reported.
+INFLUENTIAL = 20
+
 
 @dataclass(frozen=True)
 class BatchConfig:
@@ -70,14 +72,12 @@ class BatchConfig:
             freedom.
         followed: chi-square above the least up to which values are followed to their minimum, which takes off far less.
         different: part of its prior scale by which a number of another solution differs.
-        influential: number of the most influential measurements that are reported.
     """
 
     robust: RobustConfig = field(default_factory=RobustConfig)
     close: float = 6.635
     followed: float = 3.0 * 6.635
     different: float = 0.1
-    influential: int = 20
 
     @classmethod
     def of(cls, max_iterations: int) -> BatchConfig:
@@ -181,10 +181,9 @@ def solve_batch(
     begin = time.perf_counter()
     compiled = Compiled.of(problem, engine)
     built = time.perf_counter()
-    config = BatchConfig.of(max_iterations)
-    solved = solve(compiled, config)
+    solved = solve(compiled, BatchConfig.of(max_iterations))
     found = time.perf_counter()
-    estimate = whole_estimate(solved, config, budget, changed)
+    estimate = whole_estimate(solved, budget, changed)
     if device:
         estimate = replace(estimate, sqrt_info=_information_of(solved, device, elsewhere))
     done = time.perf_counter()
@@ -215,9 +214,7 @@ def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[
     return best, None
 
 
-def whole_estimate(
-    solved: Solved, config: BatchConfig, budget: bool = False, changed: Iterable[tuple[str, Problem]] = ()
-) -> Estimate:
+def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple[str, Problem]] = ()) -> Estimate:
     """Everything that is reported of a solution; see `solve_batch`."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, posterior.at
@@ -257,7 +254,7 @@ def whole_estimate(
         history=None if history is None else history.history.inflated(wide),
         posterior_history=history,
         smoothed=smoothed(compiled, posterior, covariance),
-        attitudes=_attitudes(solved) if problem.attitudes else None,
+        attitudes=problem.attitudes and problem.attitudes(compiled.keyframes, compiled.layout.to_gtsam(values)),
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=solved.levels,
         second=solved.second,
@@ -269,15 +266,8 @@ def whole_estimate(
         out,
         budget=error_budget(influence, added, covariance),
         moved={name: moves for name, other in changed if (moves := _moves(solved, influence, other))},
-        strongest=most_influential(influence, sigmas, config.influential),
+        strongest=most_influential(influence, sigmas, INFLUENTIAL),
     )
-
-
-def _attitudes(solved: Solved) -> Attitudes | None:
-    """The trajectory."""
-    compiled = solved.compiled
-    attitudes = compiled.problem.attitudes
-    return None if attitudes is None else attitudes(compiled.keyframes, compiled.layout.to_gtsam(solved.values))
 
 
 def residuals_by_family(engine: Linearization, values: Values) -> dict[str, Residuals]:

@@ -34,7 +34,7 @@ from alidade.pipelines.estimation.problem import (
     Problem,
     Step,
 )
-from alidade.pipelines.solvers.batch import BatchConfig, Solved, residuals_by_family, solve, whole_estimate
+from alidade.pipelines.solvers.batch import Solved, residuals_by_family, solve, whole_estimate
 from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.checkpoint import (
     MarginalState,
@@ -259,7 +259,7 @@ class IncrementalSolver:
 
     def _estimate_of(self, solved: Solved) -> Estimate:
         """Everything that is reported of a batch solution, with what was known over time."""
-        estimate = whole_estimate(solved, BatchConfig())
+        estimate = whole_estimate(solved)
         return replace(
             estimate,
             solver="incremental",
