@@ -24,6 +24,7 @@ numpy.linalg.LinAlgError.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -35,6 +36,8 @@ Index = NDArray[np.intp]
 
 # Chains of at most so many states are eliminated in time order.
 SEQUENTIAL_STATES = 96
+# Of longer ones so many are looked at together: what it takes beside R does not grow with the recording.
+PART_STATES = 1 << 14
 # Rows of a block of a tall matrix, of which a cache holds some thousands of columns' worth.
 _ROWS = 256
 # A pivot below this share of its column's norm counts as zero: the state is not determined.
@@ -52,20 +55,88 @@ class IndeterminateStateError(IndeterminateError):
     """A state is determined neither by measurements nor by its neighbours."""
 
 
+class Chain(ABC):
+    """Whitened rows A x = b of a chain, b as their last column, of some consecutive states at a time.
+
+    Attributes:
+        d: numbers of a state.
+        shared: (r, s + 1) rows about the shared unknowns that come first: priors.
+        piece: (N,) index j, not decreasing, of the node in force from k - 1 to k and at k; every node is in force at
+            one state at least. None: no nodes.
+        walk: (J, w, 2 c + 1) rows [z_j | z_j-1 | right side]; of the first node zero in its predecessor's columns.
+    """
+
+    d: int
+    shared: Array
+    piece: Index | None
+    walk: Array | None
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of states."""
+
+    @abstractmethod
+    def part(self, begin: int, end: int) -> ChainSystem:
+        """Rows about states from `begin` until before `end`, and those that join these to the ones before.
+
+        Rows about shared unknowns or nodes alone are all there.
+        """
+
+    @property
+    def c(self) -> int:
+        """Numbers of a node; 0 without nodes."""
+        return 0 if self.walk is None else int(self.walk.shape[2]) // 2
+
+    @property
+    def border(self) -> int:
+        """Columns beside the states', right side included: c + s + 1."""
+        return self.c + int(self.shared.shape[1])
+
+    def eliminate(self, damping: float = 0.0) -> ChainFactorization:
+        """R of the system, damped as `damped` has it. Raises IndeterminateStateError."""
+        return ChainFactorization.of(self.damped(damping) if damping > 0.0 else self)
+
+    def damped(self, damping: float) -> Chain:
+        """The system with so many times the information of every unknown by itself added, at zero (Marquardt)."""
+        d, c, root = self.d, self.c, np.sqrt(damping)
+        states, shared = np.zeros((len(self), d)), np.square(self.shared[:, :-1]).sum(axis=0)
+        for begin in range(0, len(self), PART_STATES):
+            own = self.part(begin, min(begin + PART_STATES, len(self)))
+            states[begin : begin + len(own)] += np.square(own.measured[..., :d]).sum(axis=1)
+            states[begin : begin + len(own)] += np.square(own.between[..., :d]).sum(axis=1)
+            before = np.square(own.between[..., d : 2 * d]).sum(axis=1)[begin == 0 :]
+            states[max(begin - 1, 0) :][: len(before)] += before
+            for rows in (own.measured, own.between, own.beside):
+                shared = shared + np.square(rows[..., rows.shape[2] - len(shared) - 1 : -1]).sum(axis=(0, 1))
+        prior = np.vstack([self.shared, np.pad(np.diag(root * np.sqrt(shared)), ((0, 0), (0, 1)))])
+        walk = self.walk
+        if walk is not None:
+            nodes = np.square(walk[..., :c]).sum(axis=1)
+            nodes[:-1] += np.square(walk[1:, :, c : 2 * c]).sum(axis=1)
+            walk = np.concatenate([walk, np.zeros((len(nodes), c, 2 * c + 1))], axis=1)
+            walk[:, np.arange(-c, 0), np.arange(c)] = root * np.sqrt(nodes)
+        return _Damped(self, root * np.sqrt(states), prior, walk)
+
+    def segments(self) -> Index:
+        """Last states of the segments, (B,); no segment spans two pieces."""
+        n = len(self)
+        together = min(n, PART_STATES)
+        index, length = np.arange(n), max(2, int(together / max((2.0 * together) ** 0.5, SEQUENTIAL_STATES / 2.0)))
+        if self.piece is None:
+            return np.flatnonzero((n - 1 - index) % length == 0)
+        last = np.flatnonzero(np.diff(self.piece, append=self.piece[-1] + 1) > 0)
+        return np.flatnonzero((last[np.searchsorted(last, index)] - index) % length == 0)
+
+
 @dataclass(frozen=True, eq=False)
-class ChainSystem:
-    """Whitened rows A x = b of a chain, b as their last column.
+class ChainSystem(Chain):
+    """Rows of a chain that are all at hand.
 
     Attributes:
         measured: (N, m, d + c + s + 1) rows about state k; rows that a state has no need of are zero.
         between: (N, b, 2 d + c + s + 1) rows that join state k to k - 1: zero across a break, and of the first state
             zero in the columns of its predecessor.
         beside: (N, q, c + s + 1) rows without a state that come after k - 1 and before k, or with it.
-        shared: (r, s + 1) rows about the shared unknowns that come first: priors.
-        d: numbers of a state.
-        piece: (N,) index j, not decreasing, of the node in force from k - 1 to k and at k; every node is in force at
-            one state at least. None: no nodes.
-        walk: (J, w, 2 c + 1) rows [z_j | z_j-1 | right side]; of the first node zero in its predecessor's columns.
     """
 
     measured: Array
@@ -76,53 +147,20 @@ class ChainSystem:
     piece: Index | None = None
     walk: Array | None = None
 
-    @property
-    def c(self) -> int:
-        """Numbers of a node; 0 without nodes."""
-        return 0 if self.walk is None else int(self.walk.shape[2]) // 2
+    def __len__(self) -> int:
+        return len(self.measured)
 
-    @property
-    def border(self) -> int:
-        """Columns beside the states', right side included: c + s + 1."""
-        return int(self.measured.shape[2]) - self.d
+    def part(self, begin: int, end: int) -> ChainSystem:
+        """See Chain."""
+        piece, some = None if self.piece is None else self.piece[begin:end], slice(begin, end)
+        measured, between, beside = self.measured[some], self.between[some], self.beside[some]
+        return replace(self, measured=measured, between=between, beside=beside, piece=piece)
 
     @property
     def squares(self) -> float:
         """Sum of squares of the right side: what no step at all leaves."""
         parts = [self.measured, self.between, self.beside, self.shared, *([] if self.walk is None else [self.walk])]
         return sum(float(np.square(rows[..., -1]).sum()) for rows in parts)
-
-    def eliminate(self, damping: float = 0.0) -> ChainFactorization:
-        """R of the system, damped as `damped` has it. Raises IndeterminateStateError."""
-        return ChainFactorization.of(self.damped(damping) if damping > 0.0 else self)
-
-    def damped(self, damping: float) -> ChainSystem:
-        """The system with so many times the information of every unknown by itself added, at zero (Marquardt)."""
-        d, c, root = self.d, self.c, np.sqrt(damping)
-        states = np.square(self.measured[..., :d]).sum(axis=1) + np.square(self.between[..., :d]).sum(axis=1)
-        states[:-1] += np.square(self.between[1:, :, d : 2 * d]).sum(axis=1)
-        shared = np.square(self.shared[:, :-1]).sum(axis=0)
-        for rows in (self.measured, self.between, self.beside):
-            shared = shared + np.square(rows[..., rows.shape[2] - len(shared) - 1 : -1]).sum(axis=(0, 1))
-        measured = np.concatenate([self.measured, np.zeros((len(states), d, self.measured.shape[2]))], axis=1)
-        measured[:, np.arange(-d, 0), np.arange(d)] = root * np.sqrt(states)
-        prior = np.vstack([self.shared, np.pad(np.diag(root * np.sqrt(shared)), ((0, 0), (0, 1)))])
-        walk = self.walk
-        if walk is not None:
-            nodes = np.square(walk[..., :c]).sum(axis=1)
-            nodes[:-1] += np.square(walk[1:, :, c : 2 * c]).sum(axis=1)
-            walk = np.concatenate([walk, np.zeros((len(nodes), c, 2 * c + 1))], axis=1)
-            walk[:, np.arange(-c, 0), np.arange(c)] = root * np.sqrt(nodes)
-        return replace(self, measured=measured, shared=prior, walk=walk)
-
-    def segments(self) -> Index:
-        """Last states of the segments, (B,); no segment spans two pieces."""
-        n = len(self.measured)
-        index, length = np.arange(n), max(2, int(n / max((2.0 * n) ** 0.5, SEQUENTIAL_STATES / 2.0)))
-        if self.piece is None:
-            return np.flatnonzero((n - 1 - index) % length == 0)
-        last = np.flatnonzero(np.diff(self.piece, append=self.piece[-1] + 1) > 0)
-        return np.flatnonzero((last[np.searchsorted(last, index)] - index) % length == 0)
 
     def with_nodes_as_states(self) -> ChainSystem:
         """The system with every piece as one state: states (x_j, z_j) and no nodes."""
@@ -134,6 +172,36 @@ class ChainSystem:
         out[:, b : b + len(beside[0, :c])][..., np.r_[z, rest]] = beside[:, :c]
         out[:, b + c :][..., np.r_[z, z + d + c, rest[-1]]] = self.walk
         return ChainSystem(self.measured, out, beside[:, c:, c:], self.shared, d + c)
+
+
+@dataclass(frozen=True, eq=False)
+class _Damped(Chain):
+    """A chain with rows about every number by itself; `diagonal` (N, d) are those of the states."""
+
+    chain: Chain
+    diagonal: Array
+    shared: Array
+    walk: Array | None
+
+    @property
+    def d(self) -> int:  # type: ignore[override]
+        """Numbers of a state."""
+        return self.chain.d
+
+    @property
+    def piece(self) -> Index | None:  # type: ignore[override]
+        """Node in force at each state."""
+        return self.chain.piece
+
+    def __len__(self) -> int:
+        return len(self.chain)
+
+    def part(self, begin: int, end: int) -> ChainSystem:
+        """See Chain."""
+        own, d = self.chain.part(begin, end), self.d
+        measured = np.concatenate([own.measured, np.zeros((len(own), d, own.measured.shape[2]))], axis=1)
+        measured[:, np.arange(-d, 0), np.arange(d)] = self.diagonal[begin:end]
+        return replace(own, measured=measured, shared=self.shared, walk=self.walk)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,32 +222,45 @@ class _Level:
     piece: Index | None
 
     @classmethod
-    def eliminate(cls, chain: ChainSystem) -> tuple[_Level, ChainSystem, Index]:
+    def eliminate(cls, chain: Chain) -> tuple[_Level, ChainSystem, Index]:
         """The level, the chain of the segments' last states that it leaves, and which these are."""
-        lasts, d, w, b = chain.segments(), chain.d, chain.border, chain.between.shape[1]
-        lengths = np.diff(lasts, prepend=-1)
-        order = np.argsort(-lengths, kind="stable")
-        ends, active = lasts[order], np.array([np.count_nonzero(lengths > k) for k in range(lengths.max() + 1)])
-        rows = np.zeros((len(chain.measured), d, 3 * d + w))
-        R, kept = _swapped(chain.between[ends], d), max(d, b)  # columns: state before, last state, border
-        carried, piles = np.pad(R, ((0, 0), (0, kept - b), (0, 0))), [chain.beside[ends]]
-        for k in range(1, len(active) - 1):
-            state, ended = ends[: active[k]] - k, slice(active[k + 1], active[k])
-            rows[state], R, rest = _step(R[: active[k]], chain.measured[state], chain.between[state], d, d)
-            carried[ended, :d], carried[ended, d:] = R[ended], 0.0
-            piles += [rest, chain.beside[state]]
-        left, in_time = _reduced(piles, d + w), np.argsort(order)
-        own = np.concatenate([left[:, :d, :d], np.zeros((len(ends), d, d)), left[:, :d, d:]], axis=2)
-        between = np.concatenate([_swapped(carried, d), own], axis=1)[in_time]
-        piece, beside = None if chain.piece is None else chain.piece[lasts], left[in_time, d:, d:]
-        coarse = ChainSystem(chain.measured[lasts], between, beside, chain.shared, d, piece, chain.walk)
-        return cls(ends, order, active, rows, None if piece is None else piece[order]), coarse, lasts
+        lasts, d = chain.segments(), chain.d
+        rows, begin, left = np.zeros((len(chain), d, 3 * d + chain.border)), 0, list[tuple[Array, Array, Array]]()
+        for some in _together(lasts):
+            end = int(lasts[some][-1]) + 1
+            left.append(_inner(chain.part(begin, end), lasts[some] - begin, rows[begin:end]))
+            begin = end
+        measured, between, beside = (np.concatenate(each) for each in zip(*left, strict=True))
+        piece = None if chain.piece is None else chain.piece[lasts]
+        coarse = ChainSystem(measured, between, beside, chain.shared, d, piece, chain.walk)
+        return cls.of(lasts, rows, piece), coarse, lasts
 
-    def back(self, last: Array, border: Array, generator: np.random.Generator | None) -> Array:
-        """States (N, d, n) given the segments' last ones (B, d, n) and the border (B or 1, c + s + 1, n)."""
+    @classmethod
+    def of(cls, lasts: Index, rows: Array, piece: Index | None) -> _Level:
+        """The level of segments with these last states (B,), rows R of their inner states and pieces (B,)."""
+        order, active = _longest_first(lasts)
+        return cls(lasts[order], order, active, rows, None if piece is None else piece[order])
+
+    def parts(self) -> Iterator[tuple[slice, slice, _Level]]:
+        """Some consecutive segments each time: which of the states and of the segments they are, and their level."""
+        in_time, begin = np.argsort(self.order), 0
+        lasts = self.ends[in_time]
+        for some in _together(lasts):
+            end = int(lasts[some][-1]) + 1
+            piece = None if self.piece is None else self.piece[in_time][some]
+            yield slice(begin, end), some, _Level.of(lasts[some] - begin, self.rows[begin:end], piece)
+            begin = end
+
+    def back(
+        self, last: Array, border: Array, generator: np.random.Generator | None = None, before: Array | float = 0.0
+    ) -> Array:
+        """States (N, d, n) given the segments' last ones (B, d, n) and the border (B or 1, c + s + 1, n).
+
+        `before` (d, n) is the state before the first, where there is one.
+        """
         (N, d, _), last = self.rows.shape, last[self.order]
-        x = np.zeros((N + 1, d, last.shape[2]))  # one more than there are stands before the first
-        x[self.ends] = last
+        x = np.zeros((N + 1, d, last.shape[2]))  # the last of them stands before the first
+        x[self.ends], x[-1] = last, before
         for k in range(len(self.active) - 2, 0, -1):
             some, state = slice(self.active[k]), self.ends[: self.active[k]] - k
             R = self.rows[state]
@@ -262,36 +343,66 @@ class ChainFactorization(Factorization):
     _ends: _TimeOrder
 
     @classmethod
-    def of(cls, chain: ChainSystem) -> ChainFactorization:
+    def of(cls, chain: Chain) -> ChainFactorization:
         """Eliminate all but the shared unknowns and the last node. Raises IndeterminateStateError."""
-        own, tail, levels, keyframes = chain.d, chain.c, list[_Level | None](), np.arange(len(chain.measured))
-        while len(chain.measured) > SEQUENTIAL_STATES or (own == 0 and chain.walk is not None):
-            if chain.walk is not None and len(chain.measured) == len(chain.walk):
-                chain = chain.with_nodes_as_states()
+        own, tail, levels, keyframes = chain.d, chain.c, list[_Level | None](), np.arange(len(chain))
+        while len(chain) > SEQUENTIAL_STATES or (own == 0 and chain.walk is not None):
+            if chain.walk is not None and len(chain) == len(chain.walk):
+                chain = chain.part(0, len(chain)).with_nodes_as_states()
                 levels.append(None)
             else:
                 level, chain, lasts = _Level.eliminate(chain)
                 levels.append(level)
                 keyframes = keyframes[lasts]
-        ends, root = _TimeOrder.eliminate(chain, keyframes, own)
+        ends, root = _TimeOrder.eliminate(chain.part(0, len(chain)), keyframes, own)
         return cls(own, tail, root, levels, ends)
 
-    def given_shared(self) -> tuple[Array, Array]:
-        """Covariances where the shared unknowns are known, those that rows need.
+    def nodes(self, last: Array) -> tuple[Array, Array]:
+        """What rows about nodes alone predict.
 
-        Returns (N, 2 d + c, 2 d + c) of (x_k, x_k-1, z_j) and (J, 2 c, 2 c) of (z_j, z_j-1), zero for what is before
-        the first. Of all unknowns `propagate(shared_roots)` adds its square.
+        Returns covariances (J, 2 c, 2 c) of (z_j, z_j-1) where the shared unknowns are known, zero for what is before
+        the first, and how these move (J, 2 c, q) with the last node and the shared unknowns (c + s, q).
         """
+        covariances, z = self._coarse(last)[1::2]
+        return covariances, np.concatenate([z, np.concatenate([np.zeros_like(z[:1]), z[:-1]])], axis=1)
+
+    def parts(self, last: Array, piece: Index | None) -> Iterator[tuple[slice, Array, Array]]:
+        """What the rows about some consecutive states at a time predict.
+
+        Args:
+            last: (c + s, q) moves of the last node and the shared unknowns.
+            piece: (N,) node in force at each state.
+
+        Yields which n states, the covariances (n, 2 d + c, 2 d + c) of (x_k, x_k-1, z_j) where the shared unknowns are
+        known, zero for what is before the first, and how these move (n, 2 d + c, q) with the last node and the shared
+        unknowns. What is known of all unknowns adds the squares of moves with `shared_roots`.
+        """
+        pairs, _, x, z = self._coarse(last)
+        before, shared = np.zeros_like(x[:1]), np.pad(last[self.c :], ((0, 1), (0, 0)))
+        finest = self._levels[0] if self._levels else None
+        whole = [(slice(len(x)), slice(len(x)), None)] if finest is None else finest.parts()
+        for states, some, level in whole:
+            own, covariances = x[some], pairs[some]
+            if level is not None:
+                border = shared[None] if level.piece is None else _with_nodes(z[level.piece], shared)
+                own, covariances = level.back(own, border, None, before[0]), level.covariances(covariances)
+            node = np.zeros((len(own), 0, z.shape[2])) if piece is None else z[piece[states]]
+            yield states, covariances, np.concatenate([own, np.concatenate([before, own[:-1]]), node], axis=1)
+            before = own[-1:]
+
+    def _coarse(self, last: Array) -> tuple[Array, Array, Array, Array]:
+        """Of the chain that the finest segments leave: covariances of pairs and of nodes; moves of states and nodes."""
         d, c = self.d, self.c
+        levels = self._levels[int(bool(self._levels) and self._levels[0] is not None) :]
         pairs, nodes = self._ends.covariances(_inverse_gram(self.root[:c, :c]), c)
-        for level in reversed(self._levels):
+        for level in reversed(levels):
             if level is None:
                 x, z, before = np.arange(d), np.arange(d, d + c), d + c
                 nodes = _block(pairs, np.r_[z, z + before])
                 pairs = _block(pairs, np.r_[x, x + before, z])
             else:
                 pairs = level.covariances(pairs)
-        return pairs, nodes
+        return pairs, nodes, *self._states(levels, last, 0.0)
 
     @property
     def shared_roots(self) -> Array:
@@ -308,18 +419,27 @@ class ChainFactorization(Factorization):
         return ends.keyframes, roots
 
     def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
+        return self._states(self._levels, last, right, generator)
+
+    def _states(
+        self, levels: list[_Level | None], last: Array, right: float, generator: np.random.Generator | None = None
+    ) -> tuple[Array, Array]:
+        """States that some levels begin with, and nodes."""
         last = np.pad(last, ((0, 1), (0, 0)), constant_values=-right)
         x, nodes = self._ends.back(last, self.c, generator)
         shared = last[self.c :]
-        for level in reversed(self._levels):
+        for level in reversed(levels):
             if level is None:
                 x, nodes = x[:, : self.d], x[:, self.d :]
-            elif level.piece is None:
-                x = level.back(x, shared[None], generator)
             else:
-                of = nodes[level.piece]
-                x = level.back(x, np.concatenate([of, np.repeat(shared[None], len(of), axis=0)], axis=1), generator)
+                border = shared[None] if level.piece is None else _with_nodes(nodes[level.piece], shared)
+                x = level.back(x, border, generator)
         return x, nodes
+
+
+def _with_nodes(nodes: Array, shared: Array) -> Array:
+    """Border (B, c + s + 1, n) of segments from the nodes (B, c, n) in force there and the shared unknowns."""
+    return np.concatenate([nodes, np.repeat(shared[None], len(nodes), axis=0)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -460,6 +580,40 @@ def _about_node(walk: Array, columns: int) -> Array:
     out = np.zeros((len(walk), columns))
     out[:, :c], out[:, -1] = walk[:, :c], walk[:, -1]
     return out
+
+
+def _longest_first(lasts: Index) -> tuple[Index, Index]:
+    """Segments with these last states (B,), the longest first, and the number (L + 1,) of those longer than k."""
+    lengths = np.diff(lasts, prepend=-1)
+    active = np.array([np.count_nonzero(lengths > k) for k in range(lengths.max() + 1)])
+    return np.argsort(-lengths, kind="stable"), active
+
+
+def _together(lasts: Index) -> list[slice]:
+    """Consecutive segments with these last states that are looked at together: of `PART_STATES` or one."""
+    cuts = np.flatnonzero(np.diff(lasts // PART_STATES)) + 1
+    return [slice(int(a), int(b)) for a, b in zip([0, *cuts], [*cuts, len(lasts)], strict=True)]
+
+
+def _inner(chain: ChainSystem, lasts: Index, rows: Array) -> tuple[Array, Array, Array]:
+    """Eliminate all but the last states (B,) of some segments; `rows` (N, d, 3 d + border) get R of the inner ones.
+
+    Returns the rows of the last states' chain: about each, joining it to the one before, and without a state.
+    """
+    d, w, b = chain.d, chain.border, chain.between.shape[1]
+    order, active = _longest_first(lasts)
+    ends = lasts[order]
+    R, kept = _swapped(chain.between[ends], d), max(d, b)  # columns: state before, last state, border
+    carried, piles = np.pad(R, ((0, 0), (0, kept - b), (0, 0))), [chain.beside[ends]]
+    for k in range(1, len(active) - 1):
+        state, ended = ends[: active[k]] - k, slice(active[k + 1], active[k])
+        rows[state], R, rest = _step(R[: active[k]], chain.measured[state], chain.between[state], d, d)
+        carried[ended, :d], carried[ended, d:] = R[ended], 0.0
+        piles += [rest, chain.beside[state]]
+    left, in_time = _reduced(piles, d + w), np.argsort(order)
+    own = np.concatenate([left[:, :d, :d], np.zeros((len(ends), d, d)), left[:, :d, d:]], axis=2)
+    between = np.concatenate([_swapped(carried, d), own], axis=1)[in_time]
+    return chain.measured[lasts], between, left[in_time, d:, d:]
 
 
 def _swapped(rows: Array, d: int) -> Array:

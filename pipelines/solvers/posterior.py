@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import ChiSquare, Problem, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
-from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, Factorization
+from alidade.pipelines.solvers.chain import Array, Chain, ChainFactorization, Factorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization, System
@@ -39,8 +39,6 @@ MAX_TOLD = 1e6
 FREE_PRIOR = 10.0
 # Draws whose mean squares give leverages where the system is no chain: 13 % of each, 1 % of a hundred's sum.
 DRAWS = 120
-# Moves of states that are held at a time: 128 MiB.
-MOVED = 1 << 24
 # Singular values below this share of the largest, and to the power of 3/4 coefficients of a row, are rounding.
 UNSEEN = 1e-12
 
@@ -231,7 +229,7 @@ def leverages(engine: Linearization, system: System, factorization: Factorizatio
         factorization: of the system.
         values: the estimate.
     """
-    if not (isinstance(system, ChainSystem) and isinstance(factorization, ChainFactorization)):
+    if not (isinstance(system, Chain) and isinstance(factorization, ChainFactorization)):
         drawn, found = draws(factorization, DRAWS, np.random.default_rng(1)), []
         for group in engine.groups:
             moves, right = engine.products(group, values, drawn)
@@ -251,9 +249,7 @@ def leverages(engine: Linearization, system: System, factorization: Factorizatio
             h, right, begin = variances.shared[some].reshape(shape), system.shared[some, -1].reshape(shape), some.stop
         else:
             at = group.place[:, None], group.row[:, None] + np.arange(m)
-            state = group.target == "state"
-            h = (variances.measured if state else variances.between)[at]
-            right = (system.measured if state else system.between)[(*at, -1)]
+            h, right = (variances.measured if group.target == "state" else variances.between)[:, *at]
         found.append(Leverage(group, group.inliers(values), h, np.square(right)))
     return found
 
@@ -282,7 +278,8 @@ class _Variances:
     """Variances of what the rows of a chain predict, under its posterior.
 
     Attributes:
-        measured, between, shared: (N, m), (N, b), (r,) of the rows of these names.
+        measured, between: (2, N, m), (2, N, b) of the rows of these names, and their right sides.
+        shared: (r,) of the rows about shared unknowns alone.
         nodes: (J, 2 c, 2 c) covariance of (node, node before) where the shared unknowns are known.
         moves: (J, 2 c, s) by which these follow the shared unknowns.
     """
@@ -294,35 +291,29 @@ class _Variances:
     moves: Array
 
     @classmethod
-    def of(cls, system: ChainSystem, factorization: ChainFactorization) -> _Variances:
-        d, c, piece = system.d, system.c, system.piece
-        pairs, nodes = factorization.given_shared()
-        state = np.r_[:d, 2 * d : 2 * d + c]
-        measured = _quadratic(system.measured[..., : d + c], pairs[:, state[:, None], state])
-        between = _quadratic(system.between[..., : 2 * d + c], pairs)
-        roots, moved = factorization.shared_roots, []
-        count = max(1, MOVED // max(d * len(measured), 1))
-        for last in np.split(roots, range(count, roots.shape[1], count), axis=1):
-            x, z = factorization.propagate(last)
-            node = np.zeros((len(x), 0, x.shape[2])) if piece is None else z[piece]
-            own = np.concatenate([x, node], axis=1)
-            both = np.concatenate([x, np.concatenate([0.0 * x[:1], x[:-1]]), node], axis=1)
-            measured += _squares(system.measured, own, last[c:])
-            between += _squares(system.between, both, last[c:])
-            moved.append(np.concatenate([z, np.concatenate([0.0 * z[:1], z[:-1]])], axis=1))
+    def of(cls, system: Chain, factorization: ChainFactorization) -> _Variances:
+        d, c, roots = system.d, system.c, factorization.shared_roots
+        pair, state = np.arange(2 * d + c), np.r_[:d, 2 * d : 2 * d + c]
+        measured, between = list[Array](), list[Array]()
+        for some, covariances, moves in factorization.parts(roots, system.piece):
+            own = system.part(some.start, some.stop)
+            for rows, of, out in ((own.measured, state, measured), (own.between, pair, between)):
+                h = _quadratic(rows[..., : len(of)], covariances[:, of[:, None], of])
+                h += np.square(_moved(rows, moves[:, of], roots[c:])).sum(axis=2)
+                out.append(np.stack([h, rows[..., -1]]))
         shared = np.square(system.shared[:, :-1] @ roots[c:]).sum(axis=1)
-        return cls(measured, between, shared, nodes, np.concatenate(moved, axis=2))
+        return cls(np.concatenate(measured, axis=1), np.concatenate(between, axis=1), shared, *factorization.nodes(roots))
 
     def of_walk(self, rows: Array, node: NDArray[np.intp]) -> Array:
         """Variances (n, m) of rows (n, m, 2 c) about nodes and those before."""
         return _quadratic(rows, self.nodes[node]) + np.square(rows @ self.moves[node]).sum(axis=2)
 
 
-def _squares(rows: Array, following: Array, shared: Array) -> Array:
-    """Squares (n, m) of rows (n, m, k + s + 1) times moves (n, k, q) and (s, q), summed over the q."""
+def _moved(rows: Array, following: Array, shared: Array) -> Array:
+    """Rows (n, m, k + s + 1) times moves (n, k, q) and (s, q), (n, m, q)."""
     n, k, q = following.shape
     about = rows.reshape(-1, rows.shape[2])[:, k:-1] @ shared
-    return np.asarray(np.square(rows[..., :k] @ following + about.reshape(n, rows.shape[1], q)).sum(axis=2))
+    return np.asarray(rows[..., :k] @ following + about.reshape(n, rows.shape[1], q))
 
 
 def _quadratic(rows: Array, covariances: Array) -> Array:

@@ -88,15 +88,14 @@ def smoothed(compiled: Compiled, posterior: Posterior, covariance: Array) -> His
         return None
     (parameter,) = moving
     nodes = [_at_node(layout, parameter.key, j) for j in range(count)]
-    _, given = factorization.given_shared()
-    own = np.arange(len(parameter.quantities))
+    own, roots = np.arange(len(parameter.quantities)), factorization.shared_roots
+    given, moves = factorization.nodes(roots)
     columns = factorization.c + layout.shared[layout.at(nodes[:1])] + own
     squares = given[:, own, own]
     squares[0] = 0.0  # the first node does not deviate from itself
-    for root in factorization.shared_roots.T:
-        moved = factorization.propagate(root[:, None])[1][:, own, 0]
-        moved[0] = 0.0
-        squares = squares + np.square(moved + root[columns])
+    moved = moves[:, own]
+    moved[0] = 0.0
+    squares = squares + np.square(moved + roots[columns]).sum(axis=2)
     names = [q.name for q in compiled.problem.quantities]
     numbers = [names.index(q.name) for q in parameter.quantities]
     values = np.tile(posterior.reported.numbers, (count, 1))
