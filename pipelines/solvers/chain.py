@@ -380,7 +380,7 @@ class ChainFactorization(Factorization):
         pairs, _, x, z = self._coarse(last)
         before, shared = np.zeros_like(x[:1]), np.pad(last[self.c :], ((0, 1), (0, 0)))
         finest = self._levels[0] if self._levels else None
-        whole = [(slice(len(x)), slice(len(x)), None)] if finest is None else finest.parts()
+        whole = [(slice(0, len(x)), slice(0, len(x)), None)] if finest is None else finest.parts()
         for states, some, level in whole:
             own, covariances = x[some], pairs[some]
             if level is not None:

@@ -19,7 +19,7 @@ is linearised one at a time, by gtsam; one with a robust or constrained noise mo
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -28,18 +28,17 @@ from numpy.typing import NDArray
 
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.model import Block, Model, Residuals, dimension, stack_models, stacking_key
+from alidade.factors.model import Block, Model, Residuals, dimension, select_rows, stack_models, stacking_key
 from alidade.pipelines.estimation.problem import Factor
-from alidade.pipelines.solvers.chain import Array, ChainSystem, Index
+from alidade.pipelines.solvers.chain import PART_STATES, Array, Chain, ChainSystem, Index
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem
 from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Values, insert_value
 
 if TYPE_CHECKING:
     import gtsam
 
-# Whitened rows A dx = b about some values, as numpy eliminates them where they are a chain, else gtsam.
-System = ChainSystem | GtsamSystem
-
+# Rows of a chain of at most so many bytes are kept; those of a longer one are made anew, part by part, wherever asked.
+KEPT_BYTES = 1 << 28
 # Families whose residuals have no information about measurement noise.
 NOT_MEASURED = ("prior", "definition")
 # The shared variables of a row about nodes alone cancel to this share of its largest coefficient.
@@ -168,6 +167,35 @@ class Group:
         jacobians = tuple(J if plain else factor[..., None] * J for J in linearize())
         return -factor * residuals, jacobians, self.cost(residuals)
 
+    @property
+    def is_divisible(self) -> bool:
+        """Whether some of its measurements may be evaluated without the others."""
+        return len(self.place) == 1 or hasattr(self.model, "stacked")
+
+    def within(self, begin: int, end: int) -> Group | None:
+        """Those of its measurements whose place is from `begin` until before `end`, if there are any."""
+        some = np.flatnonzero((self.place >= begin) & (self.place < end))
+        if len(some) in (0, len(self.place)):
+            return self if len(some) else None
+
+        def own(each: Any) -> Any:
+            return each if each is None or len(each) == 1 else each[some]
+
+        return replace(
+            self,
+            model=select_rows(self.model, some),
+            weights=None if self.weights is None else self.weights[some],
+            factors=self.factors[some],
+            beside=None if self.beside is None else self.beside[some],
+            gather=[(block, own(rows)) for block, rows in self.gather],
+            at=[own(each) for each in self.at],
+            place=self.place[some],
+            row=self.row[some],
+            columns=[[own(each) for each in columns] for columns in self.columns],
+            deviates=[own(each) for each in self.deviates],
+            excluded=None if self.excluded is None else self.excluded[some],
+        )
+
     def rows(self, values: Values, width: int) -> tuple[Array, float]:
         """Rows (n, m, width) on the columns of their target, right side last, and the cost."""
         right, jacobians, cost = self.whitened(values)
@@ -230,29 +258,39 @@ class Linearization:
         each = [(group.at, *group.whitened(values)) for group in self.groups]
         return GtsamSystem.of(self.layout, (rows[:3] for rows in each)), sum(rows[3] for rows in each)
 
-    def _chain_at(self, values: Values) -> tuple[ChainSystem, float]:
+    def _chain_at(self, values: Values) -> tuple[ChainSystem | LinearizedChain, float]:
         (N, d, J, c, s), (m, b) = self.layout.sizes, self.sizes
-        measured, between = np.zeros((N, m, d + c + s + 1)), np.zeros((N, b, 2 * d + c + s + 1))
-        shared, cost = list[Array](), 0.0
+        shared, cost, squares = [np.zeros((0, s + 1))], 0.0, 0.0
         walk: list[list[Array]] = [[] for _ in range(J)]
-        widths = {"state": d + c + s + 1, "pair": 2 * d + c + s + 1, "walk": 2 * c + s + 1, "shared": s + 1}
         for group in self.groups:
-            rows, square = group.rows(values, widths[group.target])
-            cost += square
+            if group.target in ("state", "pair"):
+                continue
+            rows, square = group.rows(values, {"walk": 2 * c + s + 1, "shared": s + 1}[group.target])
+            cost, squares = cost + square, squares + float(np.square(rows[..., -1]).sum())
             if group.target == "shared":
                 shared.append(rows.reshape(-1, s + 1))
-            elif group.target == "walk":
-                _require_cancelled(rows, c, group.family)
-                for node, each in zip(group.place.tolist(), np.delete(rows, np.s_[2 * c : -1], axis=2), strict=True):
-                    walk[node].append(each)
-            else:
-                _put(measured if group.target == "state" else between, group.place, group.row, rows)
-        self._complete(measured)
-        prior = np.concatenate([np.zeros((0, s + 1)), *shared])
-        beside = np.zeros((N, 0, c + s + 1))
-        if not c:
-            return ChainSystem(measured, between, beside, prior, d), cost
-        return ChainSystem(measured, between, beside, prior, d, self.piece, self._walk(walk)), cost
+                continue
+            _require_cancelled(rows, c, group.family)
+            for node, each in zip(group.place.tolist(), np.delete(rows, np.s_[2 * c : -1], axis=2), strict=True):
+                walk[node].append(each)
+        piece, about = (self.piece, self._walk(walk)) if c else (None, None)
+        chain = LinearizedChain(self, values, np.concatenate(shared), piece, about, squares)
+        keeps = 8 * N * (m * (d + c + s + 1) + b * (2 * d + c + s + 1)) <= KEPT_BYTES
+        if keeps or not all(group.is_divisible for group in self.groups):
+            system, more = chain.rows(0, N)
+            return system, cost + more
+        for begin in range(0, N, PART_STATES):
+            for part in self.within(begin, begin + PART_STATES):
+                residuals = part.evaluate(values)[0]
+                cost += part.cost(residuals)
+                squares += float(part.used(residuals) @ np.square(part.weighted(residuals)).sum(axis=1))
+        return replace(chain, squares=squares), cost
+
+    def within(self, begin: int, end: int) -> Iterator[Group]:
+        """The measurements at keyframes from `begin` until before `end`."""
+        for group in self.groups:
+            if group.target in ("state", "pair") and (part := group.within(begin, end)) is not None:
+                yield part
 
     def cost(self, values: Values) -> float:
         """Twice the sum of the losses."""
@@ -302,13 +340,6 @@ class Linearization:
         """The linearization with another loss for measurements that have one."""
         return replace(self, groups=[g if g.loss is None else replace(g, loss=loss) for g in self.groups])
 
-    def _complete(self, measured: Array) -> None:
-        """Unit rows for the numbers of states that no variable has."""
-        absent = ~self.layout.kept[0]
-        if absent.any():
-            keyframe, number = np.nonzero(absent)
-            measured[keyframe, -1 - (np.cumsum(absent, axis=1) - 1)[keyframe, number], number] = 1.0
-
     def _walk(self, rows: list[list[Array]]) -> Array:
         """Rows (J, w, 2 c + 1) about nodes; unit rows for numbers of no variable."""
         c, absent = self.layout.sizes[3], ~self.layout.kept[1]
@@ -320,9 +351,53 @@ class Linearization:
         return out
 
 
-def _put(rows: Array, place: Index, begin: Index, new: Array) -> None:
-    """Write rows (n, m, width) below others of their place."""
-    rows[place[:, None], begin[:, None] + np.arange(new.shape[1])] = new
+@dataclass(frozen=True, eq=False)
+class LinearizedChain(Chain):
+    """Rows of a chain that are made wherever they are asked for, of so many keyframes that all take too much memory.
+
+    Attributes:
+        linearization, values: of the factors, and about which.
+        squares: sum of squares of the right side.
+    """
+
+    linearization: Linearization
+    values: Values
+    shared: Array
+    piece: Index | None
+    walk: Array | None
+    squares: float
+
+    @property
+    def d(self) -> int:  # type: ignore[override]
+        """Numbers of a state."""
+        return self.linearization.layout.sizes[1]
+
+    def __len__(self) -> int:
+        return self.linearization.layout.sizes[0]
+
+    def part(self, begin: int, end: int) -> ChainSystem:
+        """See Chain."""
+        return self.rows(begin, end)[0]
+
+    def rows(self, begin: int, end: int) -> tuple[ChainSystem, float]:
+        """A part, and twice the sum of the losses of its measurements."""
+        n, d, w, (m, b), cost = end - begin, self.d, self.border, self.linearization.sizes, 0.0
+        measured, between = np.zeros((n, m, d + w)), np.zeros((n, b, 2 * d + w))
+        for group in self.linearization.within(begin, end):
+            out = measured if group.target == "state" else between
+            rows, square = group.rows(self.values, out.shape[2])
+            out[(group.place - begin)[:, None], group.row[:, None] + np.arange(rows.shape[1])] = rows
+            cost += square
+        # Unit rows for the numbers of states that no variable has.
+        absent = ~self.linearization.layout.kept[0][begin:end]
+        keyframe, number = np.nonzero(absent)
+        measured[keyframe, -1 - (np.cumsum(absent, axis=1) - 1)[keyframe, number], number] = 1.0
+        piece = None if self.piece is None else self.piece[begin:end]
+        return ChainSystem(measured, between, np.zeros((n, 0, w)), self.shared, d, piece, self.walk), cost
+
+
+# Whitened rows A dx = b about some values, as numpy eliminates them where they are a chain, else gtsam.
+System = ChainSystem | LinearizedChain | GtsamSystem
 
 
 def _require_cancelled(rows: Array, c: int, family: str) -> None:

@@ -302,7 +302,9 @@ class _Variances:
                 h += np.square(_moved(rows, moves[:, of], roots[c:])).sum(axis=2)
                 out.append(np.stack([h, rows[..., -1]]))
         shared = np.square(system.shared[:, :-1] @ roots[c:]).sum(axis=1)
-        return cls(np.concatenate(measured, axis=1), np.concatenate(between, axis=1), shared, *factorization.nodes(roots))
+        return cls(
+            np.concatenate(measured, axis=1), np.concatenate(between, axis=1), shared, *factorization.nodes(roots)
+        )
 
     def of_walk(self, rows: Array, node: NDArray[np.intp]) -> Array:
         """Variances (n, m) of rows (n, m, 2 c) about nodes and those before."""

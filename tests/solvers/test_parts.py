@@ -1,0 +1,35 @@
+"""Long chains part by part: the same numbers as of rows that are all kept, and memory that R takes alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import alidade
+from alidade.pipelines.solvers import chain, linearization
+
+RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "los": ("los", {"duration_s": 30.0, "gyro_rate_hz": 200.0}),
+    "head": ("head", {"duration_s": 20.0}),
+    "indexer": ("indexer", {}),
+    "cube": ("cube", {}),
+    "a bias that walks": ("head", {"duration_s": 60.0, "noise": {"gyro_bias_walk": 3e-4}}),
+}
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_parts_give_what_the_whole_gives(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    method, scenario = RECORDINGS[name]
+    simulated = alidade.simulate(method, scenario)
+    whole = alidade.open(simulated).calibrate()
+    monkeypatch.setattr(linearization, "KEPT_BYTES", 0)
+    for module in (chain, linearization):
+        monkeypatch.setattr(module, "PART_STATES", 100)
+    parts = alidade.open(simulated).calibrate()
+    sigmas = whole.estimate.sigmas
+    assert (np.abs(parts.estimate.values - whole.estimate.values) <= 1e-5 * sigmas + 1e-15).all()
+    np.testing.assert_allclose(parts.estimate.sigmas, sigmas, rtol=1e-6)
+    assert parts.estimate.chi_square.dof == pytest.approx(whole.estimate.chi_square.dof, rel=1e-9)
+    assert parts.status == whole.status
