@@ -169,6 +169,10 @@ def _prepare(
     mount, bias_hat, delay = guessed
     carried = initial_attitudes(chains, time, camera(used.angles, mount, parameters.names), measured, gyro)
     del gyro  # Another as large follows.
+    motion = None
+    if parameters.sight is not None:
+        windows = None if before is None or before.around is None else before.around.motion.windows
+        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving, windows)
     chain = GyroChain.over(
         time,
         used.starts,
@@ -180,9 +184,7 @@ def _prepare(
         trunk=trunk,
     )
     around, angles, clock = None, used.angles, clock or Clock(float(data.image_t[0]))
-    if parameters.sight is not None:
-        windows = None if before is None or before.around is None else before.around.motion.windows
-        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving, windows)
+    if motion is not None:
         angles, zero = motion.read, np.zeros((len(time), 1))
         smooth = motion.moved(motion.gimbal, zero, zero + delay)[0]
         errors = predicted_errors(chains, time, camera(smooth, mount, parameters.names), measured, chain.gyro)
