@@ -19,13 +19,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import InfluentialMeasurement
 from alidade.pipelines.solvers.chain import Array
-from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.posterior import Reported, responses
@@ -50,14 +51,14 @@ class Influence:
     Attributes:
         at: the estimate; the engine of all factors.
         reported: the numbers there.
-        step: (m) columns B (B'N B)^-1 B'J' of all unknowns.
+        step: (unknowns + 1, m) columns B (B'N B)^-1 B'J', laid flat.
         from_priors: (m, 2 m) square root of what the priors of the weak directions add to the covariance of these and
             of the others, columns for each number's prior.
     """
 
     at: Point
     reported: Reported
-    step: Tangent
+    step: Array
     from_priors: Array
 
     @classmethod
@@ -71,7 +72,7 @@ class Influence:
         found, scale, weak = reported.root(at.factorization.root), reported.scale, directions.weak
         p, strong = found.unseen, directions.strong
         basis = np.hstack([found.basis[:, :p], found.basis[:, p:] @ strong])
-        step = responses(at.factorization, reported.jacobian[reported.free], basis)
+        step = at.engine.layout.tangents(responses(at.factorization, reported.jacobian[reported.free], basis))
         slope = np.linalg.lstsq(found.R @ strong, -found.R @ weak, rcond=None)[0]
         root = np.linalg.cholesky(reported.prior)
         roots = [
@@ -90,11 +91,18 @@ class Influence:
 
     def moves(self, changed: Linearization) -> Array:
         """Changes (m,) of the numbers, to first order, under other factors of the same layout."""
+        return self._moved(changed) - self._unchanged
+
+    @cached_property
+    def _unchanged(self) -> Array:
+        return self._moved(self.at.engine)
+
+    def _moved(self, engine: Linearization) -> Array:
+        """Sum (m,) of what the residuals of an engine's factors move the numbers by; nothing at a minimum."""
         moved = np.zeros(len(self.names))
-        for sign, engine in ((1.0, changed), (-1.0, self.at.engine)):
-            for group in engine.groups:
-                L, right = engine.products(group, self.at.values, self.step)
-                moved += sign * np.einsum("nrm,nr->m", L, right)
+        for group in engine.groups:
+            for some in group.divided():
+                moved += np.einsum("nrm,nr->m", *engine.products(some, self.at.values, self.step))
         return moved
 
 
@@ -114,7 +122,7 @@ def error_budget(influence: Influence, added: Mapping[str, Array], covariance: A
         covariance: (n, n) final posterior of all reported numbers.
     """
     names, variances = influence.names, dict[str, Array]()
-    for group in influence.at.engine.groups:
+    for group in (some for whole in influence.at.engine.groups for some in whole.divided()):
         L, _ = influence.rows(group)
         for source, variance in _sources(influence, group, np.square(L)):
             variances[source] = variances.get(source, np.zeros(len(names))) + variance
@@ -170,7 +178,7 @@ def most_influential(
     columns = [influence.names.index(name) for name in names]
     scale = np.array([sigmas[name] for name in names])
     found: list[tuple[float, str, float, str]] = []
-    for group in influence.at.engine.groups:
+    for group in (some for whole in influence.at.engine.groups for some in whole.divided()):
         if group.target == "shared" and group.family == "prior":
             continue
         L, right = influence.rows(group)
@@ -257,7 +265,8 @@ def variance_shares(posterior: Posterior) -> dict[str, Array]:
     influence, parts = Influence.of(posterior), dict[str, Array]()
     inverse = posterior.directions.root(-1.0) / posterior.reported.scale
     for family, groups in posterior.at.engine.measured.items():
-        rows = [influence.rows(group)[0].reshape(-1, len(inverse)) @ inverse.T for group in groups]
+        some = (each for group in groups for each in group.divided())
+        rows = [influence.rows(each)[0].reshape(-1, len(inverse)) @ inverse.T for each in some]
         parts[family] = sum((each.T @ each for each in rows), np.zeros(inverse.shape))
     return parts
 

@@ -32,13 +32,13 @@ from alidade.factors.model import Block, Model, Residuals, dimension, select_row
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import PART_STATES, Array, Chain, ChainSystem, Index
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem
-from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Values, insert_value
+from alidade.pipelines.solvers.layout import Layout, NotAChainError, Values, insert_value
 
 if TYPE_CHECKING:
     import gtsam
 
 # Rows of a chain of at most so many bytes are kept; those of a longer one are made anew, part by part, wherever asked.
-KEPT_BYTES = 1 << 28
+KEPT_BYTES = 1 << 29
 # Families whose residuals have no information about measurement noise.
 NOT_MEASURED = ("prior", "definition")
 # The shared variables of a row about nodes alone cancel to this share of its largest coefficient.
@@ -175,8 +175,21 @@ class Group:
     def within(self, begin: int, end: int) -> Group | None:
         """Those of its measurements whose place is from `begin` until before `end`, if there are any."""
         some = np.flatnonzero((self.place >= begin) & (self.place < end))
-        if len(some) in (0, len(self.place)):
-            return self if len(some) else None
+        return self.of(some) if len(some) else None
+
+    def divided(self) -> Iterator[Group]:
+        """All of its measurements, so many at a time that what follows from them is small."""
+        n = len(self.place)
+        if n <= PART_STATES or not self.is_divisible:
+            yield self
+            return
+        for begin in range(0, n, PART_STATES):
+            yield self.of(np.arange(begin, min(begin + PART_STATES, n)))
+
+    def of(self, some: Index) -> Group:
+        """Some of its measurements."""
+        if len(some) == len(self.place):
+            return self
 
         def own(each: Any) -> Any:
             return each if each is None or len(each) == 1 else each[some]
@@ -313,9 +326,8 @@ class Linearization:
         """The linearisation with other measurements at the same variables."""
         return replace(self, groups=groups)
 
-    def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
-        """A x (n, m, k) of a group's whitened rows with k tangent vectors, and its right side (n, m)."""
-        flat = self.layout.tangents(tangent)
+    def products(self, group: Group, values: Values, flat: Array) -> tuple[Array, Array]:
+        """A x (n, m, k) of a group's whitened rows with k tangent vectors laid flat, and its right side (n, m)."""
         right, jacobians, _ = group.whitened(values)
         out = np.zeros((*right.shape, flat.shape[1]))
         for at, J in zip(group.at, jacobians, strict=True):
