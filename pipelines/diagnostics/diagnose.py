@@ -161,7 +161,7 @@ def rejections(estimate: Estimate, limits: Thresholds = DEFAULT) -> list[Finding
 
 def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
     """Statements that the recording contradicts; an estimate far above its statement is no noise."""
-    for level in estimate.levels:
+    for level in (each.together for each in estimate.levels):
         least = -np.inf if level.sigma is None else (level.found or 0.0) - limits.noise_sigmas * level.sigma
         no_noise = bool(level.noise.families) and least > limits.noise_factor
         differs = level.contradicted or not 1.0 / limits.noise_note < level.scale < limits.noise_note

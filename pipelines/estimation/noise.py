@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -73,6 +73,8 @@ class Level:
         least: of a process that its sensor's own samples say is smaller than stated: how small, at most. Residuals
             estimate it in between, and never larger than stated: coloured noise of other sensors would
             raise it without bound. None: of no such process.
+        effective: of a noise with others beside it: root mean square over the recording of all together, and one
+            standard deviation. Each alone is known less well: they take each other's part.
     """
 
     noise: Noise
@@ -80,6 +82,7 @@ class Level:
     found: float | None = None
     sigma: float | None = None
     least: float | None = None
+    effective: tuple[float, float] | None = None
 
     @property
     def contradicted(self) -> bool:
@@ -87,6 +90,14 @@ class Level:
         if self.found is None or self.sigma is None:
             return False
         return abs(float(np.log(self.found))) > _APART * float(np.hypot(self.noise.known, self.sigma / self.found))
+
+    @property
+    def together(self) -> Level:
+        """The level of all noises that are beside it, as one."""
+        if self.effective is None:
+            return self
+        size, sigma = self.effective
+        return replace(self, scale=size, found=size, sigma=sigma)
 
     @property
     def known(self) -> float:

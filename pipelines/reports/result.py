@@ -173,8 +173,12 @@ class Calibration(SensorValues):
 
     @property
     def noises(self) -> list[NoiseResult]:
-        """Every noise that was in force: as stated, as found, as used."""
+        """Every noise that was in force: as stated, as found, as used.
+
+        One with others beside it counts with these: all together, root mean square over the recording.
+        """
         colours = self.estimate.colours
+        levels = [level.together for level in self.estimate.levels or [Level(noise) for noise in self.problem.noises]]
         return [
             NoiseResult(
                 name=level.noise.name,
@@ -186,7 +190,7 @@ class Calibration(SensorValues):
                 used=level.used,
                 inflation=max((colours.get(family, 1.0) ** 0.5 for family in level.noise.families), default=1.0),
             )
-            for level in self.estimate.levels or [Level(level.noise) for level in self.problem.noises]
+            for level in levels
         ]
 
     @property

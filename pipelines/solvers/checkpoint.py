@@ -274,5 +274,9 @@ def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> RunState
 
 def _level_of(noise: Mapping[str, Any], **level: Any) -> Level:
     """A noise level from its fields; JSON keeps tuples as lists."""
-    stated: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in noise.items()}
-    return Level(Noise(**stated), **level)
+    stated, found = (_with_tuples(each) for each in (noise, level))
+    return Level(Noise(**stated), **found)
+
+
+def _with_tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}

@@ -502,7 +502,8 @@ def _maximum(
         assert solution is not None
         if min(predicted, before - value) < _SETTLED:
             break
-    return LevelEstimate(_known(tried, free, np.sqrt(np.diag(np.linalg.inv(information)))), value)
+    covariance = np.linalg.inv(information)
+    return LevelEstimate(_effective(chain, _known(tried, free, np.sqrt(np.diag(covariance))), free, covariance), value)
 
 
 def widened(
@@ -677,6 +678,26 @@ def _known(levels: Sequence[Level], free: Sequence[int], spread: Array) -> tuple
     out = list(levels)
     for i, sigma in zip(free, spread.tolist(), strict=True):
         out[i] = replace(out[i], found=out[i].scale, sigma=out[i].scale * sigma)
+    return tuple(out)
+
+
+def _effective(
+    chain: LinearChain, levels: Sequence[Level], free: Sequence[int], covariance: Array
+) -> tuple[Level, ...]:
+    """The levels, those that have others beside them with what these are together.
+
+    `covariance` (k, k) is of the logarithms of the free ones.
+    """
+    out, added = list(levels), {f for level in levels if level.noise.beside for f in level.noise.families}
+    for i, level in enumerate(levels):
+        own = [k for k, rows in enumerate(chain.rows) if rows.family in added & {*level.noise.families}]
+        if level.noise.beside or not own:
+            continue
+        variance = np.concatenate([_variance(chain.rows[k], levels) for k in own])
+        parts = [np.concatenate([each[k] for k in own]) for each in (_parts(chain, levels, j) for j in free)]
+        shares = np.array([(part * variance).sum() for part in parts]) / variance.sum()
+        size = float(np.sqrt(variance.mean()))
+        out[i] = replace(level, effective=(size, size * float(shares @ covariance @ shares) ** 0.5))
     return tuple(out)
 
 

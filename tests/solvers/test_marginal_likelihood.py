@@ -86,6 +86,25 @@ def test_level_of_vision_is_that_simulated() -> None:
     assert vision.sigma < 0.03
 
 
+def test_noises_of_the_same_rows_are_known_better_together() -> None:
+    """White noise of the simulated gyro, none that grows with the rate: all of it is what was simulated."""
+    linear, levels = chain()
+    own, added = (
+        level
+        for level in estimate_levels(linear, levels).levels
+        if level.noise.name in ("gyro_density", "gyro_rate_noise")
+    )
+    assert own.effective is not None
+    assert added.effective is None
+    size, sigma = own.effective
+    assert abs(size - 1.0) < 4.0 * sigma
+    assert size > own.scale
+    assert own.found is not None
+    assert own.sigma is not None
+    assert sigma / size < own.sigma / own.found
+    assert own.together.used == pytest.approx(size * own.noise.stated)
+
+
 def test_innovations_are_white_and_of_unit_variance() -> None:
     linear, levels = chain()
     (found,) = linear.innovations(linear.variances(levels), [np.inf] * len(linear.rows)).values()
