@@ -178,7 +178,7 @@ class Calibration(SensorValues):
         One with others beside it counts with these: all together, root mean square over the recording.
         """
         colours = self.estimate.colours
-        levels = [level.together for level in self.estimate.levels or [Level(noise) for noise in self.problem.noises]]
+        stated = [Level(level.noise) for level in self.problem.noises]
         return [
             NoiseResult(
                 name=level.noise.name,
@@ -190,7 +190,7 @@ class Calibration(SensorValues):
                 used=level.used,
                 inflation=max((colours.get(family, 1.0) ** 0.5 for family in level.noise.families), default=1.0),
             )
-            for level in levels
+            for level in (each.together for each in self.estimate.levels or stated)
         ]
 
     @property

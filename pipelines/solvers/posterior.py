@@ -88,7 +88,8 @@ class Reported:
         """
         pairs = [p.coordinates(known, key) for p, key in zip(problem.parameters, keys, strict=True)]
         quantities = problem.quantities
-        free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
+        fixed = np.array([q.prior_sigma == 0.0 for q in quantities])
+        free = np.flatnonzero(~fixed)
         # The default priors are the yardstick: an earlier calibration as prior makes nothing weak that it determined.
         scale = np.array([quantities[i].prior_scale for i in free])
         sigma = np.array([quantities[i].prior_sigma or FREE_PRIOR * quantities[i].prior_scale for i in free])
@@ -96,13 +97,13 @@ class Reported:
         prior = problem.prior_covariance(names, sigma) / np.outer(scale, scale)
         return cls(
             names=tuple(q.name for q in quantities),
-            numbers=np.concatenate([numbers for numbers, _ in pairs]),
+            numbers=np.where(fixed, [q.prior_mean for q in quantities], np.concatenate([each for each, _ in pairs])),
             jacobian=np.vstack([J @ own for (_, J), own in zip(pairs, columns, strict=True)]),
             free=free,
             mean=np.array([quantities[i].prior_mean for i in free]),
             scale=scale,
             prior=np.asarray(np.linalg.inv(prior), dtype=float),
-            extra=np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma for q in quantities]),
+            extra=np.where(fixed, 0.0, [q.extra_sigma for q in quantities]),
             calibrated=np.array([not quantities[i].assumed for i in free], dtype=bool),
             bounded=np.array([quantities[i].prior_sigma is not None for i in free], dtype=bool),
         )
