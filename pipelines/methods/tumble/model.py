@@ -70,6 +70,7 @@ _GRAVITY_DOWN = (
     "The accelerometer shows gravity down where it has to show the force that holds it, up: all its three signs are "
     "inverted, which its K mends (about -1); the magnetometer keeps its signs."
 )
+_STRAIGHT = "The gyro counts as mounted straight to the magnetometer: turning about one axis does not tell."
 _UPRIGHT = (
     "The accelerometer is left out: it felt gravity along much the same axis all the time, which leaves its numbers at "
     "their priors."
@@ -231,7 +232,7 @@ def prepare(data: TumbleData, config: Config) -> Model:
             )
     gyro, more = _gyro(data, sensors)
     premises += more
-    if gyro is None and sensors[-1].name == "mag":
+    if sensors[-1].name == "mag" and (gyro is None or gyro.assumed):
         premises += _about_one_axis(sensors[-1])
     if sensors[0].name == "accel" and not sensors[0].rested:
         done = _AT_REST if gyro is None else _SWUNG
@@ -302,11 +303,9 @@ def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, l
     if data.gyro is None or data.mag is None:
         return None, []
     found = field_guess(data, sensors[-1].time, sensors[-1].raw)
-    if found is None and ring(sensors[-1].raw) is not None:
-        return None, ["The gyro is not used: turning about one axis does not tell how it is mounted."]
     if found is None:
         return None, ["The gyro is not used: it does not turn as the field does; are its axes and clock right?"]
-    return found, []
+    return found, [_STRAIGHT] if found.assumed and ring(sensors[-1].raw) is not None else []
 
 
 def _chained(

@@ -7,6 +7,8 @@ gyro's own errors are symmetric.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import permutations, product
 
 import gtsam
 import numpy as np
@@ -59,6 +61,10 @@ _SPANS, _TURNED = (0.3, 1.0, 3.0, 10.0), 0.05
 # of a mean square of n: sqrt(2 / n)); share of the field's change that the gyro may leave unexplained.
 _FEWEST, _CHANCE, _UNEXPLAINED = 30, 3.0, 0.25
 _ROUNDS = 3
+# Share of its square by which a gain with axes named alike may be farther from those that fit than one with others:
+# soft iron of .1, and a mount off by 10 deg.
+_AS_NEAR = 0.1
+_SIGNS = tuple(product((1.0, -1.0), repeat=3))
 # What part of the field's direction the first guess of attitudes takes at each keyframe.
 _GAIN = 0.2
 
@@ -102,12 +108,14 @@ class FieldGuess:
     """First guess: unit field in b = K raw + b, K (3, 3) and b (3,), and the gyro's bias (3,), rad/s.
 
     sigma: noise of K raw per axis, robust, that of the gyro over the windows included.
+    assumed: whether the motion leaves several K, of which this is that of a magnetometer mounted straight.
     """
 
     K: Array
     b: Array
     bias: Array
     sigma: float
+    assumed: bool
 
     @property
     def mount(self) -> Array:
@@ -181,8 +189,8 @@ def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
     The field stays while the device turns by dR from time i to time j: K raw_i + b = dR (K raw_j + b), linear and
     homogeneous in K and b. b is eliminated; K is the smallest right singular vector of the rest, which is total least
     squares for white noise of the readings (integrated form of m' = -w x m: Rodriguez-Martinez and Troni, "Full
-    magnetometer and gyroscope bias estimation using angular rates", IEEE J. Oceanic Eng. 2024). Motion about one axis
-    leaves K undetermined along it; there K is assumed a rotation of readings on the sphere nearest to them.
+    magnetometer and gyroscope bias estimation using angular rates", IEEE J. Oceanic Eng. 2024). Of motion about one
+    axis, as on a deck, several K are as small: of these it is that of a magnetometer mounted straight.
 
     Args:
         data: with a gyro.
@@ -197,7 +205,7 @@ def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
 
 
 def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple[float, FieldGuess] | None:
-    """A guess from pairs of readings a span (s) apart, and by what factor the second-best one fits worse."""
+    """A guess from pairs of readings a span (s) apart, and how well it is told from others, see `_homogeneous`."""
     assert data.gyro_t is not None
     assert data.gyro is not None
     first, last = _pairs(time, span, data.gyro_t)
@@ -209,20 +217,17 @@ def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple
         if turned.sum() < _FEWEST:
             return None
         R, before, after = so3.matrix(dR.wxyz[turned]), x[first[turned]], x[last[turned]]
-        K, b, gap = _homogeneous(R, before, after)
+        independent = 3.0 * turned.sum() * min(1.0, float(np.median(np.diff(time))) / span)
+        K, b, assumed, determined = _homogeneous(R, before, after, 1.0 + _CHANCE * np.sqrt(2.0 / independent))
         at_first, at_last = before @ K.T + b, after @ K.T + b
         left = at_first - np.einsum("nij,nj->ni", R, at_last)
         by_bias = -R @ so3.hat(at_last) @ dR.bias_jacobian[turned]
         bias = bias + np.linalg.lstsq(by_bias.reshape(-1, 3), left.ravel())[0]
-    independent = 3.0 * turned.sum() * min(1.0, float(np.median(np.diff(time))) / span)
-    if (
-        gap < 1.0 + _CHANCE * np.sqrt(2.0 / independent)
-        or (left**2).sum() > _UNEXPLAINED * ((at_first - at_last) ** 2).sum()
-    ):
+    if (left**2).sum() > _UNEXPLAINED * ((at_first - at_last) ** 2).sum():
         return None
     size = float(np.linalg.norm(at_first, axis=1).mean()) * (1.0 if np.linalg.det(K) > 0.0 else -1.0)
     sigma = robust_sigma(left) / abs(size) / 2.0**0.5
-    return gap, FieldGuess(K / (size * radius), (b - K @ centre / radius) / size, bias, sigma)
+    return determined, FieldGuess(K / (size * radius), (b - K @ centre / radius) / size, bias, sigma, assumed)
 
 
 def _pairs(time: Array, span: float, gyro: Array) -> tuple[Index, Index]:
@@ -234,15 +239,38 @@ def _pairs(time: Array, span: float, gyro: Array) -> tuple[Index, Index]:
     return first[near], last[near]
 
 
-def _homogeneous(R: Array, before: Array, after: Array) -> tuple[Array, Array, float]:
-    """K (3, 3) of unit norm, b (3,): K before + b = R (K after + b); and second-smallest over smallest misfit."""
+def _homogeneous(R: Array, before: Array, after: Array, alike: float) -> tuple[Array, Array, bool, float]:
+    """K (3, 3) of unit norm and b (3,) with K before + b = R (K after + b).
+
+    Of several K whose misfits are less than `alike` times the smallest it is that of a magnetometer mounted straight.
+
+    Also returns whether there are several, and by what factor the next one fits worse, over what counts as alike.
+    """
     gains = np.einsum("ac,nb->nacb", np.eye(3), before) - np.einsum("nac,nb->nacb", R, after)
     gains, offsets = gains.reshape(-1, 9), (np.eye(3) - R).reshape(-1, 3)
     by_gain = np.linalg.lstsq(offsets, gains)[0]
     left = gains - offsets @ by_gain
-    sizes, axes = np.linalg.eigh(left.T @ left)
-    K = axes[:, 0]
-    return K.reshape(3, 3), -by_gain @ K, float(np.sqrt(max(sizes[1], 0.0) / max(sizes[0], np.finfo(float).tiny)))
+    squares, axes = np.linalg.eigh(left.T @ left)
+    sizes = np.sqrt(np.maximum(squares, np.finfo(float).tiny))
+    count = int(np.searchsorted(sizes, alike * sizes[0]))
+    K = axes[:, 0] if count == 1 else _mounted_straight(axes[:, :count])
+    return K.reshape(3, 3), -by_gain @ K, count > 1, float(sizes[min(count, 8)] / (alike * sizes[0]))
+
+
+def _mounted_straight(axes: Array) -> Array:
+    """K (9,) of the span of axes (9, k), orthonormal, that is nearest to axes named alike or permuted."""
+    ways = _right_angles().reshape(-1, 9)
+    parts = ways @ axes
+    share = np.square(parts).sum(axis=1) / 3.0
+    best = 0 if share[0] > share.max() - _AS_NEAR else int(share.argmax())
+    return np.asarray(axes @ parts[best] / np.linalg.norm(parts[best]))
+
+
+@cache
+def _right_angles() -> Array:
+    """The rotations (24, 3, 3) that take axes to axes, the identity first."""
+    signed = (np.eye(3)[list(order)] * np.array(signs) for order in permutations(range(3)) for signs in _SIGNS)
+    return np.array([each for each in signed if np.linalg.det(each) > 0.0])
 
 
 def turning(
