@@ -53,6 +53,8 @@ _HALVINGS, _FINE = 6, 1e-3
 SANDWICH_BLOCK_S = 5.0
 # Linearisations, of which the first ones widen; levels have settled whose logarithms move by less.
 _MOST_ROUNDS, _WIDENING_ROUNDS, _STEADY = 8, 2, 0.02
+# Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`.
+_ABOVE = 2.0
 # Of the gate, where measurements that are widened lie at most.
 _INSIDE = 0.9
 # Random right sides that estimate traces: a quarter of a level's own sigma.
@@ -771,7 +773,7 @@ def maximise_likelihood(
     Args:
         linearization: of the factors, with the noise stated.
         values: to begin with, near the solution.
-        levels: to begin with.
+        levels: to begin with, see `_from_above`.
         outliers: group -> (n,) which measurements are rejected.
         rounds: linearisations.
     """
@@ -782,6 +784,7 @@ def maximise_likelihood(
         if deadline.passed():
             break
         chain = LinearChain.of(linearization, values)
+        found = found if number else _from_above(chain, found)
         before, found = found, estimate_levels(chain, found, wide, outliers).levels
         if number < _WIDENING_ROUNDS:
             wide, outliers = widened(chain, found, outliers)
@@ -791,6 +794,26 @@ def maximise_likelihood(
         if number >= _WIDENING_ROUNDS and changed < _STEADY:
             break
     return LikelihoodMaximum(values, found, wide, outliers)
+
+
+def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...]:
+    """The levels to begin with: two noises of the same rows `_ABOVE` what is stated, with equal shares of the variance.
+
+    -2 log L is flat in the logarithm of a level whose share vanishes: a noise that begins there stays, and the other one
+    takes its part.
+    """
+    out = list(levels)
+    for i, added in enumerate(levels):
+        parts = [r.beside for r in chain.rows if r.family in added.noise.families and r.beside is not None]
+        if not (added.noise.beside and added.noise.estimated and parts):
+            continue
+        for j, own in enumerate(levels):
+            if not own.noise.beside and set(own.noise.families) & set(added.noise.families):
+                above = float(np.exp(_ABOVE * own.noise.known)) if own.noise.estimated else 1.0
+                out[j] = replace(own, scale=max(own.scale, above))
+                unit = added.noise.stated * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+                out[i] = replace(added, scale=out[j].scale / max(unit, 1e-300))
+    return tuple(out)
 
 
 def rejected(engine: Linearization, values: Values) -> dict[int, NDArray[np.bool_]]:

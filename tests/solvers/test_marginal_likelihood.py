@@ -143,3 +143,19 @@ def test_few_rows_of_clean_noise_are_widened() -> None:
     wide, out = widened(linear, levels, {})
     assert np.mean(np.concatenate(list(wide.values())) > 1.0) < 0.01
     assert not np.concatenate(list(out.values())).any()
+
+
+@pytest.mark.parametrize(("density", "by_rate"), [(2e-3, 0.0), (5e-4, 5e-3)])
+def test_white_noise_and_noise_that_grows_with_the_rate_are_told_apart(density: float, by_rate: float) -> None:
+    """Whichever is at its default at first, where -2 log L is flat in its logarithm, is not the other one's noise."""
+    data, _ = simulate_head(SCENARIO, 1)
+    size = np.hypot(density, by_rate * np.linalg.norm(data.head_gyro, axis=1)) * SCENARIO.gyro_rate_hz**0.5
+    noise = size[:, None] * np.random.default_rng(1).standard_normal(data.head_gyro.shape)
+    noisy = replace(data, head_gyro=data.head_gyro + noise, gyro_density=None)
+    estimate = solve_batch(methods.method("head").problem(noisy, load_config(None)))
+    used = {level.noise.name: level.used for level in estimate.levels}
+    rate = float(np.sqrt((data.head_gyro**2).sum(axis=1).mean()))
+    found, true = np.array([used["gyro_density"], rate * used["gyro_rate_noise"]]), np.array([density, rate * by_rate])
+    larger = int(np.argmax(true))
+    assert found[larger] == pytest.approx(true[larger], rel=0.25)
+    assert found[1 - larger] < 0.2 * found[larger]
