@@ -46,7 +46,7 @@ _EARTH_FIELD = 4.5e-5
 # Scatter of readings over their size below which a device did not turn: a degree, which is more than noise. A
 # magnetometer in T with ten times the field for its offset scatters by more when it turns; counts may have any offset.
 TURNED = 0.02
-# The same of an accelerometer without rests and gyro, whose motion is noise: it was within 20 deg of upright.
+# The same of an accelerometer without rests and gyro in use, whose motion is noise: it was within 20 deg of upright.
 _TILTED = 0.25
 # No sensor resolves a smaller share of what it measures; numbers without noise leave rounding.
 _RESOLUTION = 1e-9
@@ -74,6 +74,10 @@ _STRAIGHT = "The gyro counts as mounted straight to the magnetometer: turning ab
 _UPRIGHT = (
     "The accelerometer is left out: it felt gravity along much the same axis all the time, which leaves its numbers at "
     "their priors."
+)
+_NOT_AS_FIELD = (
+    "The gyro is not used: it does not turn as the field does; are its axes and clock right, and is the field the same "
+    "everywhere the device was?"
 )
 _NEVER_TOGETHER = "The magnetometer has no reading during a rest: nothing ties its axes to the accelerometer's."
 _NEGATIVE_DIP = (
@@ -232,6 +236,9 @@ def prepare(data: TumbleData, config: Config) -> Model:
             )
     gyro, more = _gyro(data, sensors)
     premises += more
+    if gyro is None and more and len(sensors) > 1 and _is_upright(replace(data, gyro=None), rests):
+        data, sensors = replace(data, accel_t=None, accel=None), [_magnetometer(data, config, field, alone=True)]
+        premises.append(_UPRIGHT)
     if sensors[-1].name == "mag" and (gyro is None or gyro.assumed):
         premises += _about_one_axis(sensors[-1])
     if sensors[0].name == "accel" and not sensors[0].rested:
@@ -304,7 +311,7 @@ def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, l
         return None, []
     found = field_guess(data, sensors[-1].time, sensors[-1].raw)
     if found is None:
-        return None, ["The gyro is not used: it does not turn as the field does; are its axes and clock right?"]
+        return None, [_NOT_AS_FIELD]
     return found, [_STRAIGHT] if found.assumed and ring(sensors[-1].raw) is not None else []
 
 

@@ -333,6 +333,18 @@ def test_a_gyro_that_does_not_turn_with_the_field_is_not_used() -> None:
     assert "does not turn as the field does" in " ".join(TUMBLE.problem(backwards, Config()).premises)
 
 
+def test_an_accelerometer_that_moved_upright_is_left_out_beside_a_gyro_that_is_not_used() -> None:
+    """Its samples count as at rest then, and what the hand adds to them turned K by half."""
+    simulated = _simulated(TURNING, 0)
+    assert simulated.data.gyro is not None
+    assert simulated.data.accel is not None
+    swung = [0.0, 0.0, 9.81] + np.random.default_rng(0).standard_normal(simulated.data.accel.shape)
+    backwards = replace(simulated.data, gyro=simulated.data.gyro[::-1], accel=swung)
+    problem = TUMBLE.problem(backwards, Config())
+    assert "The accelerometer is left out" in " ".join(problem.premises)
+    assert "accel_k11" not in [quantity.name for quantity in problem.quantities]
+
+
 def test_a_gyro_in_degrees_is_not_used_and_that_is_told(tmp_path: Path) -> None:
     simulated = _simulated(TURNING, 0)
     assert simulated.data.gyro is not None
