@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class NoiseSpec:
@@ -14,16 +16,20 @@ class NoiseSpec:
         unit: SI, or pixels.
         description: a sentence for people.
         default: sigma or density where neither config nor messages state one; None: it is no key of the config.
+        no_noise: beyond this it is no noise, where it is at its default, and half of it a note.
     """
 
     name: str
     unit: str
     description: str
     default: float | None = None
+    no_noise: float = np.inf
 
 
+# Blurred and distant tags scatter by two or three times the default; attitudes that scatter by 3.5 deg serve nobody; no
+# gyro at rest has more than 3e-3 rad/s/sqrt(Hz).
 _SPECS = (
-    NoiseSpec("gyro_density", "rad/s/√Hz", "Gyro white noise.", 5.0e-5),
+    NoiseSpec("gyro_density", "rad/s/√Hz", "Gyro white noise.", 5.0e-5, 3.0e-3),
     NoiseSpec("gyro_rate_noise", "1/√Hz", "Gyro white noise that grows with the rate.", 5.0e-5),
     NoiseSpec("gyro_bias_walk", "rad/s/√s", "Gyro bias random walk.", 1.0e-6),
     NoiseSpec("gyro_scale", "", "", 0.0),
@@ -33,8 +39,8 @@ _SPECS = (
     NoiseSpec("los_error", "rad", "LOS error, per measurement and axis.", 2.0e-5),
     NoiseSpec("los_roll", "rad", "Roll of the picture about the line of sight, per measurement.", 2.0e-4),
     NoiseSpec("encoder", "rad", "Encoder reading, per sample.", 1.0e-5),
-    NoiseSpec("vision_attitude", "rad", "Vision attitude, per picture and axis.", 8.7e-3),
-    NoiseSpec("corner_px", "px", "Tag corner in a picture, per axis.", 0.3),
+    NoiseSpec("vision_attitude", "rad", "Vision attitude, per picture and axis.", 8.7e-3, 6.09e-2),
+    NoiseSpec("corner_px", "px", "Tag corner in a picture, per axis.", 0.3, 1.5),
     NoiseSpec("gyro_repeatability", "rad/s", "Gyro mean at rest, beyond white noise.", 2.0e-5),
     NoiseSpec("turn_repeatability", "", "Angle turned between rests, beyond white noise.", 1.0e-3),
     NoiseSpec("accel_repeatability", "m/s²", "Accelerometer mean at rest, beyond white noise.", 5.0e-4),

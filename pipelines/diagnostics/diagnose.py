@@ -19,9 +19,6 @@ from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate
 from alidade.pipelines.estimation.robust import robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
-# How many times its default is no noise any more, and half of it a note: blurred and distant tags scatter by two or
-# three times it; attitudes that scatter by 3.5 deg serve nobody; no gyro has more than 3e-3 rad/s/sqrt(Hz).
-_NO_NOISE = {"corner_px": 5.0, "vision_attitude": 7.0, "gyro_density": 60.0}
 # Kinds about the residuals, as opposed to priors and requirements.
 _RESIDUAL = ("not_converged", "misfit", "noise", "correlation", "rejection")
 
@@ -166,11 +163,19 @@ def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
         no_noise = bool(level.noise.families) and least > limits.noise_factor
         differs = level.contradicted or not 1.0 / limits.noise_note < level.scale < limits.noise_note
         is_default = level.noise.source == "default"
-        share = level.scale / _NO_NOISE.get(level.noise.name, np.inf) if is_default else 0.0
+        own = set(level.noise.families)
+        alike = [_share(other) for other in estimate.levels if other is level or own & set(other.noise.families)]
+        share = float(np.linalg.norm(alike)) if _share(level) == max(alike) else 0.0
         if share > 0.5 or (not is_default and (no_noise or (differs and level.scale != 1.0))):
             numbers = {"used": level.used, "factor": level.scale, "estimated_factor": level.found}
             evidence = {"noise": level.noise.name, "unit": level.noise.unit, "source": level.noise.source, **numbers}
             yield Finding("noise", INCONSISTENT if share > 1.0 or (no_noise and not is_default) else NOTE, evidence)
+
+
+def _share(level: Level) -> float:
+    """A noise over what is none, 0 where it is stated."""
+    is_default = level.noise.source == "default"
+    return level.used / (level.noise.no_noise or level.noise.spec.no_noise) if is_default else 0.0
 
 
 def _correlations(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:

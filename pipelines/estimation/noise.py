@@ -33,6 +33,7 @@ class Noise:
         beside: whether it is there beside the noise that its factors are whitened by, which say as `beside` how much
             of it they have: what means of many samples repeat to is more than white noise over their duration.
         own: declaration of a noise that only one method has.
+        no_noise: beyond this it is no noise, in its unit; None: as declared.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Noise:
     least: float = 0.0
     beside: bool = False
     own: NoiseSpec | None = None
+    no_noise: float | None = None
 
     @property
     def spec(self) -> NoiseSpec:

@@ -33,9 +33,11 @@ _APPLY = (
     "whether it still holds."
 )
 _WALK = "Calibrate the recordings after the last change together, or let the parameter walk: `share` in the config."
+_OF_GYRO = "unit, signs and order of the gyro's axes, and that it belongs to the rest"
 _CHECK = {
     "corner_px": "camera_info (lens, size and rectification of the pictures) and the layout of the tags",
-    "gyro_density": "unit, signs and order of the gyro's axes, and that it belongs to the rest",
+    "gyro_density": _OF_GYRO,
+    "gyro_rate_noise": _OF_GYRO,
     "vision_attitude": "that gyro and vision are of one device and time, and the meaning of the quaternions",
 }
 _FAR = "check the orientation and the axis order of the sensor, or widen the prior"

@@ -797,10 +797,10 @@ def maximise_likelihood(
 
 
 def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...]:
-    """The levels to begin with: two noises of the same rows `_ABOVE` what is stated, with equal shares of the variance.
+    """The levels to begin with: two noises of the same rows `_ABOVE` what is stated, with equal shares.
 
-    -2 log L is flat in the logarithm of a level whose share vanishes: a noise that begins there stays, and the other one
-    takes its part.
+    -2 log L is flat in the logarithm of a level whose share vanishes: what begins there stays, and another noise takes
+    its part.
     """
     out = list(levels)
     for i, added in enumerate(levels):

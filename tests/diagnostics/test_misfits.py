@@ -13,6 +13,7 @@ from alidade.pipelines.diagnostics.trial_fit import TrialFit
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import ChiSquare, Residuals
+from alidade.pipelines.noises import NOISES
 from tests.support.builders import make_calibration
 
 
@@ -27,7 +28,7 @@ def test_what_scatters_by_many_times_its_default_does_not_fit(
 ) -> None:
     calibration = make_calibration()
     scale = share * most
-    level = Level(Noise(noise, 0.3, "default", 1.0, ("tags",)), scale, scale, 0.1)
+    level = Level(Noise(noise, NOISES[noise].default or 0.0, "default", 1.0, ("tags",)), scale, scale, 0.1)
     estimate = replace(calibration.estimate, levels=(level,))
     findings = diagnose(estimate, calibration.problem.quantities)
     found = [each for each in findings if each.kind == "noise"]
@@ -63,3 +64,15 @@ def test_what_leaves_chi_square_far_from_its_freedom_is_no_explanation(left: flo
         return TrialFit((), estimate, ChiSquare(chi_square, 1000, {}), 0.0, 1000.0)
 
     assert hypothesis_tests._explains(fit(1e6), fit(1e3 * left)) is explains
+
+
+@pytest.mark.parametrize(("share", "severities"), [(0.6, [Severity.NOTE]), (0.8, [Severity.INCONSISTENT])])
+def test_noises_of_the_same_measurements_are_judged_together(share: float, severities: list[Severity]) -> None:
+    """Neither is beyond what is no noise, and both are by the root of the sum of squares."""
+    calibration = make_calibration()
+    white = Noise("gyro_density", 5e-5, "default", 1.0, ("gyro",), no_noise=0.01)
+    by_rate = Noise("gyro_rate_noise", 5e-5, "default", 1.0, ("gyro",), beside=True, no_noise=0.02)
+    levels = Level(white, 0.99 * share * 0.01 / 5e-5), Level(by_rate, share * 0.02 / 5e-5)
+    findings = diagnose(replace(calibration.estimate, levels=levels), calibration.problem.quantities)
+    found = [each for each in findings if each.kind == "noise"]
+    assert [(each.evidence["noise"], each.severity) for each in found] == [("gyro_rate_noise", s) for s in severities]

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines import methods
+from alidade.pipelines.applications.session import Session, calibrate
+from alidade.pipelines.config import load_config
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.write import write_results
-from datasets.broad import Score, read_trial, score_results
+from datasets.broad import Score, read_trial, score_results, to_session
 from tests.support.broad_trials import TRIALS, converted
 
 
@@ -70,3 +73,21 @@ def test_wrong_noise_is_said_plainly_and_changes_nothing(
     assert calibration.status == right.status == "calibrated"
     assert any(f.kind == "noise" and f.evidence["noise"] == "vision_attitude" for f in calibration.findings)
     np.testing.assert_allclose(calibration.estimate.sigmas, right.estimate.sigmas, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("signs", "status"), [((1, 1, 1), "calibrated"), pytest.param((-1, 1, 1), "inconsistent", marks=pytest.mark.slow)]
+)
+def test_noise_of_a_gyro_that_never_rests_is_judged_by_its_rate(
+    signs: tuple[int, int, int], status: str, shared_data: Path
+) -> None:
+    """20 s at 10 rad/s have 3.8e-3 rad/s/sqrt(Hz), which no gyro has at rest; with x inverted 50 times that."""
+    trial = read_trial(shared_data / "broad" / "07_undisturbed_fast_rotation_B.mat")
+    head = methods.method("head")
+    moving = head.faults.segment(to_session(trial, 0, 0.0), 60.0, 80.0)
+    moving = replace(moving, head_gyro=moving.head_gyro * signs)
+    found = Session(head, moving, load_config(None)).calibrate("batch", report=False)
+    assert found.status == status, found.headline
+    (density,) = (noise for noise in found.noises if noise.name == "gyro_density")
+    assert density.used > 3e-3
+    assert any(f.kind == "hypothesis" and "gyro's x" in f.evidence["label"] for f in found.findings) == (signs[0] < 0)

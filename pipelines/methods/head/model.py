@@ -43,6 +43,9 @@ from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 _SHARED, _LONGEST_INCREMENT = 0.1, 0.25
 # Pictures share a keyframe as far as what gyro noise adds on the way is at most this part of vision's.
 _NEGLIGIBLE = 0.1
+# All noise over the rate, 1/sqrt(Hz), beyond which it is none: healthy gyros in motion have .019 at most (UPenn), those
+# with an axis inverted .031 and more.
+_NO_NOISE = 0.025
 # So far from its stamp, s, the gyros carry an attitude to where its picture was taken.
 _NEAR = 0.1
 _FEWEST_FRAMES = 10
@@ -118,8 +121,7 @@ def _finer(config: Config, data: HeadData, model: _Model, levels: Sequence[Level
 
 def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
     """Pictures share a keyframe within this time, s, over which gyro noise adds little to vision's."""
-    rate = float(np.sqrt((data.head_gyro**2).sum(axis=1).mean()))
-    density = [noises["gyro_density"].used, noises["gyro_rate_noise"].used * rate]
+    density = [noises["gyro_density"].used, noises["gyro_rate_noise"].used * _rate(data)]
     if "platform_gyro_density" in noises:
         density.append(noises["platform_gyro_density"].used)
     return min(
@@ -127,13 +129,25 @@ def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
     )
 
 
+def _rate(data: HeadData) -> float:
+    """Root mean square rate of the helmet, rad/s."""
+    return float(np.sqrt((data.head_gyro**2).sum(axis=1).mean()))
+
+
+def _bounded(level: Level, no_noise: float) -> Level:
+    return replace(level, noise=replace(level.noise, no_noise=no_noise))
+
+
 def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     """Noises in use, by name."""
     density = estimated("gyro_density", config, ("gyro",), data.gyro_density)
+    density = at_least_at_rest(density, data.head_t, data.head_gyro, data.head_force)
+    rate = max(_rate(data), 1e-12)
+    no_noise = max(density.noise.spec.no_noise, _NO_NOISE * rate)
     found = [
         estimated("vision_attitude", config, (_FAMILY,), typical(data.vision_cov, 0, 1, 2)),
-        at_least_at_rest(density, data.head_t, data.head_gyro, data.head_force),
-        estimated("gyro_rate_noise", config, ("gyro",), beside=True),
+        _bounded(density, no_noise),
+        _bounded(estimated("gyro_rate_noise", config, ("gyro",), beside=True), no_noise / rate),
         Level(stated("gyro_bias_walk", config)),
     ]
     if data.platform_t is not None and data.platform_gyro is not None:
