@@ -1,4 +1,4 @@
-"""BROAD trials without any config, scored: python -m benchmarks.broad [TRIAL ...] [--noise DEG ...] [--judge].
+"""BROAD trials without any config, scored: python -m benchmarks.broad [TRIAL ...] [--noise DEG ...] [--window S].
 
 A line a trial: verdict, attitude against motion capture (carried by the gyro to every sample; averaged over 1 s, where
 motion capture's own noise hardly counts), bias against the mean rate at rest, and what the noise was found to be. With
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.methods.head.report import helmet_gyro
 from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import Config
 from datasets.broad import Trial, marker_attitudes, read_trial, score, to_session
 
 Array = NDArray[np.float64]
@@ -40,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 0.5], help="added to motion capture, deg")
     parser.add_argument("--solver", nargs="+", default=["batch"], choices=("batch", "incremental"))
     parser.add_argument("--config", type=Path, help="by default none")
+    parser.add_argument("--window", type=float, default=np.inf, help="calibrate disjoint parts of so many seconds")
     parser.add_argument("--judge", action="store_true", help="compare accelerations too")
     options = parser.parse_args(arguments)
     for path in sorted(options.data.glob("*.mat")):
@@ -47,18 +49,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         trial = read_trial(path)
         for noise in options.noise:
-            data = to_session(trial, 0, float(np.deg2rad(noise)))
-            head = methods.method("head")
-            session = Session(head, data, load_config(None, options.config))
-            for solver in options.solver:
-                start = time.process_time()
-                calibration = session.calibrate(solver, check=False)
-                seconds = time.process_time() - start
-                named = f"{path.name[:2]} {noise:.1f} {solver:11s}"
-                print(f"{named} {_line(trial, calibration)} {seconds:.0f} s", flush=True)
-                if options.judge:
-                    print(f"   {judged(path, trial, calibration)}", flush=True)
+            config = load_config(None, options.config)
+            for begin, session in _parts(trial, float(np.deg2rad(noise)), options.window, config):
+                for solver in options.solver:
+                    start = time.process_time()
+                    calibration = session.calibrate(solver, check=False)
+                    seconds = time.process_time() - start
+                    named = f"{path.name[:2]} {noise:.1f} {begin:3.0f} s {solver:11s}"
+                    print(f"{named} {_line(trial, calibration)} {seconds:.0f} s", flush=True)
+                    if options.judge:
+                        print(f"   {judged(path, trial, calibration)}", flush=True)
     return 0
+
+
+def _parts(trial: Trial, noise: float, window: float, config: Config) -> Iterator[tuple[float, Session]]:
+    """Sessions of disjoint windows (s) and when they begin, s; of an infinite window, of the whole trial."""
+    head, data = methods.method("head"), to_session(trial, 0, noise)
+    end = float(min(data.head_t[-1], data.vision_t[-1]))
+    for begin in np.arange(max(1.0, end // window)) * min(window, end):
+        part = data if window > end else head.faults.segment(data, begin, begin + window)
+        yield float(begin), Session(head, part, config)
 
 
 def _line(trial: Trial, calibration: Calibration) -> str:
