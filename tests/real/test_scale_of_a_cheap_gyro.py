@@ -70,6 +70,6 @@ def test_the_noise_of_the_gyro_is_at_least_that_at_rest_and_grows_with_the_rate(
     """9.5e-4 rad/s/sqrt(Hz) by its Allan deviation; 6e-6 also has a maximum of the likelihood."""
     for name in ("u1", "u2"):
         found = alidade.open(shared_data / "upenn_imu_vicon" / f"{name}.mcap").calibrate(report=False)
-        used = {each.name: each.used for each in found.noises}
+        used = {each.noise.name: each.used for each in found.estimate.levels}
         assert 6e-4 < used["gyro_density"] < 3e-3
         assert 3e-3 < used["gyro_rate_noise"] < 1.5e-2
