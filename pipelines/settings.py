@@ -11,7 +11,7 @@ import datetime
 import reprlib
 from collections.abc import Collection, Iterable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -25,6 +25,7 @@ from pydantic import (
     ValidationError,
     field_validator,
     model_serializer,
+    model_validator,
 )
 from pydantic import Tag as Case
 
@@ -56,6 +57,8 @@ def _date(value: object) -> object:
 # In whatever SI unit no figure of a sensor, a mount or a site is larger, and no sigma but 0 smaller: their squares and
 # products overflow or vanish, in native code without a word.
 _LARGEST, _LEAST_SIGMA = 1e9, 1e-15
+# T: of a field in a shield or coils that a magnetometer can be calibrated in; other numbers are of another unit.
+_WEAKEST_FIELD, _STRONGEST_FIELD = 1e-6, 1e-3
 
 
 def _not_tiny(sigma: float) -> float:
@@ -195,6 +198,25 @@ class FieldSheet(Sheet):
     model_error: Sigma | None = None  # T, of its model there
 
 
+class Strength(Section):
+    """Strength of the magnetic field as an instrument measured it."""
+
+    value: float  # T
+    sigma: Sigma  # T
+
+    @model_validator(mode="after")
+    def _in_tesla(self) -> Self:
+        if not (_WEAKEST_FIELD <= self.value <= _STRONGEST_FIELD and self.sigma < self.value):
+            raise ValueError("value and sigma are in T; the earth's field has 2.2e-5 to 6.7e-5")
+        return self
+
+
+class EarthField(Section):
+    """What was measured of the magnetic field at the place."""
+
+    strength: Strength | None = None  # by a proton or calibrated magnetometer; null: the model's
+
+
 class GimbalSheet(Sheet):
     """Of a gimbal."""
 
@@ -319,6 +341,7 @@ class Config(Section):
     require: dict[str, Sigma] = {}  # parameter: sigma wanted
     sensors: SensorSheets = Sensors()  # data sheets; ideal: all figures 0
     vision: Vision = Vision()  # what measures attitudes
+    field: EarthField = EarthField()  # what was measured of the magnetic field
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None  # deg north; wins over fixes
     longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None  # deg east
     altitude_m: float | None = None  # above the ellipsoid

@@ -41,6 +41,7 @@ class Prediction:
         scenario: the motion.
         duration: of the recording, s.
         quantities: what is estimated.
+        values: (n,) of the draw.
         covariance: (n, n), predicted, SI, in the order of the quantities.
         budget: parameter -> source -> its share of the variance, of the worst draw.
         worst: the seed of the draw that falls shortest of what is required.
@@ -50,6 +51,7 @@ class Prediction:
     scenario: Scenario
     duration: float
     quantities: tuple[Quantity, ...]
+    values: Array
     covariance: Array
     budget: Mapping[str, Mapping[str, float]]
     worst: int = 0
@@ -64,12 +66,12 @@ class Prediction:
     @property
     def verdicts(self) -> dict[str, Verdict]:
         """Parameter -> predicted verdict, of those with a required accuracy."""
-        return verdicts(self.quantities, self.covariance)
+        return verdicts(self.quantities, self.covariance, (), self.values)
 
     @property
     def directions(self) -> tuple[Finding, ...]:
         """Predicted weak and unobservable directions, worst first."""
-        return weak_directions(self.quantities, self.covariance, self.advice)
+        return weak_directions(self.quantities, self.covariance, self.advice, self.values)
 
     @property
     def status(self) -> Status:
@@ -80,7 +82,7 @@ class Prediction:
     def missing(self) -> dict[str, float]:
         """Parameter -> predicted sigma over the one required, of those that fall short."""
         sigmas = self.sigmas
-        estimated = [q for q in self.quantities if q.prior_sigma != 0.0]
+        estimated = [q for q in self.quantities if q.prior_sigma != 0.0 and not q.relative]
         return {q.name: sigmas[q.name] / q.require for q in estimated if sigmas[q.name] > q.require}
 
 
@@ -219,9 +221,8 @@ def _predicted(
     except IndeterminateError as error:
         raise InputError(f"scenario: {error}") from error
     covariance = finite_covariance(problem.quantities, estimate.covariance)
-    return Prediction(
-        scenario, session.facts.duration_s, problem.quantities, covariance, estimate.budget or {}, seed, problem.advice
-    )
+    duration, budget = session.facts.duration_s, estimate.budget or {}
+    return Prediction(scenario, duration, problem.quantities, estimate.values, covariance, budget, seed, problem.advice)
 
 
 def requirements(given: Sequence[str]) -> dict[str, float]:

@@ -621,6 +621,8 @@ def _check_sheets(method: Method, config: Config) -> None:
     """Raise InputError when something is stated that the method has no use for: it would be ignored in silence."""
     if "vision" in config.model_fields_set and "vision_attitude" not in {topic.key for topic in method.topics}:
         raise InputError(f"vision: method {method.name} has no use for it; it reads no attitudes by vision")
+    if "field" in config.model_fields_set and "field" not in method.data_sheets:
+        raise InputError(f"field: method {method.name} has no use for it; it reads no magnetometer")
     for name in sorted(config.sensors.model_fields_set):
         sheet, figures = getattr(config.sensors, name), method.data_sheets.get(name, [])
         useless = [each for each in sorted(sheet.model_fields_set - {*figures}) if getattr(sheet, each) != 0.0]

@@ -73,7 +73,7 @@ def diagnose(
     if not estimate.converged and not published:
         return by_severity([*hypotheses, failure, *rejections(estimate, limits)])
     # What data with a fault determine says nothing of what they would without it.
-    directions = () if hypotheses else weak_directions(quantities, estimate.covariance, advise)
+    directions = () if hypotheses else weak_directions(quantities, estimate.covariance, advise, estimate.values)
     found = [*directions, *contradictions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
         found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
@@ -113,8 +113,8 @@ def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity], limits:
         j, worst = left[0], quantities[left[0]]
         same = [k for k in nuisance if k != j and abs(P[j, k]) > limits.inseparable * sigma[j] * sigma[k]]
         shift = P[:, j] / P[j, j] * (x[j] - worst.prior_mean)
-        effect = {q.name: float(shift[i]) for i, q in enumerate(quantities) if q.judged and shift[i]}
-        material = any(abs(effect.get(q.name, 0.0)) >= limits.material * q.require for q in quantities if q.judged)
+        effect = {q.name: float(shift[i]) for i, q in enumerate(quantities) if q.required and shift[i]}
+        material = any(abs(effect.get(q.name, 0.0)) >= limits.material * q.require for q in quantities if q.required)
         severe = material and sigma[j] < limits.determined * worst.scale
         others = tuple(sorted(quantities[k].name for k in same))
         yield _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)
@@ -191,8 +191,8 @@ def _slow_errors(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator
     ratios = estimate.sandwich
     if ratios is None:
         return
-    judged = [i for i, q in enumerate(quantities) if q.judged]
-    worst = max(judged, key=lambda i: float(ratios[i]), default=None)
+    required = [i for i, q in enumerate(quantities) if q.required]
+    worst = max(required, key=lambda i: float(ratios[i]), default=None)
     if worst is not None and ratios[worst] > SLOW_ERROR:
         ratio = float(ratios[worst])
         yield Finding("slow_error", NOTE, {"parameter": quantities[worst].name, "ratio": ratio})

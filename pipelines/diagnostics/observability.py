@@ -5,18 +5,20 @@ The rules are those of the contract, section Verdicts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.common_factor import Scaling, scalings
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Array, History, Quantity
 
 Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]
+_RANKS: tuple[Verdict, ...] = get_args(Verdict)
 # Weights of a direction by parameter name -> motion that would determine it.
 Advise = Callable[[Mapping[str, float]], Motion]
 
@@ -44,15 +46,94 @@ def verdict(quantity: Quantity, sigma: float) -> Verdict:
     return "unobservable" if unchanged else "weak"
 
 
-def verdicts(quantities: Sequence[Quantity], covariance: Array, findings: Sequence[Finding] = ()) -> dict[str, Verdict]:
-    """Parameter -> verdict, of those with a required accuracy; covariance (n, n) in the order of the quantities.
+def verdicts(
+    quantities: Sequence[Quantity], covariance: Array, findings: Sequence[Finding] = (), values: Array | None = None
+) -> dict[str, Verdict]:
+    """Parameter -> verdict, of those with a required accuracy, and of a shape where that is required instead.
 
     Of a solution that rejected more than a quarter of a family, as its findings have it, nothing is `observable`: what
     is left are the measurements that agree with it.
+
+    Args:
+        quantities: n of them.
+        covariance: (n, n) in their order.
+        findings: on the solution.
+        values: (n,) in their order; None: no shape is judged.
     """
-    sigmas, doubtful = np.sqrt(np.diag(covariance)).tolist(), rejects_many(findings)
+    sigmas = np.sqrt(np.diag(covariance)).tolist()
     found = {q.name: verdict(q, sigma) for q, sigma in zip(quantities, sigmas, strict=True) if q.judged}
-    return {name: "weak" if doubtful and each == "observable" else each for name, each in found.items()}
+    instead = {q.factor for q in quantities if q.relative}
+    for scaling in [] if values is None else scalings(quantities, values):
+        shape = _shape(scaling, quantities, covariance)
+        if scaling.factor in instead and shape.verdict is not None:
+            found[shape.name] = shape.verdict
+    return {name: doubted(each, findings) for name, each in found.items()}
+
+
+def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
+    """A verdict on a number of a solution with these findings: of one that rejects many none is `observable`."""
+    return "weak" if found == "observable" and rejects_many(findings) else found
+
+
+class DerivedNumber(NamedTuple):
+    """SENSOR_scale, a factor that numbers have in common, or SENSOR_shape, what is left of them.
+
+    Attributes:
+        name: as above.
+        sigma: relative; of a shape the largest, each in units of what is required of its number.
+        require: of sigma; None: nothing is required.
+        verdict: as of a parameter; None where nothing is required.
+    """
+
+    name: str
+    sigma: float
+    require: float | None
+    verdict: Verdict | None
+
+
+def derived(
+    quantities: Sequence[Quantity], covariance: Array, values: Array, findings: Sequence[Finding] = ()
+) -> list[DerivedNumber]:
+    """Scale and shape of the sensors whose scale no recording tells from the strength of what they measure.
+
+    Args:
+        quantities: n of them.
+        covariance: (n, n), finite, in their order.
+        values: (n,), SI.
+        findings: on the solution.
+    """
+    both = (
+        each(scaling, quantities, covariance) for scaling in scalings(quantities, values) for each in (_scale, _shape)
+    )
+    return [number._replace(verdict=number.verdict and doubted(number.verdict, findings)) for number in both]
+
+
+def _scale(scaling: Scaling, quantities: Sequence[Quantity], covariance: Array) -> DerivedNumber:
+    """A common factor: it is required to be so good that no number judged by itself misses its accuracy for it."""
+    moved, sigmas = _moved(scaling, quantities, covariance), np.sqrt(np.diag(covariance))
+    rows = list(zip(quantities, np.abs(scaling.x), moved, sigmas, strict=True))
+    require = min((q.require / x for q, x, m, _ in rows if m > 0.0), default=None)
+    worst = None if require is None else _worst(verdict(q, max(m, s)) for q, _, m, s in rows if m > q.require)
+    return DerivedNumber(f"{scaling.factor.sensor}_scale", scaling.sigma(covariance), require, worst)
+
+
+def _shape(scaling: Scaling, quantities: Sequence[Quantity], covariance: Array) -> DerivedNumber:
+    sigmas = np.sqrt(np.maximum(np.diag(scaling.shape(covariance)), 0.0))
+    own = [(q, s) for q, s in zip(quantities, sigmas, strict=True) if q.factor == scaling.factor and not q.assumed]
+    name, require = f"{scaling.factor.sensor}_shape", scaling.factor.require
+    return DerivedNumber(
+        name, require * float(max(s / q.require for q, s in own)), require, _worst(verdict(*each) for each in own)
+    )
+
+
+def _moved(scaling: Scaling, quantities: Sequence[Quantity], covariance: Array) -> Array:
+    """(n,) what one sigma of a common factor moves the numbers by that are judged by themselves."""
+    judged = np.array([q.judged and q.prior_sigma != 0.0 for q in quantities])
+    return np.asarray(np.where(judged, np.abs(scaling.x) * scaling.sigma(covariance), 0.0))
+
+
+def _worst(found: Iterable[Verdict]) -> Verdict:
+    return max(found, key=_RANKS.index, default="observable")
 
 
 def rejects_many(findings: Sequence[Finding]) -> bool:
@@ -79,7 +160,7 @@ def finite_covariance(quantities: Sequence[Quantity], covariance: Array) -> Arra
 
 
 def weak_directions(
-    quantities: Sequence[Quantity], covariance: Array, advise: Advise | None = None
+    quantities: Sequence[Quantity], covariance: Array, advise: Advise | None = None, values: Array | None = None
 ) -> tuple[Finding, ...]:
     """Weak and unobservable eigen-directions of the prior-scaled covariance (n, n), worst first.
 
@@ -87,31 +168,49 @@ def weak_directions(
     some parameter's sigma is larger than this parameter's `require`, or when it is the largest share of a sigma that
     is; no direction is blamed for parameters that are all as accurate as required. It is then unobservable if its sigma
     is 0.9 of its prior's or more, else weak. Fixed quantities, and those without a required accuracy, take no part.
+
+    A factor that numbers have in common is a direction of its own, SENSOR_scale; the others are of their shape. Without
+    the values (n,) of the quantities there is none.
     """
-    estimated = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0 and q.judged]
+    estimated = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0 and q.required]
     if not estimated:
         return ()
     covariance = finite_covariance(quantities, covariance)
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    factors = [] if values is None else scalings(quantities, values)
+    moved = [_moved(factor, quantities, covariance)[estimated] for factor in factors]
+    scales = [_scale(factor, quantities, covariance) for factor in factors]
+    for factor in factors:
+        covariance = factor.shape(covariance)
+    relative = np.array([q.relative for q in quantities])
+    sigmas = np.where(relative, np.sqrt(np.maximum(np.diag(covariance), 0.0)), sigmas)[estimated]
     names = [quantities[i].name for i in estimated]
     scale = np.array([quantities[i].scale for i in estimated])
     require = np.array([quantities[i].require for i in estimated])
     scaled = covariance[np.ix_(estimated, estimated)] / np.outer(scale, scale)
     eigenvalues, vectors = np.linalg.eigh(scaled)
     ratios = np.sqrt(np.maximum(eigenvalues, 0.0))
-    shares = np.abs(vectors) * np.outer(scale, ratios)
+    shares = np.column_stack([np.abs(vectors) * np.outer(scale, ratios), *moved])
     beyond = shares > require[:, None]
-    for i in np.flatnonzero(np.sqrt(np.diag(scaled)) * scale > require):
+    for i in np.flatnonzero(sigmas > require):
         beyond[i, np.argmax(shares[i])] = True
-    bad = np.flatnonzero(beyond.any(axis=0))[::-1]
+    is_bad = beyond.any(axis=0)
+    bad = np.flatnonzero(is_bad[: len(ratios)])[::-1]
     found = []
     for group in _degenerate(ratios[bad]):
         severity = Severity.UNOBSERVABLE if ratios[bad[group]][0] >= _UNCHANGED else Severity.WEAK
         for vector in _simplest_basis(vectors[:, bad[group]]).T:
-            weights = _weights(names, vector)
             ratio = float(np.sqrt(max(vector @ scaled @ vector, 0.0)))
-            advice = (advise(weights) if advise else _DEFAULT_ADVICE).advice
-            found.append(Finding("direction", severity, {"weights": weights, "sigma_ratio": ratio, "advice": advice}))
+            found.append(_direction(severity, _weights(names, vector), ratio, advise))
+    for j in np.flatnonzero(is_bad[len(ratios) :]):
+        severity = Severity.UNOBSERVABLE if scales[j].verdict == "unobservable" else Severity.WEAK
+        found.append(_direction(severity, {scales[j].name: 1.0}, float((moved[j] / scale).max()), advise))
     return tuple(found)
+
+
+def _direction(severity: Severity, weights: Mapping[str, float], ratio: float, advise: Advise | None) -> Finding:
+    advice = (advise(weights) if advise else _DEFAULT_ADVICE).advice
+    return Finding("direction", severity, {"weights": weights, "sigma_ratio": ratio, "advice": advice})
 
 
 def _degenerate(ratios: Array) -> list[NDArray[np.intp]]:

@@ -76,7 +76,9 @@ def contradictions(
         j, shifts = fixed[worst], np.zeros(len(inside))
         shifts[inside], shifts[j] = -gain[:, worst] * x[worst], x[worst]
         shifts *= sqrt_info.scales
-        effect = {name: float(shifts[i]) for i, name in enumerate(sqrt_info.names) if known[name].judged and shifts[i]}
+        effect = {
+            name: float(shifts[i]) for i, name in enumerate(sqrt_info.names) if known[name].required and shifts[i]
+        }
         material = any(abs(shift) >= limits.material * known[name].require for name, shift in effect.items())
         alike = fixed[np.abs(correlation[worst]) > limits.inseparable]
         evidence = {

@@ -96,14 +96,16 @@ def spec_of(specs: Iterable[ParameterSpec], name: str) -> ParameterSpec | None:
     return next((spec for spec in specs if any(fnmatchcase(name, each) for each in spec.names)), None)
 
 
-def check_parameters(specs: Iterable[ParameterSpec], config: Config, more: Sequence[str] = ()) -> None:
+def check_parameters(
+    specs: Iterable[ParameterSpec], config: Config, more: Sequence[str] = (), derived: Sequence[str] = ()
+) -> None:
     """Raise InputError if the config has a prior or a requirement of an unknown parameter.
 
-    `more` are names of parameters that stand for a * of the specs.
+    `more` are names of parameters that stand for a * of the specs, `derived` what else may be required.
     """
     known = [*(name for spec in specs for name in spec.names if "*" not in name), *more]
     check_names(config.priors, known, "priors")
-    check_names(config.require, known, "require")
+    check_names(config.require, [*known, *derived], "require")
 
 
 def gyro_scale(

@@ -78,6 +78,21 @@ class NearRotationVector:
         return phi, so3.right_jacobian_inverse(phi)
 
 
+@dataclass(frozen=True)
+class CommonFactor:
+    """A factor that K and b of a sensor have in common, which no recording tells from the strength it measures.
+
+    What is left is the sensor's shape: K and b in units of that strength.
+
+    Attributes:
+        sensor: its name.
+        require: accuracy wanted of the factor and of K over it, one sigma.
+    """
+
+    sensor: str
+    require: float
+
+
 # A recording says what a number is when its sigma is below this share of the prior's.
 _DETERMINED = 0.5
 
@@ -98,6 +113,8 @@ class Quantity:
             is calibrated.
         nuisance: calibrated, but beside the purpose: a value far beyond its prior is a fault, as of an assumption.
         sheet: of an assumption, the data sheet's figure that its prior comes from, as in the config: "gyro.scale".
+        factor: that it has in common with others; None: none.
+        relative: its required accuracy is up to that factor, and it is judged with the others.
     """
 
     name: str
@@ -110,6 +127,8 @@ class Quantity:
     group: Literal["assumption"] | None = None
     nuisance: bool = False
     sheet: str = ""
+    factor: CommonFactor | None = None
+    relative: bool = False
 
     @property
     def assumed(self) -> bool:
@@ -122,9 +141,14 @@ class Quantity:
         return 0.0 < (self.prior_sigma or 0.0) < self.prior_scale
 
     @property
-    def judged(self) -> bool:
-        """Whether an accuracy is wanted of it, so that there is a verdict."""
+    def required(self) -> bool:
+        """Whether an accuracy is wanted of it."""
         return math.isfinite(self.require)
+
+    @property
+    def judged(self) -> bool:
+        """Whether an accuracy is wanted of it by itself, so that there is a verdict."""
+        return self.required and not self.relative
 
     @property
     def scale(self) -> float:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from alidade.factors.earth import magnetic_field
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.parameters import ParameterSpec
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.parameters import ParameterSpec, stated
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import Topic, wanted
@@ -17,7 +18,7 @@ from alidade.pipelines.settings import Config, first_given
 
 Array = NDArray[np.float64]
 
-# The earth's field, each component about its model: outdoors; a building may add ten times that.
+# The earth's field, each component about its model: outdoors. A parked car adds 1e-6 to 5e-6, a building 5e-6.
 FIELD = ParameterSpec(
     "field",
     "T",
@@ -28,8 +29,32 @@ FIELD = ParameterSpec(
     require=1e-6,
     per_recording=True,
 )
-# Of the total intensity by WMM 2025, T: global error model of its technical report (NOAA/NCEI and BGS, 2024).
-STRENGTH_SIGMA = 1.38e-7
+STRENGTH_ADVICE = Motion(
+    "measure that strength with a proton or calibrated magnetometer and state it, in T, as "
+    "field: {strength: {value: 4.9e-5, sigma: 1.0e-7}}; where headings are all that is wanted, require the shape "
+    "alone: require: {mag_shape: 5.0e-3}",
+    why="no motion tells the magnetometer's scale from the strength of the field",
+)
+
+
+def known_strength(config: Config, model: Array | None) -> tuple[float, float] | None:
+    """Strength of the field and its sigma, T: as measured, else of the model (3,); None without both."""
+    measured = config.field.strength
+    if measured is not None:
+        return measured.value, measured.sigma
+    return None if model is None else (float(np.linalg.norm(model)), stated(config, FIELD))
+
+
+def known_field(config: Config, model: Array) -> tuple[Array, Array]:
+    """Prior mean (3,) and square root (3, 3) of the covariance of the field, T, from its model (3,).
+
+    Its direction is the model's; a strength that was measured replaces the model's.
+    """
+    strength = known_strength(config, model)
+    assert strength is not None
+    along = model / np.linalg.norm(model)
+    across = stated(config, FIELD)
+    return strength[0] * along, across * np.eye(3) + (strength[1] - across) * np.outer(along, along)
 
 
 def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float | None, float | None, float]:

@@ -6,7 +6,7 @@ definition of the body's axes there are only the six on and above the diagonal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +14,11 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.gyro import symmetric
 from alidade.pipelines.estimation.parameters import SENSORS, ParameterSpec
-from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.estimation.problem import Array, CommonFactor, Quantity
 from alidade.pipelines.methods import Correction
 from alidade.pipelines.methods.formula import Formula
 from alidade.pipelines.recording.topics import IMU, MAG
+from alidade.pipelines.settings import Config
 
 TRIADS = ("accel", "gyro", "mag")
 # Of S of a gyro, in the order that `symmetric` takes.
@@ -60,6 +61,33 @@ def triad_specs(
         f"{name}_b{{}}", unit, bias[0], f"{sensor} offset, {{axis}} (after K).", axes="123", require=bias[1]
     )
     return (*K, replace(b, per_recording=per_recording))
+
+
+def shape(sensor: str) -> str:
+    """Name under which the accuracy of K and b up to a common factor is required."""
+    return f"{sensor}_shape"
+
+
+def with_factor(sensor: str, quantities: Sequence[Quantity], config: Config, require: float) -> tuple[Quantity, ...]:
+    """Quantities that have a factor in common which no recording tells from the strength of what a sensor measures.
+
+    Where the config requires the shape, those that it does not name are judged by their shape.
+
+    Args:
+        sensor: its name.
+        quantities: K and b, and the strength.
+        config: what is required.
+        require: accuracy of K, which they are declared with.
+    """
+    wanted = config.require.get(shape(sensor))
+    factor = CommonFactor(sensor, require if wanted is None else wanted)
+
+    def of(q: Quantity) -> Quantity:
+        relative = wanted is not None and q.name not in config.require
+        tighter = factor.require / require if relative and q.name.startswith(f"{sensor}_k") else 1.0
+        return replace(q, require=tighter * q.require, factor=factor, relative=relative)
+
+    return tuple(map(of, quantities))
 
 
 def triad_names(name: str, symmetric: bool = False) -> tuple[str, ...]:

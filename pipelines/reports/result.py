@@ -20,7 +20,14 @@ import numpy as np
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.device_changes import Changes
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest, SolverDifference
-from alidade.pipelines.diagnostics.observability import TimeToAccuracy, Verdict, time_to_accuracy, verdicts
+from alidade.pipelines.diagnostics.observability import (
+    DerivedNumber,
+    TimeToAccuracy,
+    Verdict,
+    derived,
+    time_to_accuracy,
+    verdicts,
+)
 from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.finding import Finding, Status, status
@@ -242,7 +249,15 @@ class Calibration(SensorValues):
     @property
     def verdicts(self) -> dict[str, Verdict]:
         """Parameter -> verdict, of those with a required accuracy."""
-        return verdicts(quantities_of(self.problem, self.estimate), self.estimate.covariance, self.findings)
+        return verdicts(
+            quantities_of(self.problem, self.estimate), self.estimate.covariance, self.findings, self.estimate.values
+        )
+
+    @property
+    def derived(self) -> list[DerivedNumber]:
+        """Scale and shape of a sensor whose scale hangs on the strength of what it measures."""
+        known = quantities_of(self.problem, self.estimate)
+        return derived(known, self.estimate.covariance, self.estimate.values, self.findings)
 
     @property
     def quantities(self) -> dict[str, Quantity]:

@@ -71,6 +71,15 @@ class ParameterResult(_Record):
         return {k: v for k, v in content.items() if k not in left_out}
 
 
+class DerivedResult(_Record):
+    """What follows from parameters: mag_scale, a factor that K, b and the field have in common; mag_shape, the rest."""
+
+    name: str
+    sigma: float  # relative, one standard deviation
+    require: float | None  # sigma wanted; null: none
+    verdict: Verdict | None  # null: nothing is required
+
+
 class NoiseResult(_Record):
     """A noise in its unit: stated by whom, estimated from the recording with sigma (null: not asked), and used.
 
@@ -279,6 +288,7 @@ class Result(_Record):
     solver: str  # batch, incremental or published
     status: Status  # the verdict on the whole
     parameters: list[ParameterResult]
+    derived: list[DerivedResult] = []  # what follows from them
     covariance: CovarianceResult
     null_directions: list[DirectionResult]
     chi_square: ChiSquareResult
@@ -346,6 +356,7 @@ def result(calibration: Calibration) -> Result:
             "solver": c.estimate.solver,
             "status": c.status,
             "parameters": list(c.parameters.values()),
+            "derived": [each._asdict() for each in c.derived],
             "covariance": {"order": c.estimate.names, "matrix": c.covariance.tolist()},
             "null_directions": [direction.evidence for direction in c.directions],
             "chi_square": {

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.observability import Verdict, rejects_many, verdict
+from alidade.pipelines.diagnostics.observability import DerivedNumber, Verdict, doubted, verdict
 from alidade.pipelines.display.table import Cell, Column, Interval, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.parameters import SENSORS
@@ -187,12 +187,14 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     symmetric = f"{sensor}_k21" not in names
     unit = c.quantities[f"{sensor}_k11"].unit
     plain = unit in ("", "1")
+    common = {each.name: each for each in c.derived}.get(f"{sensor}_scale")
+    relative = common is not None or not plain
 
     def parts(values: Array) -> Array:
         K, bias = sensor_model(sensor, dict(zip(names, values.tolist(), strict=True)))
         found = parts_of(K)
-        scale = found[:3] - 1.0 if plain else found[:3] / found[:3].mean() - 1.0
-        return np.concatenate([scale, found[3:], bias])
+        mean = found[:3].mean()
+        return np.concatenate([found[:3] / (mean if relative else 1.0) - 1.0, found[3:], bias, [mean]])
 
     try:
         rows = _derived(c, names, parts)
@@ -205,17 +207,28 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     raw = unit.partition("/")[2]
     bias_unit, factor = ("counts", 1.0) if raw == "count" else _BIAS_UNITS[sensor]
     groups = [
-        ResultGroup("Scale error" if plain else "Scale error, relative to their mean", percent, tuple(scale)),
+        ResultGroup("Scale error about mean" if relative else "Scale error", percent, tuple(scale)),
         ResultGroup("Non-orthogonality", "deg", tuple(row.times(_DEG) for row in rows[3:6])),
         ResultGroup("Misalignment", "deg", tuple(row.times(_DEG) for row in rows[6:9])),
-        ResultGroup("Bias", bias_unit, tuple(row.times(factor) for row in rows[9:])),
+        ResultGroup("Bias", bias_unit, tuple(row.times(factor) for row in rows[9:12])),
     ]
     if symmetric:
         groups[2] = ResultGroup("Misalignment", "", (), "0 by definition: it defines the body's axes")
+    if common is not None and not unit.startswith("1/"):
+        groups.insert(0, _overall(rows[12], common, raw))
     return ResultCard(SENSORS[sensor].capitalize(), tuple(groups))
 
 
-_LABELS = (*"xyz", "xy", "xz", "yz", *"xyz", *"xyz")
+def _overall(row: ResultRow, common: DerivedNumber, raw: str) -> ResultGroup:
+    """The mean scale, whose error all axes have in common; of counts per µT."""
+    require = None if common.require is None else common.require * row.value
+    row = replace(row, require=require, verdict=common.verdict)
+    if raw:
+        return ResultGroup("Mean scale", f"{raw}s/µT", (row.times(1e-6),))
+    return ResultGroup("Mean scale error", "%", (replace(row, value=row.value - 1.0).times(100.0),))
+
+
+_LABELS = (*"xyz", "xy", "xz", "yz", *"xyz", *"xyz", "xyz")
 
 
 def _derived(c: Calibration, names: Sequence[str], function: Callable[[Array], Array]) -> list[ResultRow]:
@@ -224,13 +237,12 @@ def _derived(c: Calibration, names: Sequence[str], function: Callable[[Array], A
     x, P = np.array([c.values[name] for name in names]), c.covariance_of(names)
     step = np.where(np.diag(P) > 0.0, _STEP * np.sqrt(np.diag(P)), 0.0)
     value, J = function(x), numeric_jacobian(function, x, step)
-    wanted = np.array([q.require if q.judged else 0.0 for q in quantities])
+    wanted = np.array([q.require if q.required else 0.0 for q in quantities])
     prior = np.array([q.scale for q in quantities])
     require, scale = (np.sqrt((J**2) @ v**2) for v in (wanted, prior))
     sigma = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", J, P, J), 0.0))
     truth = {name: found.value for name, found in truth_errors(c).items()}
     error = value - function(np.array([truth[n] for n in names])) if truth.keys() >= set(names) else None
-    doubtful = rejects_many(c.findings)
     rows = []
     for i, label in enumerate(_LABELS):
         fixed = sigma[i] <= _NOTHING * require[i]
@@ -243,7 +255,7 @@ def _derived(c: Calibration, names: Sequence[str], function: Callable[[Array], A
                 float(value[i]),
                 0.0 if fixed else float(sigma[i]),
                 float(require[i]) or None,
-                "weak" if doubtful and found == "observable" else found,
+                doubted(found, c.findings),
                 None if error is None else float(error[i]),
                 tuple(names),
                 hint="of K and b: " + ", ".join(n for n, d in zip(names, J[i], strict=True) if d)[:80],

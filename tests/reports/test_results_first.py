@@ -69,7 +69,7 @@ def test_sections_come_in_the_order_in_which_they_are_asked_for() -> None:
     titles = [section.title for section in report.sections if section.blocks and section.title]
     assert titles == ["Results", "Uncertainty in use", "Frames", "Apply", "Diagnostics", "Details"]
     page = Page(report_html(calibrated("tumble")))
-    first = ["All 9 required parameters", "heading, any direction", "Scale error, %"]
+    first = ["All 9 required parameters", "heading, any direction", "Mean scale error, %"]
     order = [*first, "In plain words", "Parameters parameter value"]
     assert sorted(order, key=page.text.index) == order
     assert report.summary is not None
@@ -79,7 +79,7 @@ def test_sections_come_in_the_order_in_which_they_are_asked_for() -> None:
 def test_a_terminal_and_a_notebook_show_what_the_page_begins_with() -> None:
     c = calibrated("tumble")
     text = str(c)
-    order = ["calibrated. All 9 required", "heading, any direction", "Scale error x, %", "Bias z, µT"]
+    order = ["calibrated. All 9 required", "heading, any direction", "Mean scale error, %", "Scale error about mean x, %", "Bias z, µT"]
     assert sorted(order, key=text.index) == order
     assert max(len(line) for line in text.splitlines() if "observable" in line) <= 80
     assert "mag_k11" not in text
@@ -107,14 +107,17 @@ def test_the_verdict_is_one_sentence_whatever_fails() -> None:
 def test_scale_angles_and_bias_have_the_sigmas_of_draws() -> None:
     c = calibrated("tumble")
     (card, *_) = result_cards(c)
-    assert [group.title for group in card.groups] == ["Scale error", "Non-orthogonality", "Misalignment", "Bias"]
+    titles = [group.title for group in card.groups]
+    assert titles == ["Mean scale error", "Scale error about mean", "Non-orthogonality", "Misalignment", "Bias"]
     names = list(c.values)
     draws = np.random.default_rng(0).multivariate_normal(c.estimate.values, c.covariance, 4000)
     parts = []
     for draw in draws:
         K, bias = sensor_model("mag", dict(zip(names, draw.tolist(), strict=True)))
         found = parts_of(K)
-        parts.append([*(100.0 * (found[:3] - 1.0)), *np.rad2deg(found[3:6]), *(1e6 * bias)])
+        mean = found[:3].mean()
+        relative = [mean - 1.0, *(found[:3] / mean - 1.0)]
+        parts.append([*(100.0 * np.array(relative)), *np.rad2deg(found[3:6]), *(1e6 * bias)])
     rows = [row for _, row in card.rows]
     np.testing.assert_allclose([row.value for row in rows], np.mean(parts, axis=0), rtol=1e-2, atol=2e-3)
     np.testing.assert_allclose([row.sigma for row in rows], np.std(parts, axis=0), rtol=0.05)

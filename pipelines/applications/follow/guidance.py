@@ -62,7 +62,7 @@ class View:
     @property
     def verdicts(self) -> dict[str, Verdict]:
         """Parameter -> verdict, of those with a required accuracy; none while there is too little."""
-        return {} if self.covariance is None else verdicts(self.quantities, self.covariance, self.findings)
+        return {} if self.covariance is None else verdicts(self.quantities, self.covariance, self.findings, self.values)
 
     @property
     def status(self) -> str:
@@ -191,8 +191,7 @@ def view_of(
     time = run.time if np.isfinite(run.time) else 0.0
     if not run.started:
         return View(time, epoch_ns, quantities, None, None, checklist, change)
-    covariance = finite_covariance(quantities, run.covariance())
-    findings = by_severity(
-        [*weak_directions(quantities, covariance, advise), *misfits(run.chi_square(), run.state.levels)]
-    )
-    return View(time, epoch_ns, quantities, run.values(), covariance, checklist, change, findings, advise)
+    covariance, values = finite_covariance(quantities, run.covariance()), run.values()
+    weak = weak_directions(quantities, covariance, advise, values)
+    findings = by_severity([*weak, *misfits(run.chi_square(), run.state.levels)])
+    return View(time, epoch_ns, quantities, values, covariance, checklist, change, findings, advise)

@@ -23,6 +23,7 @@ from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData
 from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.cube.simulation import attitudes
 from alidade.pipelines.methods.cube.static_poses import static_poses
+from alidade.pipelines.methods.place import STRENGTH_ADVICE
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.simulated import YEAR
 
@@ -165,12 +166,9 @@ _UP: dict[str, Side] = {"x": "+x", "y": "+y", "z": "+z"}
 
 def advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
+    if "mag_scale" in weights:
+        return STRENGTH_ADVICE
     strongest = [name for name, w in weights.items() if abs(w) > 0.3] or list(weights)
-    if all(name.startswith("field") for name in strongest):
-        return Motion(
-            "give tighter priors on field_e, field_n, field_u",
-            why="the magnetometer's scale follows the field model's strength",
-        )
     gyro = "".join(sorted({"xyz"[int(name[-1]) - 1] for name in strongest if name.startswith("gyro_k")}))
     if gyro:
         words = f"turn the cube between poses about its {' and '.join(gyro)} axis, by a quarter turn or more, both ways"

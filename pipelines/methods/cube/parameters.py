@@ -27,9 +27,9 @@ from alidade.pipelines.estimation.parameters import (
 from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
-from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA
+from alidade.pipelines.methods.place import FIELD, known_field
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE, GYRO_SLOPE
-from alidade.pipelines.methods.triads import TRIADS, triad_names, triad_specs
+from alidade.pipelines.methods.triads import TRIADS, shape, triad_names, triad_specs, with_factor
 from alidade.pipelines.settings import Config
 
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
@@ -125,7 +125,7 @@ class Parameters:
         places: corrections of the tags' positions; none without a camera.
         said: correction of what the reference says, tilt about East and North and heading; None without a camera.
         field: the earth's field in n about the model, None without a magnetometer.
-        field_model: (3,) T.
+        field_prior: its mean (3,) and the square root (3, 3) of its covariance, T.
         sensitivity: G of the gyro, None where it does not feel force.
         curvature: square and cube terms of the accelerometer, None where it has none.
         slopes: sensor -> what its offset does with its temperature, where that is known.
@@ -138,7 +138,7 @@ class Parameters:
     places: tuple[Parameter, ...]
     said: Parameter | None
     field: Parameter | None
-    field_model: Array | None
+    field_prior: tuple[Array, Array] | None
     sensitivity: Parameter | None
     curvature: Parameter | None
     slopes: Mapping[str, Parameter]
@@ -170,8 +170,8 @@ class Parameters:
             values.insert(rotation.key, so3.to_gtsam(so3.identity()))
         for vector in self.zeros:
             values.insert(vector.key, np.zeros(len(vector.quantities)))
-        if self.field is not None and self.field_model is not None:
-            values.insert(self.field.key, self.field_model)
+        if self.field is not None and self.field_prior is not None:
+            values.insert(self.field.key, self.field_prior[0])
         return values
 
 
@@ -184,21 +184,12 @@ def first_priors(parameters: Parameters) -> list[Factor]:
         factors.append(Factor.process_of("prior", prior.on(own.key)))
     factors += [rotation_prior(p) for p in parameters.rotations]
     factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in parameters.zeros]
-    if parameters.field is not None and parameters.field_model is not None:
-        factors.append(vector_prior(parameters.field, parameters.field_model))
-        if prior_sigmas(parameters.field).max() <= FIELD.prior:
-            factors.append(_strength(parameters.field.key, parameters.field_model))
+    if parameters.field is not None and parameters.field_prior is not None:
+        key, (mean, root) = parameters.field.key, parameters.field_prior
+        factors.append(
+            Factor.process_of("prior", linear_factor({key: np.asarray(np.linalg.inv(root))}, {key: mean}, 1.0))
+        )
     return factors
-
-
-def _strength(key: int, model: Array) -> Factor:
-    """The field's strength is as the model says, to the model's own error.
-
-    No motion separates it from the magnetometer's scale, and the usual prior on the components is made for its
-    direction. Not for a field that is farther off: a building changes its strength too.
-    """
-    along = (model / np.linalg.norm(model))[None]
-    return Factor.process_of("prior", linear_factor({key: along}, {key: model}, STRENGTH_SIGMA))
 
 
 def cube_parameters(
@@ -223,7 +214,10 @@ def cube_parameters(
         )
     tags = sorted(config.section(CubeConfig).tags)
     check_parameters(
-        PARAMETERS, config, [name for tag in tags for spec in (TAG, PLACE) for name in of_tag(spec, tag).names]
+        PARAMETERS,
+        config,
+        [name for tag in tags for spec in (TAG, PLACE) for name in of_tag(spec, tag).names],
+        [shape("mag")],
     )
 
     def nuisance(spec: ParameterSpec, fixed: bool = False) -> tuple[Quantity, ...]:
@@ -247,11 +241,11 @@ def cube_parameters(
             rotations.append(Parameter(tag_key(tag), own, rotation_vector_coordinates))
         tilt = [q if reference else replace(q, prior_sigma=0.0) for q in quantities(TILT, config)]
         said = Parameter(SAID_KEY, (*tilt, *nuisance(HEADING, not reference)))
-    field_parameter = None
+    field_parameter = field_prior = None
     if field is not None:
-        about = replace(FIELD, prior=stated(config, FIELD), data_sheet="")
-        modelled = tuple(replace(q, prior_mean=float(m)) for q, m in zip(nuisance(about), field, strict=True))
-        field_parameter = Parameter(FIELD_KEY, modelled)
+        field_parameter, field_prior = _field(config, field)
+        mag = triads["mag"]
+        triads["mag"] = replace(mag, quantities=with_factor("mag", mag.quantities, config, _GAIN[1]))
     return Parameters(
         triads=triads,
         priors=priors,
@@ -259,12 +253,28 @@ def cube_parameters(
         places=tuple(_place(tag, tag == tags[0], config) for tag in tags) if camera else (),
         said=said,
         field=field_parameter,
-        field_model=field,
+        field_prior=field_prior,
         sensitivity=parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
         curvature=parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
         lens=parameter(LENS_KEY, (FOCAL, CENTRE), config) if camera else None,
         slopes=_slopes(config) if thermometer else {},
     )
+
+
+def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Array]]:
+    """The field, and its prior mean (3,) and the square root (3, 3) of its covariance; the config's priors win."""
+    mean, root = known_field(config, model)
+    about = replace(FIELD, prior=stated(config, FIELD), data_sheet="")
+    plain = tuple(
+        replace(q, prior_mean=float(m), nuisance=True) for q, m in zip(quantities(about, config), mean, strict=True)
+    )
+    if config.priors.keys().isdisjoint(FIELD.names):
+        plain = tuple(
+            replace(q, prior_sigma=float(s)) for q, s in zip(plain, np.linalg.norm(root, axis=1), strict=True)
+        )
+    else:
+        root = np.diag(prior_sigmas(Parameter(FIELD_KEY, plain)))
+    return Parameter(FIELD_KEY, with_factor("mag", plain, config, _GAIN[1])), (mean, root)
 
 
 def _place(tag: int, fixed: bool, config: Config) -> Parameter:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from alidade.pipelines.methods.cube.faces import FACES, Resting
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
-from alidade.pipelines.simulation.sensors import Warming, recording_config
+from alidade.pipelines.simulation.sensors import Warming, recording_config, stated_strength
 
 # BRC of a camera that looks along x of the reference, z up.
 FORWARD = (-0.5, 0.5, -0.5, 0.5)
@@ -40,7 +40,8 @@ class FieldErrors(ScenarioPart):
     """Sigmas of the earth's field against its model, T; a data sheet of the field goes before them."""
 
     direction: NotNegative = 5e-7  # each way across the model's field
-    strength: NotNegative = 1.33e-7  # along it
+    strength: NotNegative = 5e-7  # along it
+    measured: Positive | None = 1e-7  # of the strength that was measured there; null: nobody did
 
 
 class Place(ScenarioPart):
@@ -127,8 +128,11 @@ class CubeScenario(ScenarioPart):
         return self
 
 
-def cube_config(scenario: CubeScenario, images: bool = False) -> str:
-    """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors."""
+def cube_config(scenario: CubeScenario, images: bool = False, strength: float | None = None) -> str:
+    """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors.
+
+    `strength`, T, is what was measured of the field.
+    """
     # Simulated sensors repeat as well as white noise lets them.
     repeats = {f"{name}_repeatability": 0.0 for name in ("gyro", "turn", "accel", "mag")}
     noise = {**scenario.noise.model_dump(), **repeats}
@@ -145,4 +149,6 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
             for i, (wxyz, normal) in FACES.items()
         }
         cube = {"cube": {"tag_family": "36h11", "tags": tags, "camera_rotation": list(FORWARD)}}
-    return recording_config("cube", scenario, noise, date="2026-11-20", **cube)
+    return recording_config(
+        "cube", scenario, noise, date="2026-11-20", **cube, **stated_strength(strength, scenario.field.measured)
+    )

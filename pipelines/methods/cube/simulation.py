@@ -47,7 +47,7 @@ from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from alidade.pipelines.simulation.sensors import by_axis, drift, measured, true_values
+from alidade.pipelines.simulation.sensors import by_axis, drift, measured, measured_strength, true_values
 from alidade.pipelines.simulation.simulated import EPOCH_NS, YEAR, Simulated
 from alidade.pipelines.vision.camera import Camera
 
@@ -66,15 +66,18 @@ def simulate_cube(scenario: CubeScenario, seed: int) -> tuple[CubeData, dict[str
 
 def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
     """A session in memory; with pictures in place of the detections if asked for."""
+    world = _World(scenario, seed)
+    is_measured = scenario.magnetometer is not None
+    strength = measured_strength(world.field, scenario.field.measured, seed) if is_measured else None
+    config = cube_config(scenario, images, strength)
     if not images:
-        return Simulated(*simulate_cube(scenario, seed), cube_config(scenario))
+        return Simulated(world.data(), world.truth, config)
     if scenario.camera is None:
         raise InputError("pictures are asked for, but the scenario has no camera: take `camera: null` out of it")
-    world = _World(scenario, seed)
     t = sample_times(world.duration, scenario.camera.pictures.rate_hz, 0.5)
     nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)
     data = replace(world.data(), sightings=nothing)
-    return Simulated(data, world.truth, cube_config(scenario, images=True), world.pictures(t, scenario.camera.pictures))
+    return Simulated(data, world.truth, config, world.pictures(t, scenario.camera.pictures))
 
 
 def attitudes(scenario: CubeScenario, seed: int) -> Array:

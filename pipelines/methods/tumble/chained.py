@@ -20,6 +20,7 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.priors import rotation_about, vector_prior
 from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.place import STRENGTH_ADVICE
 from alidade.pipelines.methods.tumble.model import Model, Sensor
 from alidade.pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
 from alidade.pipelines.methods.tumble.recording import TumbleData
@@ -186,6 +187,8 @@ def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -
 
 def advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
+    if "mag_scale" in weights:
+        return STRENGTH_ADVICE
     strong = [name for name, weight in weights.items() if abs(weight) > 0.3] or list(weights)
     if any(name.startswith("accel") for name in strong):
         return Motion("rest the device for a second or two in each of twenty and more attitudes, every side up")

@@ -22,7 +22,7 @@ from alidade.pipelines.estimation.parameters import stated as sheet
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import sampled, stated
-from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
+from alidade.pipelines.methods.place import FIELD, field_at, known_strength
 from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess
@@ -229,10 +229,10 @@ def prepare(data: TumbleData, config: Config) -> Model:
         sensors.append(_accelerometer(data, config, rests))
     if data.mag is not None and data.mag_t is not None:
         sensors.append(_magnetometer(data, config, field, alone=data.accel is None))
-        if field is None:
+        if sensors[-1].unit == "1":
             premises.append(
                 "No position, so that the field's strength is unknown and called 1: K and b give the field in units of "
-                "it; state latitude_deg and longitude_deg in the config for T."
+                "it; state latitude_deg and longitude_deg, or field.strength, in the config for T."
             )
     gyro, more = _gyro(data, sensors)
     premises += more
@@ -449,11 +449,8 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sen
 def _magnetometer(data: TumbleData, config: Config, field: Array | None, alone: bool) -> Sensor:
     assert data.mag is not None
     assert data.mag_t is not None
-    if field is None:
-        known = 1.0, 0.0, "1"
-    else:
-        across = sheet(config, FIELD)
-        known = float(np.linalg.norm(field)), STRENGTH_SIGMA if across <= FIELD.prior else across, "T"
+    strength = known_strength(config, field)
+    known = (1.0, 0.0, "1") if strength is None else (*strength, "T")
     found = _sensor("mag", (data.mag_t, data.mag, data.mag_density), None, config, known)
     return found if alone else replace(found, symmetric=False, start=found.start @ entries(True).T)
 

@@ -14,7 +14,7 @@ from alidade.factors.ellipsoid import entries
 from alidade.pipelines.estimation.parameters import quantities
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
-from alidade.pipelines.methods.triads import triad_names
+from alidade.pipelines.methods.triads import shape, triad_names, with_factor
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, GAIN, OFFSET
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
@@ -90,6 +90,8 @@ def _triad(sensor: Sensor, config: Config) -> Variable:
         prior = config.prior(name, scale * float(sigma[i]))
         wanted = config.require.get(name, scale * float(require[i]))
         listed.append(Quantity(name, unit, prior, scale * float(sigma[i]), wanted, prior_mean=scale * float(mean[i])))
+    if sensor.name == "mag":
+        listed = list(with_factor("mag", listed, config, _REQUIRE_GAIN))
     return _variable(TRIAD_KEYS[sensor.name], tuple(listed), sensor.scales, sensor.start)
 
 
@@ -111,7 +113,6 @@ def _strength(sensor: Sensor, config: Config) -> Variable:
         config.require.get(name, math.inf),
         prior_mean=sensor.strength,
         group="assumption",
-        sheet="field.model_error" if sensor.unit == "T" else "",
     )
     return _variable(STRENGTH_KEYS[sensor.name], (quantity,), np.array([sensor.strength]), np.ones(1))
 
@@ -138,4 +139,4 @@ def _check_names(config: Config) -> None:
         *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, FILTER, ACCEL_SQUARE, *SLOPES)),
     ]
     check_names(config.priors, known, "priors")
-    check_names(config.require, known, "require")
+    check_names(config.require, [*known, shape("mag")], "require")

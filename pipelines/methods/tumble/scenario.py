@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
-from alidade.pipelines.simulation.sensors import Warming, recording_config
+from alidade.pipelines.simulation.sensors import Warming, recording_config, stated_strength
 
 
 class TumbledMagnetometer(ScenarioPart):
@@ -58,12 +58,13 @@ class TumbleScenario(ScenarioPart):
     temperature: Warming | None = None  # of accelerometer and gyro; null: nobody measures it
     latitude_deg: float | None = 40.0  # null: nobody knows where it was
     longitude_deg: float = 116.3
-    field_error: NotNegative = 1.33e-7  # T, sigma of the strength about its model
+    field_error: NotNegative = 5e-7  # T, sigma of the strength about its model
+    field_measured: Positive | None = 1e-7  # T, sigma of the strength that was measured there; null: nobody did
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
 
-def tumble_config(scenario: TumbleScenario) -> str:
-    """The recording's config, YAML: the noise simulated, the scenario's priors."""
+def tumble_config(scenario: TumbleScenario, strength: float | None = None) -> str:
+    """The recording's config, YAML: the noise simulated, the scenario's priors, the strength (T) that was measured."""
     noise = {}
     if scenario.magnetometer is not None:
         noise["mag_density"] = scenario.magnetometer.density
@@ -71,4 +72,5 @@ def tumble_config(scenario: TumbleScenario) -> str:
         noise["accel_density"] = scenario.accelerometer.density
     if scenario.gyro is not None:
         noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
-    return recording_config("tumble", scenario, noise, date="2026-11-20")
+    measured = stated_strength(strength, scenario.field_measured)
+    return recording_config("tumble", scenario, noise, date="2026-11-20", **measured)

@@ -169,6 +169,8 @@ def test_without_noise_there_is_no_error() -> None:
         magnetometer={"density": 1e-13},
         accelerometer={"density": 1e-9, "arm": 0.0, "square": 0.0},
         field_error=0.0,
+        field_measured=None,
+        priors={"field_strength": 0.0},
     )
     simulated = _simulated(quiet, 0)
     estimate = _solved(simulated)
