@@ -79,7 +79,13 @@ def test_sections_come_in_the_order_in_which_they_are_asked_for() -> None:
 def test_a_terminal_and_a_notebook_show_what_the_page_begins_with() -> None:
     c = calibrated("tumble")
     text = str(c)
-    order = ["calibrated. All 9 required", "heading, any direction", "Mean scale error, %", "Scale error about mean x, %", "Bias z, µT"]
+    order = [
+        "calibrated. All 9 required",
+        "heading, any direction",
+        "Mean scale error, %",
+        "Scale error about mean x, %",
+        "Bias z, µT",
+    ]
     assert sorted(order, key=text.index) == order
     assert max(len(line) for line in text.splitlines() if "observable" in line) <= 80
     assert "mag_k11" not in text

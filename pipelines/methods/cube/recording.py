@@ -16,7 +16,7 @@ from alidade.pipelines.estimation.noise import Noise
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.noise import stated
-from alidade.pipelines.methods.place import field_at, place_topics, read_place
+from alidade.pipelines.methods.place import field_at, known_field, place_topics, read_place
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, check_overlap, nanoseconds
 from alidade.pipelines.recording.recording import Recording
@@ -209,13 +209,15 @@ def recorded(values: Array, conversion: RawConversion | None) -> Array:
 
 
 def local_field(data: CubeData, config: Config) -> Array:
-    """The World Magnetic Model where the reference is, (3,) T in n, on the config's date or that of the stamps.
+    """The field where the reference is, (3,) T in n: of its model on the config's date or that of the stamps, of the
+    strength that was measured.
 
     Raises InputError when the model does not hold there and then. `data` has latitude and longitude.
     """
     assert data.latitude is not None
     assert data.longitude is not None
-    return field_at(data.latitude, data.longitude, data.height, data.epoch_ns, field_date(config))
+    model = field_at(data.latitude, data.longitude, data.height, data.epoch_ns, field_date(config))
+    return known_field(config, model)[0]
 
 
 def stated_density(name: str, data: CubeData, config: Config, *families: str) -> Noise:

@@ -15,7 +15,7 @@ from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
 from alidade.pipelines.methods.cube.recording import CubeData, local_field
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import simulate_cube, simulated
 
 RNG = np.random.default_rng(1)
 K = np.eye(3) + 0.05 * RNG.normal(size=(3, 3))
@@ -80,8 +80,8 @@ def test_nominal_vectors_are_those_of_the_local_level_frame() -> None:
 def test_static_gyro_regression_returns_no_gain() -> None:
     """The defect that the graph is there for: earth rate alone, under MEMS noise."""
     scenario = CubeScenario(poses=18, errors=Errors(gain=0.0), camera=CubeCamera(rate_hz=5.0))
-    data, _ = simulate_cube(scenario, 2)
-    config = load_config(cube_config(scenario).encode())
+    found = simulated(scenario, 2)
+    data, config = found.data, load_config(found.config.encode())
     estimate = published_estimate(data, config, problem(data, config))
     values = dict(zip(estimate.names, estimate.values, strict=True))
     assert abs(values["accel_k11"] - 1.0) < 0.01
