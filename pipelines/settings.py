@@ -199,7 +199,7 @@ class FieldSheet(Sheet):
 
 
 class Strength(Section):
-    """Strength of the magnetic field as an instrument measured it."""
+    """As measured."""
 
     value: float  # T
     sigma: Sigma  # T
@@ -212,9 +212,9 @@ class Strength(Section):
 
 
 class EarthField(Section):
-    """What was measured of the magnetic field at the place."""
+    """The magnetic field."""
 
-    strength: Strength | None = None  # by a proton or calibrated magnetometer; null: the model's
+    strength: Strength | None = None  # null: the model's
 
 
 class GimbalSheet(Sheet):
@@ -341,7 +341,7 @@ class Config(Section):
     require: dict[str, Sigma] = {}  # parameter: sigma wanted
     sensors: SensorSheets = Sensors()  # data sheets; ideal: all figures 0
     vision: Vision = Vision()  # what measures attitudes
-    field: EarthField = EarthField()  # what was measured of the magnetic field
+    field: EarthField = EarthField()  # the magnetic field
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None  # deg north; wins over fixes
     longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None  # deg east
     altitude_m: float | None = None  # above the ellipsoid

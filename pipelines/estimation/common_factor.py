@@ -1,8 +1,7 @@
 """Factors that parameters have in common, and the shape that is left without them.
 
-A magnetometer's K and b, and the strength of the field, fit as well when all are multiplied by one factor: only what is
-known of the strength beforehand tells it. K and b in units of that strength, their shape, are what a recording
-determines.
+A magnetometer's K and b, and the strength of the field, fit as well when all are multiplied by one factor, which only
+the prior of the strength determines. K and b in units of that strength, their shape, are what a recording determines.
 """
 
 from __future__ import annotations

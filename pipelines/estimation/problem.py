@@ -80,7 +80,7 @@ class NearRotationVector:
 
 @dataclass(frozen=True)
 class CommonFactor:
-    """A factor that K and b of a sensor have in common, which no recording tells from the strength it measures.
+    """A factor that K and b of a sensor have in common, which no recording separates from the strength it measures.
 
     What is left is the sensor's shape: K and b in units of that strength.
 

@@ -71,15 +71,6 @@ class ParameterResult(_Record):
         return {k: v for k, v in content.items() if k not in left_out}
 
 
-class DerivedResult(_Record):
-    """What follows from parameters: mag_scale, a factor that K, b and the field have in common; mag_shape, the rest."""
-
-    name: str
-    sigma: float  # relative, one standard deviation
-    require: float | None  # sigma wanted; null: none
-    verdict: Verdict | None  # null: nothing is required
-
-
 class NoiseResult(_Record):
     """A noise in its unit: stated by whom, estimated from the recording with sigma (null: not asked), and used.
 
@@ -288,7 +279,6 @@ class Result(_Record):
     solver: str  # batch, incremental or published
     status: Status  # the verdict on the whole
     parameters: list[ParameterResult]
-    derived: list[DerivedResult] = []  # what follows from them
     covariance: CovarianceResult
     null_directions: list[DirectionResult]
     chi_square: ChiSquareResult
@@ -307,7 +297,7 @@ class Result(_Record):
     sensitivity: dict[str, SensitivityResult] | None  # effect of a fixed input
     measurements: list[MeasurementResult] | None  # the twenty that matter most
     findings: list[dict[str, object]]  # kind, severity and evidence, the most severe first
-    tables: dict[str, list[dict[str, object]]]  # the method's own
+    tables: dict[str, list[dict[str, object]]]  # the method's own; derived: mag_scale, mag_shape
     uses: list[UseResult] = []  # error in use, before and after
     applied: list[str] = []  # parameters that the formulas apply
     second_best: SecondResult | None = None  # where there is another solution that is nearly as likely
@@ -356,7 +346,6 @@ def result(calibration: Calibration) -> Result:
             "solver": c.estimate.solver,
             "status": c.status,
             "parameters": list(c.parameters.values()),
-            "derived": [each._asdict() for each in c.derived],
             "covariance": {"order": c.estimate.names, "matrix": c.covariance.tolist()},
             "null_directions": [direction.evidence for direction in c.directions],
             "chi_square": {
@@ -385,7 +374,7 @@ def result(calibration: Calibration) -> Result:
             "sensitivity": c.sensitivity,
             "measurements": c.measurements,
             "findings": [finding_json(finding) for finding in c.findings],
-            "tables": c.tables,
+            "tables": {**c.tables, **({"derived": [each._asdict() for each in c.derived]} if c.derived else {})},
             "second_best": second
             and {
                 "chi_square": second.chi_square,
