@@ -62,10 +62,9 @@ def verdicts(
     """
     sigmas = np.sqrt(np.diag(covariance)).tolist()
     found = {q.name: verdict(q, sigma) for q, sigma in zip(quantities, sigmas, strict=True) if q.judged}
-    instead = {q.factor for q in quantities if q.relative}
-    for scaling in [] if values is None else scalings(quantities, values):
-        shape = _shape(scaling, quantities, covariance)
-        if scaling.factor in instead and shape.verdict is not None:
+    for scaling in [] if values is None else scalings(quantities, covariance, values):
+        shape = _shape(scaling, quantities)
+        if shape.verdict and any(q.relative and q.factor == scaling.factor for q in quantities):
             found[shape.name] = shape.verdict
     return {name: doubted(each, findings) for name, each in found.items()}
 
@@ -76,13 +75,13 @@ def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
 
 
 class DerivedNumber(NamedTuple):
-    """SENSOR_scale, a factor that numbers have in common, or SENSOR_shape, what is left of them.
+    """SENSOR_scale, what the strength of what a sensor measures leaves open, or SENSOR_shape, K and b given that.
 
     Attributes:
         name: as above.
         sigma: relative; of a shape the largest, each in units of what is required of its number.
         require: of sigma; None: nothing is required.
-        verdict: as of a parameter; None where nothing is required.
+        verdict: as of a parameter; None: nothing is required.
     """
 
     name: str
@@ -94,7 +93,7 @@ class DerivedNumber(NamedTuple):
 def derived(
     quantities: Sequence[Quantity], covariance: Array, values: Array, findings: Sequence[Finding] = ()
 ) -> list[DerivedNumber]:
-    """Scale and shape of the sensors whose scale no recording tells from the strength of what they measure.
+    """Scale and shape of the sensors whose scale no recording separates from the strength of what they measure.
 
     Args:
         quantities: n of them.
@@ -102,34 +101,29 @@ def derived(
         values: (n,), SI.
         findings: on the solution.
     """
-    both = (
-        each(scaling, quantities, covariance) for scaling in scalings(quantities, values) for each in (_scale, _shape)
-    )
+    both = (each(one, quantities) for one in scalings(quantities, covariance, values) for each in (_scale, _shape))
     return [number._replace(verdict=number.verdict and doubted(number.verdict, findings)) for number in both]
 
 
-def _scale(scaling: Scaling, quantities: Sequence[Quantity], covariance: Array) -> DerivedNumber:
-    """A common factor: it is required to be so good that no number judged by itself misses its accuracy for it."""
-    moved, sigmas = _moved(scaling, quantities, covariance), np.sqrt(np.diag(covariance))
-    rows = list(zip(quantities, np.abs(scaling.x), moved, sigmas, strict=True))
-    require = min((q.require / x for q, x, m, _ in rows if m > 0.0), default=None)
-    worst = None if require is None else _worst(verdict(q, max(m, s)) for q, _, m, s in rows if m > q.require)
-    return DerivedNumber(f"{scaling.factor.sensor}_scale", scaling.sigma(covariance), require, worst)
+def _scale(scaling: Scaling, quantities: Sequence[Quantity]) -> DerivedNumber:
+    """The strength is required to be so well known that no number judged by itself misses its accuracy for it."""
+    rows = [(q, float(m)) for q, m in zip(quantities, _moved(scaling, quantities), strict=True) if m > 0.0]
+    require = min((scaling.sigma * q.require / m for q, m in rows), default=None)
+    worst = None if require is None else _worst(verdict(q, m) for q, m in rows if m > q.require)
+    return DerivedNumber(f"{scaling.factor.sensor}_scale", scaling.sigma, require, worst)
 
 
-def _shape(scaling: Scaling, quantities: Sequence[Quantity], covariance: Array) -> DerivedNumber:
-    sigmas = np.sqrt(np.maximum(np.diag(scaling.shape(covariance)), 0.0))
+def _shape(scaling: Scaling, quantities: Sequence[Quantity]) -> DerivedNumber:
+    sigmas = np.sqrt(np.maximum(np.diag(scaling.shape), 0.0)).tolist()
     own = [(q, s) for q, s in zip(quantities, sigmas, strict=True) if q.factor == scaling.factor and not q.assumed]
     name, require = f"{scaling.factor.sensor}_shape", scaling.factor.require
-    return DerivedNumber(
-        name, require * float(max(s / q.require for q, s in own)), require, _worst(verdict(*each) for each in own)
-    )
+    sigma = require * max((s / q.require for q, s in own), default=0.0)
+    return DerivedNumber(name, sigma, require, _worst(verdict(q, s) for q, s in own))
 
 
-def _moved(scaling: Scaling, quantities: Sequence[Quantity], covariance: Array) -> Array:
-    """(n,) what one sigma of a common factor moves the numbers by that are judged by themselves."""
-    judged = np.array([q.judged and q.prior_sigma != 0.0 for q in quantities])
-    return np.asarray(np.where(judged, np.abs(scaling.x) * scaling.sigma(covariance), 0.0))
+def _moved(scaling: Scaling, quantities: Sequence[Quantity]) -> Array:
+    """(n,) what one sigma of a strength moves the numbers by that are judged by themselves."""
+    return np.where([q.judged and q.prior_sigma != 0.0 for q in quantities], np.abs(scaling.moves), 0.0)
 
 
 def _worst(found: Iterable[Verdict]) -> Verdict:
@@ -169,21 +163,20 @@ def weak_directions(
     is; no direction is blamed for parameters that are all as accurate as required. It is then unobservable if its sigma
     is 0.9 of its prior's or more, else weak. Fixed quantities, and those without a required accuracy, take no part.
 
-    A factor that numbers have in common is a direction of its own, SENSOR_scale; the others are of their shape. Without
+    The strength of what a sensor measures is a direction of its own, SENSOR_scale, and the others are given it. Without
     the values (n,) of the quantities there is none.
     """
     estimated = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0 and q.required]
     if not estimated:
         return ()
     covariance = finite_covariance(quantities, covariance)
-    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    factors = [] if values is None else scalings(quantities, values)
-    moved = [_moved(factor, quantities, covariance)[estimated] for factor in factors]
-    scales = [_scale(factor, quantities, covariance) for factor in factors]
+    own = np.diag(covariance)
+    factors = [] if values is None else scalings(quantities, covariance, values)
     for factor in factors:
-        covariance = factor.shape(covariance)
-    relative = np.array([q.relative for q in quantities])
-    sigmas = np.where(relative, np.sqrt(np.maximum(np.diag(covariance), 0.0)), sigmas)[estimated]
+        covariance = covariance - np.outer(factor.moves, factor.moves)
+    variances = np.where([q.relative for q in quantities], np.diag(covariance), own)
+    sigmas = np.sqrt(np.maximum(variances, 0.0))[estimated]
+    moved = np.array([_moved(factor, quantities)[estimated] for factor in factors]).reshape(len(factors), len(sigmas))
     names = [quantities[i].name for i in estimated]
     scale = np.array([quantities[i].scale for i in estimated])
     require = np.array([quantities[i].require for i in estimated])
@@ -194,17 +187,18 @@ def weak_directions(
     beyond = shares > require[:, None]
     for i in np.flatnonzero(sigmas > require):
         beyond[i, np.argmax(shares[i])] = True
-    is_bad = beyond.any(axis=0)
-    bad = np.flatnonzero(is_bad[: len(ratios)])[::-1]
+    count = len(ratios)
+    bad = np.flatnonzero(beyond[:, :count].any(axis=0))[::-1]
     found = []
     for group in _degenerate(ratios[bad]):
         severity = Severity.UNOBSERVABLE if ratios[bad[group]][0] >= _UNCHANGED else Severity.WEAK
         for vector in _simplest_basis(vectors[:, bad[group]]).T:
             ratio = float(np.sqrt(max(vector @ scaled @ vector, 0.0)))
             found.append(_direction(severity, _weights(names, vector), ratio, advise))
-    for j in np.flatnonzero(is_bad[len(ratios) :]):
-        severity = Severity.UNOBSERVABLE if scales[j].verdict == "unobservable" else Severity.WEAK
-        found.append(_direction(severity, {scales[j].name: 1.0}, float((moved[j] / scale).max()), advise))
+    for j in np.flatnonzero(beyond[:, count:].any(axis=0)):
+        number = _scale(factors[j], quantities)
+        severity = Severity.UNOBSERVABLE if number.verdict == "unobservable" else Severity.WEAK
+        found.append(_direction(severity, {number.name: 1.0}, float((moved[j] / scale).max()), advise))
     return tuple(found)
 
 

@@ -114,7 +114,8 @@ def _strength(sensor: Sensor, config: Config) -> Variable:
         prior_mean=sensor.strength,
         group="assumption",
     )
-    return _variable(STRENGTH_KEYS[sensor.name], (quantity,), np.array([sensor.strength]), np.ones(1))
+    found = with_factor("mag", (quantity,), config, _REQUIRE_GAIN) if sensor.name == "mag" else (quantity,)
+    return _variable(STRENGTH_KEYS[sensor.name], found, np.array([sensor.strength]), np.ones(1))
 
 
 def _variable(key: int, quantities: tuple[Quantity, ...], scales: Array, start: Array) -> Variable:

@@ -56,7 +56,7 @@ SHORT: dict[str, Any] = {"poses": 16, "static_s": 2.0, "turn_rad_s": 1.6, "camer
 @cache
 def _simulated(seed: int, **options: Any) -> tuple[CubeData, dict[str, float], Config]:
     found = simulated(CubeScenario(**(SHORT | options)), seed)
-    return found.data, found.truth, load_config(found.config.encode())
+    return found.data, dict(found.truth), load_config(found.config.encode())
 
 
 def _solved(data: CubeData, config: Config) -> tuple[Problem, Estimate, Judged]:
