@@ -110,15 +110,15 @@ def _scale(scaling: Scaling, quantities: Sequence[Quantity]) -> DerivedNumber:
     rows = [(q, float(m)) for q, m in zip(quantities, _moved(scaling, quantities), strict=True) if m > 0.0]
     require = min((scaling.sigma * q.require / m for q, m in rows), default=None)
     worst = None if require is None else _worst(verdict(q, m) for q, m in rows if m > q.require)
-    return DerivedNumber(f"{scaling.factor.sensor}_scale", scaling.sigma, require, worst)
+    return DerivedNumber(scaling.factor.scale, scaling.sigma, require, worst)
 
 
 def _shape(scaling: Scaling, quantities: Sequence[Quantity]) -> DerivedNumber:
     sigmas = np.sqrt(np.maximum(np.diag(scaling.shape), 0.0)).tolist()
     own = [(q, s) for q, s in zip(quantities, sigmas, strict=True) if q.factor == scaling.factor and not q.assumed]
-    name, require = f"{scaling.factor.sensor}_shape", scaling.factor.require
+    require = scaling.factor.require
     sigma = require * max((s / q.require for q, s in own), default=0.0)
-    return DerivedNumber(name, sigma, require, _worst(verdict(q, s) for q, s in own))
+    return DerivedNumber(scaling.factor.shape, sigma, require, _worst(verdict(q, s) for q, s in own))
 
 
 def _moved(scaling: Scaling, quantities: Sequence[Quantity]) -> Array:

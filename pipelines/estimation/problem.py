@@ -92,6 +92,16 @@ class CommonFactor:
     sensor: str
     require: float
 
+    @property
+    def scale(self) -> str:
+        """Name of the factor."""
+        return f"{self.sensor}_scale"
+
+    @property
+    def shape(self) -> str:
+        """Name of what is left, as it may be required."""
+        return f"{self.sensor}_shape"
+
 
 # A recording says what a number is when its sigma is below this share of the prior's.
 _DETERMINED = 0.5

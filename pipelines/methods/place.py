@@ -33,7 +33,7 @@ STRENGTH_ADVICE = Motion(
     "measure that strength with a proton or calibrated magnetometer and state it, in T, as "
     "field: {strength: {value: 4.9e-5, sigma: 1.0e-7}}; where headings are all that is wanted, require the shape "
     "alone: require: {mag_shape: 5.0e-3}",
-    why="no motion tells the magnetometer's scale from the strength of the field",
+    why="no motion separates the magnetometer's scale from the strength of the field",
 )
 
 

@@ -21,6 +21,8 @@ from alidade.pipelines.recording.topics import IMU, MAG
 from alidade.pipelines.settings import Config
 
 TRIADS = ("accel", "gyro", "mag")
+# What may be required of a magnetometer in place of its numbers.
+MAG_SHAPE = CommonFactor("mag", 0.0).shape
 # Of S of a gyro, in the order that `symmetric` takes.
 _ELEMENTS = ("x", "y", "z", "xy", "xz", "yz")
 # Sensor -> name of the calibrated vector in formulas; its description and SI unit.
@@ -63,15 +65,10 @@ def triad_specs(
     return (*K, replace(b, per_recording=per_recording))
 
 
-def shape(sensor: str) -> str:
-    """Name under which the accuracy of K and b up to a common factor is required."""
-    return f"{sensor}_shape"
-
-
 def with_factor(sensor: str, quantities: Sequence[Quantity], config: Config, require: float) -> tuple[Quantity, ...]:
-    """Quantities that have a factor in common which no recording tells from the strength of what a sensor measures.
+    """Quantities with the factor that they have in common with the strength of what a sensor measures.
 
-    Where the config requires the shape, those that it does not name are judged by their shape.
+    Where the config requires the shape, those that it does not name are judged by it.
 
     Args:
         sensor: its name.
@@ -79,11 +76,11 @@ def with_factor(sensor: str, quantities: Sequence[Quantity], config: Config, req
         config: what is required.
         require: accuracy of K, which they are declared with.
     """
-    wanted = config.require.get(shape(sensor))
-    factor = CommonFactor(sensor, require if wanted is None else wanted)
+    shape = CommonFactor(sensor, require).shape
+    factor = CommonFactor(sensor, config.require.get(shape, require))
 
     def of(q: Quantity) -> Quantity:
-        relative = wanted is not None and q.name not in config.require
+        relative = shape in config.require and q.name not in config.require
         tighter = factor.require / require if relative and q.name.startswith(f"{sensor}_k") else 1.0
         return replace(q, require=tighter * q.require, factor=factor, relative=relative)
 

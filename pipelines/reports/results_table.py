@@ -222,7 +222,8 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
 def _overall(row: ResultRow, common: DerivedNumber, raw: str) -> ResultGroup:
     """The mean scale, whose error all axes have in common; of counts per µT."""
     require = None if common.require is None else common.require * row.value
-    row = replace(row, require=require, verdict=common.verdict)
+    by_strength = common.verdict != "observable" or row.sigma <= (require or np.inf)
+    row = replace(row, require=require, verdict=common.verdict if by_strength else row.verdict)
     if raw:
         return ResultGroup("Mean scale", f"{raw}s/µT", (row.times(1e-6),))
     return ResultGroup("Mean scale error", "%", (replace(row, value=row.value - 1.0).times(100.0),))

@@ -14,6 +14,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import Method, method
 from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.results_table import result_cards
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.simulated import Simulated
 
@@ -124,6 +125,13 @@ def test_a_shape_of_few_attitudes_is_weak() -> None:
     c = alidade.calibrate(alidade.simulate("tumble", few, seed=1), config=SHAPE)
     assert c.status in ("weak", "unobservable")
     assert c.verdicts["mag_shape"] in ("weak", "unobservable")
+    assert "mag_scale" not in c.headline
+
+
+def test_a_scale_that_no_motion_determines_is_no_better_for_a_strength_that_was_measured() -> None:
+    c = alidade.calibrate(alidade.simulate("tumble", "tumble_car", seed=3))
+    (row,) = result_cards(c)[0].groups[0].rows
+    assert row.verdict in ("weak", "unobservable")
     assert "mag_scale" not in c.headline
 
 

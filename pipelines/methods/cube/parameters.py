@@ -29,7 +29,7 @@ from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quant
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
 from alidade.pipelines.methods.place import FIELD, known_field
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE, GYRO_SLOPE
-from alidade.pipelines.methods.triads import TRIADS, shape, triad_names, triad_specs, with_factor
+from alidade.pipelines.methods.triads import MAG_SHAPE, TRIADS, triad_names, triad_specs, with_factor
 from alidade.pipelines.settings import Config
 
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
@@ -217,7 +217,7 @@ def cube_parameters(
         PARAMETERS,
         config,
         [name for tag in tags for spec in (TAG, PLACE) for name in of_tag(spec, tag).names],
-        [shape("mag")],
+        [MAG_SHAPE],
     )
 
     def nuisance(spec: ParameterSpec, fixed: bool = False) -> tuple[Quantity, ...]:

@@ -14,7 +14,7 @@ from alidade.factors.ellipsoid import entries
 from alidade.pipelines.estimation.parameters import quantities
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
-from alidade.pipelines.methods.triads import shape, triad_names, with_factor
+from alidade.pipelines.methods.triads import MAG_SHAPE, triad_names, with_factor
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, GAIN, OFFSET
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
@@ -140,4 +140,4 @@ def _check_names(config: Config) -> None:
         *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, FILTER, ACCEL_SQUARE, *SLOPES)),
     ]
     check_names(config.priors, known, "priors")
-    check_names(config.require, [*known, shape("mag")], "require")
+    check_names(config.require, [*known, MAG_SHAPE], "require")
