@@ -67,18 +67,15 @@ def by_axis(**vectors: ArrayLike) -> dict[str, float]:
     }
 
 
-def measured_strength(field: Array, sigma: float | None, seed: int) -> float | None:
-    """What an instrument says of the strength of a field (3,); None where there is none. Drawn apart from all else."""
-    return (
-        None
-        if sigma is None
-        else float(np.linalg.norm(field) + sigma * np.random.default_rng([seed, 3]).standard_normal())
-    )
+def strength_measured(field: Array, sigma: float | None, seed: int) -> dict[str, object]:
+    """The config's key of the strength of a field (3,), T, measured with this sigma; none where nobody did.
 
-
-def stated_strength(strength: float | None, sigma: float | None) -> dict[str, object]:
-    """The config's key of a strength that was measured, T; none where it was not."""
-    return {} if strength is None else {"field": {"strength": {"value": strength, "sigma": sigma}}}
+    Drawn apart: a seed gives the same noise whatever is measured.
+    """
+    if sigma is None:
+        return {}
+    value = float(np.linalg.norm(field) + sigma * np.random.default_rng([seed, 3]).standard_normal())
+    return {"field": {"strength": {"value": value, "sigma": sigma}}}
 
 
 def recording_config(method: str, scenario: Any, noise: Mapping[str, float], **more: object) -> str:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from alidade.pipelines.methods.cube.faces import FACES, Resting
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
-from alidade.pipelines.simulation.sensors import Warming, recording_config, stated_strength
+from alidade.pipelines.simulation.sensors import Warming, recording_config
 
 # BRC of a camera that looks along x of the reference, z up.
 FORWARD = (-0.5, 0.5, -0.5, 0.5)
@@ -128,11 +128,8 @@ class CubeScenario(ScenarioPart):
         return self
 
 
-def cube_config(scenario: CubeScenario, images: bool = False, strength: float | None = None) -> str:
-    """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors.
-
-    `strength`, T, is what was measured of the field.
-    """
+def cube_config(scenario: CubeScenario, images: bool = False, **more: object) -> str:
+    """The recording's config (YAML): cube as built to the drawing, noise simulated, the scenario's priors, more keys."""
     # Simulated sensors repeat as well as white noise lets them.
     repeats = {f"{name}_repeatability": 0.0 for name in ("gyro", "turn", "accel", "mag")}
     noise = {**scenario.noise.model_dump(), **repeats}
@@ -149,6 +146,4 @@ def cube_config(scenario: CubeScenario, images: bool = False, strength: float | 
             for i, (wxyz, normal) in FACES.items()
         }
         cube = {"cube": {"tag_family": "36h11", "tags": tags, "camera_rotation": list(FORWARD)}}
-    return recording_config(
-        "cube", scenario, noise, date="2026-11-20", **cube, **stated_strength(strength, scenario.field.measured)
-    )
+    return recording_config("cube", scenario, noise, date="2026-11-20", **cube, **more)

@@ -47,7 +47,7 @@ from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from alidade.pipelines.simulation.sensors import by_axis, drift, measured, measured_strength, true_values
+from alidade.pipelines.simulation.sensors import by_axis, drift, measured, strength_measured, true_values
 from alidade.pipelines.simulation.simulated import EPOCH_NS, YEAR, Simulated
 from alidade.pipelines.vision.camera import Camera
 
@@ -67,9 +67,8 @@ def simulate_cube(scenario: CubeScenario, seed: int) -> tuple[CubeData, dict[str
 def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
     """A session in memory; with pictures in place of the detections if asked for."""
     world = _World(scenario, seed)
-    is_measured = scenario.magnetometer is not None
-    strength = measured_strength(world.field, scenario.field.measured, seed) if is_measured else None
-    config = cube_config(scenario, images, strength)
+    known = strength_measured(world.field, scenario.field.measured, seed) if scenario.magnetometer else {}
+    config = cube_config(scenario, images, **known)
     if not images:
         return Simulated(world.data(), world.truth, config)
     if scenario.camera is None:

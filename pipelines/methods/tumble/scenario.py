@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
-from alidade.pipelines.simulation.sensors import Warming, recording_config, stated_strength
+from alidade.pipelines.simulation.sensors import Warming, recording_config
 
 
 class TumbledMagnetometer(ScenarioPart):
@@ -63,8 +63,8 @@ class TumbleScenario(ScenarioPart):
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
 
-def tumble_config(scenario: TumbleScenario, strength: float | None = None) -> str:
-    """The recording's config, YAML: the noise simulated, the scenario's priors, the strength (T) that was measured."""
+def tumble_config(scenario: TumbleScenario, **more: object) -> str:
+    """The recording's config, YAML: the noise simulated, the scenario's priors, other keys."""
     noise = {}
     if scenario.magnetometer is not None:
         noise["mag_density"] = scenario.magnetometer.density
@@ -72,5 +72,4 @@ def tumble_config(scenario: TumbleScenario, strength: float | None = None) -> st
         noise["accel_density"] = scenario.accelerometer.density
     if scenario.gyro is not None:
         noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
-    measured = stated_strength(strength, scenario.field_measured)
-    return recording_config("tumble", scenario, noise, date="2026-11-20", **measured)
+    return recording_config("tumble", scenario, noise, date="2026-11-20", **more)

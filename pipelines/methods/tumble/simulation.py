@@ -22,7 +22,7 @@ from alidade.pipelines.methods.tumble.scenario import (
     tumble_config,
 )
 from alidade.pipelines.simulation.motion import sample_times
-from alidade.pipelines.simulation.sensors import by_axis, drift, measured, measured_strength
+from alidade.pipelines.simulation.sensors import by_axis, drift, measured, strength_measured
 from alidade.pipelines.simulation.simulated import EPOCH_NS, YEAR, Simulated
 
 Array = NDArray[np.float64]
@@ -85,8 +85,8 @@ def simulated(scenario: TumbleScenario, seed: int, _images: bool = False) -> Sim
             truth |= _level_frame(field, earth if estimated else None, accel is None)
     found |= {"temperature": measured(scenario.temperature, motion.duration)}
     is_measured = place is not None and scenario.magnetometer is not None
-    known = measured_strength(field, scenario.field_measured, seed) if is_measured else None
-    return Simulated(TumbleData(EPOCH_NS, **found), truth, tumble_config(scenario, known))  # type: ignore[arg-type]
+    known = strength_measured(field, scenario.field_measured, seed) if is_measured else {}
+    return Simulated(TumbleData(EPOCH_NS, **found), truth, tumble_config(scenario, **known))  # type: ignore[arg-type]
 
 
 def _level_frame(field: Array, earth: Array | None, alone: bool) -> dict[str, float]:
