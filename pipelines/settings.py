@@ -341,7 +341,7 @@ class Config(Section):
     require: dict[str, Sigma] = {}  # parameter: sigma wanted
     sensors: SensorSheets = Sensors()  # data sheets; ideal: all figures 0
     vision: Vision = Vision()  # what measures attitudes
-    field: EarthField = EarthField()  # the magnetic field
+    field: EarthField = EarthField()
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None  # deg north; wins over fixes
     longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None  # deg east
     altitude_m: float | None = None  # above the ellipsoid
