@@ -107,7 +107,8 @@ def derived(
 
 def _scale(scaling: Scaling, quantities: Sequence[Quantity]) -> DerivedNumber:
     """The strength is required to be so well known that no number judged by itself misses its accuracy for it."""
-    rows = [(q, float(m)) for q, m in zip(quantities, _moved(scaling, quantities), strict=True) if m > 0.0]
+    moved = zip(quantities, _moved(scaling, quantities).tolist(), strict=True)
+    rows = [(q, m) for q, m in moved if m > 0.0 and q.factor == scaling.factor]
     require = min((scaling.sigma * q.require / m for q, m in rows), default=None)
     worst = None if require is None else _worst(verdict(q, m) for q, m in rows if m > q.require)
     return DerivedNumber(scaling.factor.scale, scaling.sigma, require, worst)

@@ -96,6 +96,7 @@ def test_a_field_that_nobody_measured_leaves_the_scale_weak_and_the_shape_good(n
     assert of_shape.parameters["mag_k11"].require is None
     assert of_shape.parameters["mag_k11"].observability is None
     assert "mag_k11" not in of_shape.verdicts
+    assert [each.verdict for each in of_shape.derived] == [None, "observable"]
     np.testing.assert_array_equal(of_shape.estimate.sigmas, c.estimate.sigmas)
 
 
