@@ -17,7 +17,7 @@ from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube import model as cube
 from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import simulate_cube, simulated
 from alidade.pipelines.methods.indexer import model as indexer
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los import model as los
@@ -56,7 +56,8 @@ def _far_indexer() -> Made:
 
 def _far_cube() -> Made:
     """The whole device turned in the cube: what it reads is turned, and K turns it back."""
-    data, truth = simulate_cube(CUBE, 1)
+    found = simulated(CUBE, 1)
+    data, truth = found.data, dict(found.truth)
     R = so3.matrix(so3.exp(np.deg2rad([30.0, -30.0, 30.0])))
     assert data.mag is not None
     turned = replace(data, gyro=data.gyro @ R.T, accel=data.accel @ R.T, mag=data.mag @ R.T)
@@ -64,7 +65,7 @@ def _far_cube() -> Made:
         names = triad_names(triad)[:9]
         K = np.array([truth[name] for name in names]).reshape(3, 3) @ R.T
         truth |= dict(zip(names, K.ravel().tolist(), strict=True))
-    return cube.problem(turned, load_config(cube_config(CUBE).encode())), truth
+    return cube.problem(turned, load_config(found.config.encode())), truth
 
 
 def _worst(estimate: Estimate, truth: dict[str, float]) -> float:
