@@ -67,6 +67,7 @@ def _drawn(seed: int) -> dict[str, Any]:
         },
         "camera": {"rate_hz": float(rng.choice([5.0, 10.0, 20.0])), "occluded": 0.2 if "fingers" in kinds else 0.05},
         "magnetometer": {"disturbed": 0.1 if "iron" in kinds else 0.0},
+        "field": {"measured": None},
         "temperature": {} if "temperature" in kinds else None,
         "effects": {name: float(spec.prior * rng.standard_normal()) for spec in specs for name in spec.names},
         **MODES[int(rng.integers(len(MODES)))],
