@@ -102,8 +102,9 @@ def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise InputError(f"{paths[0]}: the same file is named twice")
     parts = [_file(path) for path in paths]
-    begin = min((part.first_log_ns for part in parts if not isinstance(part, CameraFile)), default=0)
-    parts = [CameraFile(p.path, p.cameras, p.data, begin) if isinstance(p, CameraFile) else p for p in parts]
+    if any(isinstance(part, CameraFile) for part in parts):
+        begin = min((part.first_log_ns for part in parts if not isinstance(part, CameraFile)), default=0)
+        parts = [CameraFile(p.path, p.cameras, p.data, begin) if isinstance(p, CameraFile) else p for p in parts]
     whole = parts[0] if len(parts) == 1 else MultiPartContainer(folder or paths[0], parts)
     if folder is None:
         whole.assumptions = (*_part_of(paths), *whole.assumptions)

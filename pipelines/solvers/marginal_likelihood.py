@@ -55,6 +55,8 @@ SANDWICH_BLOCK_S = 5.0
 _MOST_ROUNDS, _WIDENING_ROUNDS, _STEADY = 8, 2, 0.02
 # Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`.
 _ABOVE = 2.0
+# By which another maximum has to lower -2 log L: what one more noise does by chance once in a thousand.
+_CLEARLY = 10.8
 # Of the gate, where measurements that are widened lie at most.
 _INSIDE = 0.9
 # Random right sides that estimate traces: a quarter of a level's own sigma.
@@ -430,6 +432,7 @@ def estimate_levels(
     levels: Sequence[Level],
     widening: Mapping[int, Array] | None = None,
     rejected: Mapping[int, NDArray[np.bool_]] | None = None,
+    from_above: bool = True,
 ) -> LevelEstimate:
     """Levels that maximise the marginal likelihood at a linearisation, by Newton steps with average information.
 
@@ -441,6 +444,7 @@ def estimate_levels(
         levels: to begin with.
         widening: group -> (n,) as it is, None: none.
         rejected: group -> (n,) measurements that are rejected as outliers.
+        from_above: whether another maximum is looked for, see `_from_above`.
 
     Raises:
         IndeterminateStateError: states or parameters are not determined at the levels to begin with.
@@ -453,6 +457,11 @@ def estimate_levels(
         return LevelEstimate(tuple(levels), np.inf)
     roughly = np.array([max(levels[i].noise.known, ROUGHLY) for i in free])
     found = _maximum(some, own, levels, free, roughly)
+    above = _from_above(some, levels) if from_above else None
+    if above is not None:
+        other = _maximum(some, own, above, free, roughly)
+        if other.minus_two_log_likelihood < found.minus_two_log_likelihood - _CLEARLY:
+            found = other
     closely = np.array([found.levels[i].known for i in free])
     if (closely >= roughly).all():
         return found
@@ -773,7 +782,7 @@ def maximise_likelihood(
     Args:
         linearization: of the factors, with the noise stated.
         values: to begin with, near the solution.
-        levels: to begin with, see `_from_above`.
+        levels: to begin with.
         outliers: group -> (n,) which measurements are rejected.
         rounds: linearisations.
     """
@@ -784,8 +793,7 @@ def maximise_likelihood(
         if deadline.passed():
             break
         chain = LinearChain.of(linearization, values)
-        found = found if number else _from_above(chain, found)
-        before, found = found, estimate_levels(chain, found, wide, outliers).levels
+        before, found = found, estimate_levels(chain, found, wide, outliers, number < _WIDENING_ROUNDS).levels
         if number < _WIDENING_ROUNDS:
             wide, outliers = widened(chain, found, outliers)
         states, shared = step(chain, found, wide, outliers)
@@ -796,13 +804,13 @@ def maximise_likelihood(
     return LikelihoodMaximum(values, found, wide, outliers)
 
 
-def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...]:
-    """The levels to begin with: two noises of the same rows `_ABOVE` what is stated, with equal shares.
+def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...] | None:
+    """Where two noises of the same rows begin a second time: `_ABOVE` what is stated, with equal shares; None without.
 
     -2 log L is flat in the logarithm of a level whose share vanishes: what begins there stays, and another noise takes
     its part.
     """
-    out = list(levels)
+    out, found = list(levels), False
     for i, added in enumerate(levels):
         parts = [r.beside for r in chain.rows if r.family in added.noise.families and r.beside is not None]
         if not (added.noise.beside and added.noise.estimated and parts):
@@ -812,8 +820,8 @@ def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...
                 above = float(np.exp(_ABOVE * own.noise.known)) if own.noise.estimated else 1.0
                 out[j] = replace(own, scale=max(own.scale, above))
                 unit = added.noise.stated * float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-                out[i] = replace(added, scale=out[j].scale / max(unit, 1e-300))
-    return tuple(out)
+                out[i], found = replace(added, scale=out[j].scale / max(unit, 1e-300)), True
+    return tuple(out) if found else None
 
 
 def rejected(engine: Linearization, values: Values) -> dict[int, NDArray[np.bool_]]:

@@ -209,7 +209,7 @@ def test_the_first_attitudes_of_a_tumbled_magnetometer_are_at_their_priors() -> 
         size, numbers = nees(following.values(), following.covariance(), truth)
         sizes.append(size)
         if step.time < 5.0:
-            assert (sigmas > 0.5 * scale).all()
+            assert (sigmas[:6] > 0.5 * scale[:6]).all()
     assert max(sizes) < chi2.ppf(0.999, numbers)
     assert (sigmas < 0.5 * scale).any()
 

@@ -129,7 +129,7 @@ class CubeScenario(ScenarioPart):
 
 
 def cube_config(scenario: CubeScenario, images: bool = False, **more: object) -> str:
-    """The recording's config (YAML): cube as built to the drawing, noise simulated, the scenario's priors, more keys."""
+    """The recording's config (YAML): cube as drawn, noise simulated, the scenario's priors, more keys."""
     # Simulated sensors repeat as well as white noise lets them.
     repeats = {f"{name}_repeatability": 0.0 for name in ("gyro", "turn", "accel", "mag")}
     noise = {**scenario.noise.model_dump(), **repeats}
