@@ -160,14 +160,14 @@ def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
     """Statements that the recording contradicts; an estimate far above its statement is no noise."""
     for level in estimate.levels:
         known, own = level.together, set(level.noise.families)
-        least = -np.inf if known.sigma is None else (known.found or 0.0) - limits.noise_sigmas * known.sigma
+        least = -np.inf if level.sigma is None else (level.found or 0.0) - limits.noise_sigmas * level.sigma
         no_noise = bool(own) and least > limits.noise_factor
         differs = known.contradicted or not 1.0 / limits.noise_note < known.scale < limits.noise_note
         is_default = level.noise.source == "default"
         alike = [_share(other) for other in estimate.levels if other is level or own & set(other.noise.families)]
         share = float(np.linalg.norm(alike)) if _share(level) == max(alike) else 0.0
         if share > 0.5 or (not is_default and (no_noise or (differs and known.scale != 1.0))):
-            numbers = {"used": known.used, "factor": known.scale, "estimated_factor": known.found}
+            numbers = {"used": known.used, "factor": known.scale, "estimated_factor": level.found}
             evidence = {"noise": level.noise.name, "unit": level.noise.unit, "source": level.noise.source, **numbers}
             yield Finding("noise", INCONSISTENT if share > 1.0 or (no_noise and not is_default) else NOTE, evidence)
 
