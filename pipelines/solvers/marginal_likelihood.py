@@ -421,10 +421,19 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class LevelEstimate:
-    """Levels at a linearisation, with their sigmas, and -2 log L there, the levels' own prior included."""
+    """Levels at a linearisation, with their sigmas, and -2 log L there, the levels' own prior included.
+
+    `from_priors` is the part of it by which the parameters miss their priors.
+    """
 
     levels: tuple[Level, ...]
     minus_two_log_likelihood: float
+    from_priors: float
+
+    @property
+    def of_recording(self) -> float:
+        """-2 log L without what parameters miss their priors by: a scale beyond its data sheet is no noise."""
+        return self.minus_two_log_likelihood - self.from_priors
 
 
 def estimate_levels(
@@ -454,13 +463,13 @@ def estimate_levels(
     some, own = chain.liveliest(factors)
     free = [i for i, level in enumerate(levels) if level.noise.estimated and _present(chain, level)]
     if not free:
-        return LevelEstimate(tuple(levels), np.inf)
+        return LevelEstimate(tuple(levels), np.inf, 0.0)
     roughly = np.array([max(levels[i].noise.known, ROUGHLY) for i in free])
     found = _maximum(some, own, levels, free, roughly)
     above = _from_above(some, levels) if from_above else None
     if above is not None:
         other = _maximum(some, own, above, free, roughly)
-        if other.minus_two_log_likelihood < found.minus_two_log_likelihood - _CLEARLY:
+        if other.of_recording < found.of_recording - _CLEARLY:
             found = other
     closely = np.array([found.levels[i].known for i in free])
     if (closely >= roughly).all():
@@ -513,8 +522,10 @@ def _maximum(
         assert solution is not None
         if min(predicted, before - value) < _SETTLED:
             break
-    covariance = np.linalg.inv(information)
-    return LevelEstimate(_effective(chain, _known(tried, free, np.sqrt(np.diag(covariance))), free, covariance), value)
+    covariance = np.asarray(np.linalg.inv(information), dtype=float)
+    known_levels = _known(tried, free, np.sqrt(np.diag(covariance)))
+    missed = chain.prior[:, :-1] @ solution.shared + chain.prior[:, -1]
+    return LevelEstimate(_effective(chain, known_levels, free, covariance), value, float(missed @ missed))
 
 
 def widened(
