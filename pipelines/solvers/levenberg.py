@@ -22,13 +22,9 @@ from functools import cached_property
 import numpy as np
 
 from alidade.pipelines import deadline
-from alidade.pipelines.solvers.chain import Factorization as Factorization
-from alidade.pipelines.solvers.chain import IndeterminateStateError
+from alidade.pipelines.solvers.chain import Factorization, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.linearization import System as System
-
-Engine = Linearization
+from alidade.pipelines.solvers.linearization import Linearization, System
 
 # Decrease of the cost over the one predicted above which a step is doubled: along it the cost is no parabola, and falls
 # on, as it does about a saddle, where the ratio is 2.

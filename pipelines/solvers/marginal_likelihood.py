@@ -874,8 +874,6 @@ def solve_likelihood(
         config: of the last minimisation.
     """
     problem, engine = compiled.problem, compiled.engine
-    assert isinstance(engine, Linearization)
-    assert isinstance(solution.engine, Linearization)
     values = solution.values
     outliers: Outliers = rejected(solution.engine, values)
     if problem.finer is not None:
@@ -886,7 +884,6 @@ def solve_likelihood(
             known = compiled
             compiled = Compiled.of(finer, "chain")
             problem, engine = finer, compiled.engine
-            assert isinstance(engine, Linearization)
             late = _times(known.engine.groups, outliers)
             outliers = {i: np.isin(g.model.time, late) for i, g in enumerate(engine.groups) if g.is_measurement}
             values = _with_parameters(compiled, known, values)
@@ -912,11 +909,9 @@ def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Val
 def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> Array:
     """Ratio of sandwich to nominal sigma of the reported numbers, (n,), at least 1."""
     engine, layout = compiled.engine, compiled.layout
-    assert isinstance(engine, Linearization)
-    assert isinstance(solution.engine, Linearization)
     chain = LinearChain.of(engine, solution.values)
-    at, columns = layout.to_gtsam(solution.values, _keys(compiled)), []
-    for p, key in zip(compiled.problem.parameters, _keys(compiled), strict=True):
+    at, columns = layout.to_gtsam(solution.values, compiled.keys), []
+    for p, key in zip(compiled.problem.parameters, compiled.keys, strict=True):
         _, J = p.coordinates(at, key)
         columns.append(J @ layout.root_columns(key)[:, layout.sizes[3] :])
     outliers = rejected(solution.engine, solution.values)
@@ -925,8 +920,6 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
 
 def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> dict[str, Residuals]:
     """Innovations by family at noise levels, white and of unit variance if the model is right; outliers have no say."""
-    assert isinstance(compiled.engine, Linearization)
-    assert isinstance(solution.engine, Linearization)
     chain = LinearChain.of(compiled.engine, solution.values)
     out = _by_row(chain, rejected(solution.engine, solution.values), 0.0)
     found = chain.innovations(_without_say(chain.variances(levels), out), chain.limits)
@@ -934,7 +927,3 @@ def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Soluti
         chain.rows[k].family: Residuals(chain.rows[k].time, each.whitened[..., 0], out[k] == 0.0)
         for k, each in found.items()
     }
-
-
-def _keys(compiled: Compiled) -> list[int]:
-    return [compiled.current_keys.get(p.key, p.key) for p in compiled.problem.parameters]

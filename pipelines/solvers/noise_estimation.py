@@ -21,10 +21,10 @@ import numpy as np
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.solvers.chain import Array
+from alidade.pipelines.solvers.chain import Array, Factorization
 from alidade.pipelines.solvers.layout import Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System, minimize
-from alidade.pipelines.solvers.linearization import Group
+from alidade.pipelines.solvers.levenberg import Solution, minimize
+from alidade.pipelines.solvers.linearization import Group, Linearization, System
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated
 
 # (family, row of its measurements) -> expected sum of squares under noise of unit variance.
@@ -63,12 +63,12 @@ CONFIG = NoiseConfig()
 
 
 def estimate_noise(
-    engine: Engine,
+    engine: Linearization,
     solution: Solution,
     levels: tuple[Level, ...],
     loss: TruncatedLoss | None,
     robust: RobustConfig,
-    expected_squares: Callable[[Engine, System, Factorization, Values], ExpectedSquares],
+    expected_squares: Callable[[Linearization, System, Factorization, Values], ExpectedSquares],
     config: NoiseConfig = CONFIG,
 ) -> tuple[Solution, tuple[Level, ...]]:
     """The solution with the noise levels that the recording has, and these.
@@ -107,7 +107,7 @@ def estimate_noise(
     return solution, levels
 
 
-def apply_levels(engine: Engine, levels: Sequence[Level]) -> Engine:
+def apply_levels(engine: Linearization, levels: Sequence[Level]) -> Linearization:
     """The measurements with their noise at these levels, over what they were whitened by."""
     scaled = [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
     if not scaled:
@@ -152,7 +152,7 @@ def _far(levels: Sequence[Level], others: Sequence[Level], config: NoiseConfig) 
 
 def refine(
     levels: Sequence[Level],
-    engine: Engine,
+    engine: Linearization,
     values: Values,
     expected: ExpectedSquares,
     first: bool,
