@@ -98,8 +98,9 @@ def change_finding(
         return None
     required = {q.name: q.require for q in quantities}
     material = any(abs(step) - _SURE * s > _MATERIAL * required[name] for name, (step, s) in steps.items())
-    immaterial = bool(parts) and not material
-    severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
+    # Without segments nobody knows what the change of a required parameter is; that of others is never material.
+    known = bool(parts) or (bool(steps) and all(np.isinf(required[name]) for name in steps))
+    severity = Severity.NOTE if known and not material else Severity.INCONSISTENT
     return Finding("change", severity, {"since_s": found.time_s, "time_s": found.time_s, "steps": steps})
 
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     import gtsam
 
 # Rows of a chain of at most so many bytes are kept; those of a longer one are made anew, part by part, wherever asked.
-KEPT_BYTES = 1 << 29
+KEPT_BYTES = 1 << 28
 # Families whose residuals have no information about measurement noise.
 NOT_MEASURED = ("prior", "definition")
 # The shared variables of a row about nodes alone cancel to this share of its largest coefficient.

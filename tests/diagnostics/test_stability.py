@@ -225,6 +225,9 @@ def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> No
     assert unknown is not None
     assert unknown.severity == Severity.INCONSISTENT
     assert unknown.evidence["steps"] == {"a": (0.2, 0.02)}
+    nuisance = change_finding(found, {}, [replace(quantity, require=np.inf) for quantity in quantities])
+    assert nuisance is not None
+    assert nuisance.severity == Severity.NOTE
 
 
 def test_a_mount_that_stays_is_calibrated() -> None:
