@@ -441,7 +441,7 @@ def estimate_levels(
     levels: Sequence[Level],
     widening: Mapping[int, Array] | None = None,
     rejected: Mapping[int, NDArray[np.bool_]] | None = None,
-    from_above: bool = True,
+    from_above: bool = False,
 ) -> LevelEstimate:
     """Levels that maximise the marginal likelihood at a linearisation, by Newton steps with average information.
 
