@@ -173,7 +173,7 @@ def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
 
 
 def _share(level: Level) -> float:
-    """A noise over what is none, 0 where it is stated."""
+    """A noise over the level beyond which errors are no noise; 0 where it is stated, not at its default."""
     is_default = level.noise.source == "default"
     return level.used / (level.noise.no_noise or level.noise.spec.no_noise) if is_default else 0.0
 

@@ -124,7 +124,7 @@ def _recordings(result: Result) -> list[_Recording]:
 def write_certificate(
     results: Path, fields: Path | None, before: Path | None, out: Path | None, pdf: bool = False, digital: bool = False
 ) -> tuple[tuple[Path, ...], list[str]]:
-    """Write certificate.html and .json, .pdf and .xml; returns their paths and what was not stated.
+    """Write the certificate of a calibration to files; returns their paths and the fields that nobody stated.
 
     Args:
         results: folder of a calibration, or its result.json.

@@ -77,7 +77,7 @@ class Chain(ABC):
 
     @abstractmethod
     def part(self, begin: int, end: int) -> ChainSystem:
-        """Rows about states from `begin` until before `end`, and those that join these to the ones before.
+        """The part of the linear system about states `begin` to `end` - 1, the rows that join the first backward too.
 
         Rows about shared unknowns or nodes alone are all there.
         """
@@ -115,7 +115,7 @@ class Chain(ABC):
             nodes[:-1] += np.square(walk[1:, :, c : 2 * c]).sum(axis=1)
             walk = np.concatenate([walk, np.zeros((len(nodes), c, 2 * c + 1))], axis=1)
             walk[:, np.arange(-c, 0), np.arange(c)] = root * np.sqrt(nodes)
-        return _Damped(self, root * np.sqrt(states), prior, walk)
+        return _Damped(self, root * np.sqrt(states), d, prior, self.piece, walk)
 
     def segments(self) -> Index:
         """Last states of the segments, (B,); no segment spans two pieces."""
@@ -151,7 +151,7 @@ class ChainSystem(Chain):
         return len(self.measured)
 
     def part(self, begin: int, end: int) -> ChainSystem:
-        """See Chain."""
+        """Rows about some consecutive states, as views."""
         piece, some = None if self.piece is None else self.piece[begin:end], slice(begin, end)
         measured, between, beside = self.measured[some], self.between[some], self.beside[some]
         return replace(self, measured=measured, between=between, beside=beside, piece=piece)
@@ -180,24 +180,16 @@ class _Damped(Chain):
 
     chain: Chain
     diagonal: Array
+    d: int
     shared: Array
+    piece: Index | None
     walk: Array | None
-
-    @property
-    def d(self) -> int:  # type: ignore[override]
-        """Numbers of a state."""
-        return self.chain.d
-
-    @property
-    def piece(self) -> Index | None:  # type: ignore[override]
-        """Node in force at each state."""
-        return self.chain.piece
 
     def __len__(self) -> int:
         return len(self.chain)
 
     def part(self, begin: int, end: int) -> ChainSystem:
-        """See Chain."""
+        """Rows about some consecutive states, those of the damping below the others."""
         own, d = self.chain.part(begin, end), self.d
         measured = np.concatenate([own.measured, np.zeros((len(own), d, own.measured.shape[2]))], axis=1)
         measured[:, np.arange(-d, 0), np.arange(d)] = self.diagonal[begin:end]
@@ -596,7 +588,9 @@ def _together(lasts: Index) -> list[slice]:
 
 
 def _inner(chain: ChainSystem, lasts: Index, rows: Array) -> tuple[Array, Array, Array]:
-    """Eliminate all but the last states (B,) of some segments; `rows` (N, d, 3 d + border) get R of the inner ones.
+    """Eliminate all states of some segments of a chain but the last of each, (B,).
+
+    `rows` (N, d, 3 d + border) get R of the states that are eliminated.
 
     Returns the rows of the last states' chain: about each, joining it to the one before, and without a state.
     """

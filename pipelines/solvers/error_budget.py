@@ -100,9 +100,8 @@ class Influence:
     def _moved(self, engine: Linearization) -> Array:
         """Sum (m,) of what the residuals of an engine's factors move the numbers by; nothing at a minimum."""
         moved = np.zeros(len(self.names))
-        for group in engine.groups:
-            for some in group.divided():
-                moved += np.einsum("nrm,nr->m", *engine.products(some, self.at.values, self.step))
+        for group in engine.divided():
+            moved += np.einsum("nrm,nr->m", *engine.products(group, self.at.values, self.step))
         return moved
 
 
@@ -122,7 +121,7 @@ def error_budget(influence: Influence, added: Mapping[str, Array], covariance: A
         covariance: (n, n) final posterior of all reported numbers.
     """
     names, variances = influence.names, dict[str, Array]()
-    for group in (some for whole in influence.at.engine.groups for some in whole.divided()):
+    for group in influence.at.engine.divided():
         L, _ = influence.rows(group)
         for source, variance in _sources(influence, group, np.square(L)):
             variances[source] = variances.get(source, np.zeros(len(names))) + variance
@@ -178,7 +177,7 @@ def most_influential(
     columns = [influence.names.index(name) for name in names]
     scale = np.array([sigmas[name] for name in names])
     found: list[tuple[float, str, float, str]] = []
-    for group in (some for whole in influence.at.engine.groups for some in whole.divided()):
+    for group in influence.at.engine.divided():
         if group.target == "shared" and group.family == "prior":
             continue
         L, right = influence.rows(group)

@@ -48,7 +48,7 @@ def _factor(keys: Sequence[int], blocks: Sequence[Array], right: Array) -> gtsam
 
 @dataclass(frozen=True, eq=False)
 class GtsamSystem:
-    """Whitened rows about some values.
+    """Linear system about some values, whitened rows A dx = b, as a Gaussian factor graph of gtsam.
 
     Attributes:
         layout: of the variables.

@@ -287,7 +287,7 @@ class Linearization:
             for node, each in zip(group.place.tolist(), np.delete(rows, np.s_[2 * c : -1], axis=2), strict=True):
                 walk[node].append(each)
         piece, about = (self.piece, self._walk(walk)) if c else (None, None)
-        chain = LinearizedChain(self, values, np.concatenate(shared), piece, about, squares)
+        chain = LinearizedChain(self, values, d, np.concatenate(shared), piece, about, squares)
         keeps = 8 * N * (m * (d + c + s + 1) + b * (2 * d + c + s + 1)) <= KEPT_BYTES
         if keeps or not all(group.is_divisible for group in self.groups):
             system, more = chain.rows(0, N)
@@ -304,6 +304,11 @@ class Linearization:
         for group in self.groups:
             if group.target in ("state", "pair") and (part := group.within(begin, end)) is not None:
                 yield part
+
+    def divided(self) -> Iterator[Group]:
+        """All measurements by kind, so many at a time that what follows from them is small."""
+        for group in self.groups:
+            yield from group.divided()
 
     def cost(self, values: Values) -> float:
         """Twice the sum of the losses."""
@@ -374,21 +379,17 @@ class LinearizedChain(Chain):
 
     linearization: Linearization
     values: Values
+    d: int
     shared: Array
     piece: Index | None
     walk: Array | None
     squares: float
 
-    @property
-    def d(self) -> int:  # type: ignore[override]
-        """Numbers of a state."""
-        return self.linearization.layout.sizes[1]
-
     def __len__(self) -> int:
         return self.linearization.layout.sizes[0]
 
     def part(self, begin: int, end: int) -> ChainSystem:
-        """See Chain."""
+        """Rows about some consecutive keyframes, linearised now."""
         return self.rows(begin, end)[0]
 
     def rows(self, begin: int, end: int) -> tuple[ChainSystem, float]:

@@ -205,7 +205,7 @@ def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
 
 
 def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple[float, FieldGuess] | None:
-    """A guess from pairs of readings a span (s) apart, and how well it is told from others, see `_homogeneous`."""
+    """A guess from pairs of readings a span (s) apart, and how clearly others fit worse, see `_homogeneous`."""
     assert data.gyro_t is not None
     assert data.gyro is not None
     first, last = _pairs(time, span, data.gyro_t)
