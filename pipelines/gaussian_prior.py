@@ -6,9 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from alidade.factors.so3 import Array
 
 # Of correlated numbers, the least variance of a combination that counts as known, in their own.
 _LEAST = 1e-14

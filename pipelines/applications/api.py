@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
+from alidade.factors.so3 import Array
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
@@ -33,7 +34,7 @@ from alidade.pipelines.recording.checks import (
 )
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.recording.shapes import Array, Rows, as_dates, rows_by_name
+from alidade.pipelines.recording.shapes import Rows, as_dates, rows_by_name
 from alidade.pipelines.settings import Config as _BaseConfig
 from alidade.pipelines.settings import first_error
 from alidade.pipelines.simulation.simulated import Simulated

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
@@ -26,8 +26,6 @@ from alidade.pipelines.recording.table_topics import TableTopic, tables_of
 from alidade.pipelines.recording.table_units import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
 from alidade.pipelines.settings import Config
-
-Array = NDArray[np.float64]
 
 # What the names of three columns along x, y and z begin with or are, lower case; `gx` is a gyro's as often as not.
 _WORDS = {

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema
-from alidade.pipelines.recording.messages import Array, Definition, definition_text, known
+from alidade.pipelines.recording.messages import Definition, definition_text, known
 
 # Messages of a block; those of varying size may be pictures.
 _UNIFORM_BLOCK, _VARYING_BLOCK = 1 << 14, 4

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
-
-Array = NDArray[np.float64]
 
 # A gyro that saturates above this is rare; 2000 deg/s read as rad/s is far beyond.
 MAX_RATE_RAD_S = 35.0

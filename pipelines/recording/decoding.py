@@ -15,9 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.container import Channel, MessageBlock, Schema, byte_windows
-from alidade.pipelines.recording.messages import Array, Definition, Language, Layout, Leaf, MessageError, Wire, at
+from alidade.pipelines.recording.messages import Definition, Language, Layout, Leaf, MessageError, Wire, at
 from alidade.pipelines.recording.translation import Translation, is_foxglove, ros_type
 
 # Indexes of the numbers of a field that are meant, given the message; None if it does not have them.

@@ -10,10 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.checks import count
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # A reading frozen for at least so long, s, and so many samples, that jumps to where the sensor has moved meanwhile.

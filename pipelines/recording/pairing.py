@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 # Delays looked for, s; steps and length of the grid they are looked for on.

@@ -11,9 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.recording.checks import count
-
-Array = NDArray[np.float64]
 
 SI = {"accel": "m/s^2", "gyro": "rad/s", "mag": "T"}
 # Median norms that an accelerometer in m/s^2 and a magnetometer in T show, and in which unit others are likely to be.

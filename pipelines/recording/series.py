@@ -16,9 +16,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.recording import messages
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _XYZW_TO_WXYZ = (3, 0, 1, 2)

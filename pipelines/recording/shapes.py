@@ -19,9 +19,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
-
-Array = NDArray[np.float64]
 
 # From so many rows on a component that never changes was not measured.
 _MEASURED = 20

@@ -14,14 +14,11 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_serializer, model_validator
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.recording import series
-
-Array = NDArray[np.float64]
-
 
 Axis = Literal["x", "y", "z", "+x", "+y", "+z", "-x", "-y", "-z"]
 

@@ -18,6 +18,7 @@ from typing import Any, Generic, TypeVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import checks, plausibility
 from alidade.pipelines.recording.checks import LEAST_ACCEL, LEAST_GYRO, LEAST_MAG, SLOWEST_GYRO_S, SLOWEST_S
@@ -25,7 +26,6 @@ from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries, JointSeries, MagneticSeries, Series
 
-Array = NDArray[np.float64]
 AnySeries = TypeVar("AnySeries", bound=Series | JointSeries)
 
 # Quantities whose faults are looked for, and their unit.

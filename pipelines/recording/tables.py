@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.table_units import unit_in, unit_named
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]

@@ -31,11 +31,10 @@ from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
 from alidade.pipelines.reports.result_json import Result, read_result
-from alidade.pipelines.reports.whole import write_whole
+from alidade.pipelines.reports.whole import Content, write_whole
 from alidade.pipelines.settings import first_error
 from alidade.pipelines.solvers.joint import RECORDING
 
-FILES = ("certificate.html", "certificate.pdf", "certificate.xml", "certificate.json")
 # Of effective degrees of freedom more than this are as good as infinitely many.
 _MANY = 1e4
 
@@ -149,21 +148,15 @@ def write_certificate(
         name for name, value in stated.model_dump(exclude={"remarks", "limits", "country"}).items() if value is None
     ]
     content = _content(result, stated, rows, missing)
-
     page = render_html(certificate_report(result, stated, rows, missing, before))
-    printed = _printed(page) if pdf else None
     matrix = result.covariance
-    xml = digital_certificate(content, matrix.order, matrix.matrix) if digital else None
-
-    def make(folder: Path) -> None:
-        (folder / FILES[0]).write_text(page, encoding="utf-8")
-        if printed is not None:
-            (folder / FILES[1]).write_bytes(printed)
-        if xml is not None:
-            (folder / FILES[2]).write_text(xml, encoding="utf-8")
-        (folder / FILES[3]).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-    return write_whole(out or path.parent, FILES, make), missing
+    files: dict[str, Content] = {
+        "certificate.html": page,
+        "certificate.pdf": _printed(page) if pdf else None,
+        "certificate.xml": digital_certificate(content, matrix.order, matrix.matrix) if digital else None,
+        "certificate.json": json.dumps(content, indent=1, allow_nan=False) + "\n",
+    }
+    return write_whole(out or path.parent, files), missing
 
 
 def _read_result(path: Path) -> Result:

@@ -20,9 +20,8 @@ from alidade.pipelines.reports.report import Block, Bullets, Details, Plots, Rep
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import truth_errors
 from alidade.pipelines.reports.results_table import result_cards
-from alidade.pipelines.reports.whole import write_page
+from alidade.pipelines.reports.whole import write_whole
 
-FILE = "compare.html"
 # Bars of z end here: a published solver may be hundreds of its sigmas off.
 _MAX_Z = 12.0
 # Difference of the published solver from batch that is counted, in sigmas of batch.
@@ -58,7 +57,8 @@ def comparison_report(comparison: Comparison) -> Report:
 
 def write_compare(out_dir: Path, comparison: Comparison) -> Path:
     """Write compare.html; returns its path. Raises InputError when it cannot be written."""
-    return write_page(out_dir, FILE, render_html(comparison_report(comparison)))
+    (path,) = write_whole(out_dir, {"compare.html": render_html(comparison_report(comparison))})
+    return path
 
 
 def _solvers(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,6 @@ from alidade.pipelines.reports.plain_json import plain_json
 from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
 from alidade.pipelines.reports.result import software_versions
 from alidade.pipelines.reports.whole import write_whole
-
-FILES = ("noise.html", "noise.json")
 
 _TITLES = {"gyro": "gyro", "accel": "accelerometer", "mag": "magnetometer"}
 _COEFFICIENTS = {"N": "white noise", "B": "bias instability", "K": "random walk", "Q": "quantisation"}
@@ -197,7 +194,7 @@ def _summary(study: NoiseStudy) -> Summary:
 
 def write_noise(out_dir: Path, study: NoiseStudy) -> tuple[Path, ...]:
     """Write noise.html and noise.json, whole or not at all; returns their paths. Raises InputError as it cannot."""
-    return write_whole(out_dir, FILES, partial(_make, study=study))
+    return write_whole(out_dir, {"noise.html": render_html(noise_report(study)), "noise.json": noise_json(study)})
 
 
 def length(seconds: float) -> str:
@@ -206,11 +203,6 @@ def length(seconds: float) -> str:
         if seconds < size * most:
             return f"{seconds / size:.2g} {unit}" if seconds / size < 9.95 else f"{seconds / size:.0f} {unit}"
     return f"{seconds / 86400.0:.0f} days"
-
-
-def _make(folder: Path, study: NoiseStudy) -> None:
-    (folder / "noise.html").write_text(render_html(noise_report(study)), encoding="utf-8")
-    (folder / "noise.json").write_text(noise_json(study), encoding="utf-8")
 
 
 def _of(sensor: SensorNoise, axis: str, name: str) -> Coefficient:

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods.triads import TRIADS, triad_of
 from alidade.pipelines.reports.calibration import SavedCalibration
-
-Array = NDArray[np.float64]
 
 _GAUSS, _MILLIGAUSS = 1e4, 1e7  # in a tesla
 _AXES = "XYZ"

@@ -17,12 +17,11 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.sentences import capital
-from alidade.pipelines.reports.whole import write_page
+from alidade.pipelines.reports.whole import write_whole
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.validate import Validated
 
-FILE = "validation.html"
 # Angles smaller than this, rad, are shown in arc seconds.
 _FINE_RAD = 2e-4
 # Verdict -> answer, tone and next steps.
@@ -65,7 +64,8 @@ def validation_report(validated: Validated) -> Report:
 
 def write_validation(out_dir: Path, validated: Validated) -> Path:
     """Write validation.html; returns its path. Raises InputError when it cannot be written."""
-    return write_page(out_dir, FILE, render_html(validation_report(validated)))
+    (path,) = write_whole(out_dir, {"validation.html": render_html(validation_report(validated))})
+    return path
 
 
 def _changes(validated: Validated) -> tuple[Block, ...]:

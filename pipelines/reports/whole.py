@@ -12,11 +12,14 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from alidade.pipelines.errors import InputError
+
+# Of a file: its text or bytes, a function that writes it to a path, or None where there is none.
+Content = str | bytes | Callable[[Path], None] | None
 
 # Others are waited for so long, s: pages and tables are made in a few seconds. Looked at so often, s.
 _PATIENCE_S, _GLANCE_S = 60.0, 0.02
@@ -25,30 +28,30 @@ _PART = ".alidade."
 _claimed: dict[Path, int] = {}
 
 
-def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None]) -> tuple[Path, ...]:
-    """Files as `make` writes them into the folder it is given; returns their paths in out_dir.
+def write_whole(out_dir: Path, contents: Mapping[str, Content]) -> tuple[Path, ...]:
+    """Write files that belong together; returns the paths of those that have a content.
 
-    They are made in a folder of their own and moved at the end. Files of earlier ones are replaced, or removed when
-    none of that name was made; others in out_dir stay.
+    They are made in a folder of their own and moved at the end. Files of earlier ones are replaced, or removed where
+    there is no content now; others in out_dir stay.
 
     Args:
         out_dir: where they go.
-        names: in the order in which they take their places; the last, gone first and back last, says that the others
-            are its own, and is always made.
-        make: writes the files.
+        contents: by name, in the order in which they take their places; the last, gone first and back last, says that
+            the others are its own, and always has a content.
 
     Raises:
         InputError: out_dir is a file, cannot be written to, another process does not come to an end there, or has
             written there since this one claimed the folder (`require_room`).
     """
-    new = not out_dir.exists()
+    new, names = not out_dir.exists(), list(contents)
     try:
         with _alone(out_dir):
             for left in out_dir.glob(f"{_PART}*"):  # of processes that were killed: nobody else is here
                 shutil.rmtree(left, ignore_errors=True)
             part = Path(tempfile.mkdtemp(prefix=_PART, dir=out_dir))
             try:
-                make(part)
+                for name, content in contents.items():
+                    _write(part / name, content)
                 return _move(part, out_dir, names)
             finally:
                 shutil.rmtree(part, ignore_errors=True)
@@ -103,12 +106,6 @@ def require_room(out_dir: Path | None) -> None:
         raise InputError(f"{out_dir}: no folder to write results to ({there} may not be written to)")
 
 
-def write_page(out_dir: Path, name: str, text: str) -> Path:
-    """One page of text; returns its path. Raises InputError when it cannot be written."""
-    (path,) = write_whole(out_dir, [name], lambda folder: _write(folder / name, text))
-    return path
-
-
 def write_file(path: Path, content: str | bytes) -> None:
     """A file that belongs to nothing else, whole or not at all. Raises InputError when it cannot be written."""
     try:
@@ -125,8 +122,11 @@ def write_file(path: Path, content: str | bytes) -> None:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def _write(path: Path, content: str | bytes) -> None:
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+def _write(path: Path, content: Content) -> None:
+    if callable(content):
+        content(path)
+    elif content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:

@@ -15,10 +15,8 @@ from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.estimates_mcap import foxglove_layout, write_estimates
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import result_json
-from alidade.pipelines.reports.whole import write_whole
+from alidade.pipelines.reports.whole import Content, write_whole
 
-# In the order in which they take their places: result.json, gone first and back last, says that the others are its own.
-FILES = ("calibration.yaml", "attitude.tum", "estimates.mcap", "foxglove.json", "report.html", "result.json")
 # Folder of the recordings of a joint calibration.
 PARTS = "recordings"
 
@@ -29,7 +27,19 @@ def write_results(out_dir: Path, calibration: Calibration) -> tuple[Path, ...]:
     Raises:
         InputError: out_dir is a file, or cannot be written to.
     """
-    return write_whole(out_dir, FILES, partial(_make, calibration=calibration))
+    estimate, history = calibration.estimate, calibration.estimate.history
+    attitudes = estimate.attitudes if estimate.attitudes is not None and len(estimate.attitudes.time) else None
+    over_time = history if history is not None and len(history.time) else None
+    # result.json, gone first and back last, says that the others are its own.
+    contents: dict[str, Content] = {
+        "calibration.yaml": calibration_yaml(calibration),
+        "attitude.tum": tum(attitudes, calibration.facts.epoch_ns) if attitudes else None,
+        "estimates.mcap": partial(write_estimates, calibration=calibration, history=over_time) if over_time else None,
+        "foxglove.json": foxglove_layout(calibration) if over_time else None,
+        "report.html": report_html(calibration),
+        "result.json": result_json(calibration),
+    }
+    return write_whole(out_dir, contents)
 
 
 def write_part(out_dir: Path, calibration: Calibration) -> None:
@@ -48,18 +58,6 @@ def adopt_parts(out_dir: Path, written: Path) -> None:
         shutil.copytree(written / PARTS, out_dir / PARTS, dirs_exist_ok=True)
     except (OSError, shutil.Error) as error:
         raise InputError(f"{out_dir / PARTS}: cannot be written ({error})") from error
-
-
-def _make(folder: Path, calibration: Calibration) -> None:
-    estimate = calibration.estimate
-    (folder / "result.json").write_text(result_json(calibration), encoding="utf-8")
-    (folder / "calibration.yaml").write_text(calibration_yaml(calibration), encoding="utf-8")
-    (folder / "report.html").write_text(report_html(calibration), encoding="utf-8")
-    if estimate.attitudes is not None and len(estimate.attitudes.time):
-        (folder / "attitude.tum").write_text(tum(estimate.attitudes, calibration.facts.epoch_ns), encoding="utf-8")
-    if estimate.history is not None and len(estimate.history.time):
-        write_estimates(folder / "estimates.mcap", calibration, estimate.history)
-        (folder / "foxglove.json").write_text(foxglove_layout(calibration), encoding="utf-8")
 
 
 def tum(attitudes: Attitudes, epoch_ns: int) -> str:

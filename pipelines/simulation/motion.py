@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.simulation.scenario import ScenarioPart
-
-Array = NDArray[np.float64]
 
 
 class Swing(ScenarioPart):

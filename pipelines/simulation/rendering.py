@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.camera import Camera
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 # A pixel is integrated over n by n parts of its area: (n, contrast of the texture in it, grey levels, up to which).

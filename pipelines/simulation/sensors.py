@@ -6,17 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.parameters import ParameterSpec, quantities
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.scenario import Positive, ScenarioPart
-
-Array = NDArray[np.float64]
 
 
 class Warming(ScenarioPart):

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.topics import CAMERA_INFO
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from alidade.pipelines.recording.series import CameraInfo
     from alidade.pipelines.settings import Config
 
-Array = NDArray[np.float64]
 
 # Number of coefficients that each distortion model may come with; missing ones are zero.
 _COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 4, 5, 8), "equidistant": (0, 4)}

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.refinement import PoseFit, refine, reprojection_errors
@@ -18,7 +19,6 @@ from alidade.pipelines.vision.tags import Detections
 if TYPE_CHECKING:
     from alidade.pipelines.settings import Board
 
-Array = NDArray[np.float64]
 
 # Corners of a tag of size 1 in its own frame (x right, y up, z out of the face), in the AprilTag library's order.
 SQUARE = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])

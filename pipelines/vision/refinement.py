@@ -8,12 +8,10 @@ from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 # First damping, relative; most steps; the last one moves corners by less than this (norm, px).
 _DAMPING, _MAX_STEPS, _SETTLED_PX = 1e-3, 50, 1e-6

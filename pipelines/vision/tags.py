@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
 
-Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 # OpenCV's picture of 36h11 is turned by 180 degrees: its corners 0, 1, 2, 3 (clockwise from its top left) are the

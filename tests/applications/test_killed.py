@@ -23,7 +23,6 @@ from alidade.pipelines.applications import cli
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import load_calibration
-from alidade.pipelines.reports.write import FILES
 
 
 def _parts(few: int, count: int) -> pytest.MarkDecorator:
@@ -34,6 +33,7 @@ def _parts(few: int, count: int) -> pytest.MarkDecorator:
 
 # A server of its own forks the commands, which have imported what they need: a fork of a process with threads,
 # as that of pytest is after other tests, may never end.
+FILES = ("calibration.yaml", "attitude.tum", "estimates.mcap", "foxglove.json", "report.html", "result.json")
 _FORK = multiprocessing.get_context("forkserver")
 _FORK.set_forkserver_preload([__name__, "alidade.pipelines.solvers.batch"])
 

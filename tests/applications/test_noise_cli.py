@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from alidade.pipelines.applications.noise import noise_of
+from alidade.pipelines.applications.noise import even_pieces, noise_of
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.even import even_pieces
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.reports.noise_report import length
 from datasets.broad import read_trial

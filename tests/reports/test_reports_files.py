@@ -291,15 +291,16 @@ def test_the_foxglove_layout_plots_what_the_estimates_hold(tmp_path: Path) -> No
 
 
 def test_all_files_are_written_and_others_left_alone(tmp_path: Path) -> None:
+    files = {"calibration.yaml", "attitude.tum", "estimates.mcap", "foxglove.json", "report.html", "result.json"}
     out = tmp_path / "a" / "b"
     written = write_results(out, make_calibration())
-    assert {path.name for path in written} == set(write.FILES)
-    assert {path.name for path in out.iterdir()} == set(write.FILES)
+    assert {path.name for path in written} == files
+    assert {path.name for path in out.iterdir()} == files
     (out / "notes.txt").write_text("mine")
     batch = make_calibration(solver="batch", history=None)
     over_time = {"estimates.mcap", "foxglove.json"}
-    assert {path.name for path in write_results(out, batch)} == set(write.FILES) - over_time
-    assert {path.name for path in out.iterdir()} == {*write.FILES, "notes.txt"} - over_time
+    assert {path.name for path in write_results(out, batch)} == files - over_time
+    assert {path.name for path in out.iterdir()} == {*files, "notes.txt"} - over_time
     assert json.loads((out / "result.json").read_text())["solver"] == "batch"
 
 
@@ -307,7 +308,7 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path: Path, monkeypatch: pyte
     write_results(tmp_path, make_calibration())
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(write, "write_estimates", fail)

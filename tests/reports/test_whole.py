@@ -24,14 +24,11 @@ import sys, time
 from pathlib import Path
 from alidade.pipelines.reports.whole import require_room, write_whole
 who, folder, rounds = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
-def make(part):
-    for name in ("a", "b", "c", "result"):
-        (part / name).write_text(f"{who} {i}")
 require_room(folder)
 print("begun", flush=True)
 sys.stdin.readline()
 for i in range(rounds):
-    write_whole(folder, ("a", "b", "c", "result"), make)
+    write_whole(folder, dict.fromkeys(("a", "b", "c", "result"), lambda path: path.write_text(f"{who} {i}")))
     print(i, flush=True)
 """
 
@@ -85,11 +82,7 @@ def test_a_process_that_is_killed_leaves_results_whole_or_absent(rounds: int, tm
         assert len(_state(folder)) <= 1
         kept += len(_state(folder))
 
-    def make(part: Path) -> None:
-        for name in NAMES:
-            (part / name).write_text("last")
-
-    write_whole(folder, NAMES, make)
+    write_whole(folder, dict.fromkeys(NAMES, "last"))
     assert _state(folder) == {"last"}
     assert sorted(path.name for path in folder.iterdir()) == sorted(NAMES), "what was left of the killed is gone"
     assert kept
@@ -101,7 +94,7 @@ def test_who_does_not_get_the_folder_says_so(tmp_path: Path, monkeypatch: pytest
     fcntl.flock(held, fcntl.LOCK_EX)
     try:
         with pytest.raises(InputError, match="another process is writing its results there"):
-            write_whole(tmp_path, ["x"], lambda _: None)
+            write_whole(tmp_path, {"x": "never"})
     finally:
         os.close(held)
     assert list(tmp_path.iterdir()) == []

@@ -15,9 +15,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.histories import History
-from alidade.pipelines.applications.fleet.statistics import Array, Component, Spread, Trend
+from alidade.pipelines.applications.fleet.statistics import Component, Spread, Trend
 from alidade.pipelines.applications.fleet.store import RecordingResult, UnitResult
 from alidade.pipelines.applications.fleet.tables import Cell, Row
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from alidade.factors.so3 import Array
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.fleet import require_extra, statistics
 from alidade.pipelines.applications.fleet.engine import Killed, answer_interruption, cluster, completed, source_version
@@ -85,7 +86,7 @@ class Study:
         found = self.estimates(solver)
         return statistics.mean_nees(np.array([r["nees"] for r in found]), np.array([float(r["dof"]) for r in found]))
 
-    def normalised(self, solver: str) -> statistics.Array:
+    def normalised(self, solver: str) -> Array:
         """All errors in sigmas, over runs and parameters."""
         return np.array([p["error"] / p["sigma"] for r in self.estimates(solver) for p in r["parameters"].values()])
 

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors.chi_square import quantile, student
+from alidade.factors.so3 import Array
 from alidade.pipelines.diagnostics.device_changes import maximum_likelihood_sigma
-
-Array = NDArray[np.float64]
 
 # Chance that anything at all is flagged among good units, over all tests of a page.
 FALSE_ALARM = 0.01

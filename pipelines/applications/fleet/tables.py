@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,13 @@ Cell = str | int | float | None
 Row = Mapping[str, Cell]
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
+def csv_text(rows: Sequence[Row]) -> str:
     """Numbers with all their digits; empty where a row has nothing; text that is no formula to any spreadsheet."""
-    with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, columns(rows), restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({name: _inert(cell) for name, cell in row.items()} for row in rows)
+    stream = StringIO()
+    writer = csv.DictWriter(stream, columns(rows), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _inert(cell) for name, cell in row.items()} for row in rows)
+    return stream.getvalue()
 
 
 def _inert(cell: Cell) -> Cell:

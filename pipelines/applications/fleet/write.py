@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from alidade.pipelines.applications.fleet.analysis import Population, counting, populations, table
@@ -13,7 +14,7 @@ from alidade.pipelines.applications.fleet.histories import History, change_table
 from alidade.pipelines.applications.fleet.montecarlo import Study, run_table, summary_table
 from alidade.pipelines.applications.fleet.pages import fleet_report, study_report
 from alidade.pipelines.applications.fleet.recordings import find
-from alidade.pipelines.applications.fleet.tables import write_csv, write_parquet
+from alidade.pipelines.applications.fleet.tables import csv_text, write_parquet
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.whole import write_whole
 
@@ -64,25 +65,26 @@ def run_fleet(
 
 
 def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> tuple[Path, ...]:
-    """fleet.html, fleet.csv, fleet.parquet and changes.csv, whole or not at all; returns their paths."""
+    """fleet.csv, fleet.parquet, changes.csv and fleet.html, whole or not at all; returns their paths."""
     rows = table(outcome.results, fleet)
-    page = render_html(fleet_report(outcome, fleet, found))
-
-    def make(folder: Path) -> None:
-        write_csv(folder / "fleet.csv", rows)
-        write_parquet(folder / "fleet.parquet", rows)
-        write_csv(folder / "changes.csv", change_table(found))
-        (folder / "fleet.html").write_text(page, encoding="utf-8")
-
-    return write_whole(out, ["fleet.csv", "fleet.parquet", "changes.csv", "fleet.html"], make)
+    return write_whole(
+        out,
+        {
+            "fleet.csv": csv_text(rows),
+            "fleet.parquet": partial(write_parquet, rows=rows),
+            "changes.csv": csv_text(change_table(found)),
+            "fleet.html": render_html(fleet_report(outcome, fleet, found)),
+        },
+    )
 
 
 def write_study(out: Path, study: Study) -> tuple[Path, ...]:
-    """montecarlo.html, runs.csv and summary.csv, whole or not at all; returns their paths."""
-
-    def make(folder: Path) -> None:
-        write_csv(folder / "runs.csv", run_table(study))
-        write_csv(folder / "summary.csv", summary_table(study))
-        (folder / "montecarlo.html").write_text(render_html(study_report(study)), encoding="utf-8")
-
-    return write_whole(out, ["runs.csv", "summary.csv", "montecarlo.html"], make)
+    """runs.csv, summary.csv and montecarlo.html, whole or not at all; returns their paths."""
+    return write_whole(
+        out,
+        {
+            "runs.csv": csv_text(run_table(study)),
+            "summary.csv": csv_text(summary_table(study)),
+            "montecarlo.html": render_html(study_report(study)),
+        },
+    )

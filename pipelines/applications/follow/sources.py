@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 from alidade.pipelines.applications.follow.spool import RETRY_PERIOD_S, Spool
@@ -68,9 +67,7 @@ class Source(AbstractContextManager["Source"]):
             return False
         return closed and (not self.path.is_dir() or (self.path / "metadata.yaml").is_file())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Nothing to end: another process writes."""
 
 
@@ -115,9 +112,7 @@ class Stream(Source):
         threading.Thread(target=self._run, daemon=True).start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._over.set()
         self._ended.wait(2.0)
         self._stack.close()

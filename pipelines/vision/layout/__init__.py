@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
@@ -22,7 +23,7 @@ from alidade.pipelines.vision.layout.covariance import Covariance, covariance
 from alidade.pipelines.vision.layout.pictures import Gathered, Shots, gathered
 from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_told, joint
 from alidade.pipelines.vision.layout.robust import Fit, fitted
-from alidade.pipelines.vision.layout.sights import Array, Sights, linearized
+from alidade.pipelines.vision.layout.sights import Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, part
 
 __all__ = ["LINE_TIME", "Layout", "Shots", "TagSeen", "estimate_layout"]

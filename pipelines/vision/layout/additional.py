@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.layout.sights import Array, Bundle, Rows, Sights
+from alidade.pipelines.vision.layout.sights import Bundle, Rows, Sights
 
 # What a calibration of a camera is good to: focal lengths as a share, centre, distortion at the picture's corner.
 _FOCAL, _CENTRE_PX, _DISTORTION_PX = 5e-3, 5.0, 1.0

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.layout.additional import Additional
-from alidade.pipelines.vision.layout.sights import Array, Bundle, Rows, Sights, linearized
+from alidade.pipelines.vision.layout.sights import Bundle, Rows, Sights, linearized
 
 _STEPS = 40
 _DIAGONAL = np.arange(6)

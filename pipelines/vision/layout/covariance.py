@@ -25,9 +25,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.layout.bundle import normal_equations, shared_rows
 from alidade.pipelines.vision.layout.robust import Fit
-from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Rows, Sights
+from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights
 from alidade.pipelines.vision.pose import SQUARE
 
 # A correlation within this many of its sigmas of zero has died out; the first one is asked to be beyond more of them.

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Sights
+from alidade.pipelines.vision.layout.sights import Bundle, Index, Sights
 from alidade.pipelines.vision.pose import TagBody
 from alidade.pipelines.vision.tags import Detections
 

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.layout.additional import Additional
 from alidade.pipelines.vision.layout.bundle import adjusted
-from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Rows, Sights, linearized
+from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights, linearized
 
 # Degrees of freedom of the t distribution.
 _NU = 4.0

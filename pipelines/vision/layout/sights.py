@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.so3 import Array
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.pose import SQUARE, TagBody
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # A corner behind the camera, sigmas: a residual that no step may leave there. Beside the camera, farther than so many
