@@ -18,27 +18,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alidade.pipelines.applications.api import (
-        Config,
-        apply,
-        calibrate,
-        certificate,
-        compare,
-        export,
-        fleet,
-        follow,
-        load,
-        noise,
-        open,
-        plan,
-        simulate,
-        validate,
-    )
+    from alidade.pipelines.applications.api import Config, calibrate, compare, fleet, follow, load, open, plan, simulate
+    from alidade.pipelines.applications.apply import apply
+    from alidade.pipelines.applications.noise import noise
     from alidade.pipelines.applications.one_liners import hand_eye, imu_static, magcal
     from alidade.pipelines.applications.session import Session
+    from alidade.pipelines.applications.validate import validate
     from alidade.pipelines.errors import InputError
     from alidade.pipelines.methods import Method
     from alidade.pipelines.methods import names as methods
+    from alidade.pipelines.reports.certificate import certificate
+    from alidade.pipelines.reports.export_formats import export
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.simulation.simulated import Simulated
     from alidade.pipelines.solvers.chain import IndeterminateError
@@ -78,6 +68,11 @@ _MODULES = {
     "Method": "alidade.pipelines.methods",
     "Session": "alidade.pipelines.applications.session",
     "Simulated": "alidade.pipelines.simulation.simulated",
+    "apply": "alidade.pipelines.applications.apply",
+    "certificate": "alidade.pipelines.reports.certificate",
+    "export": "alidade.pipelines.reports.export_formats",
+    "noise": "alidade.pipelines.applications.noise",
+    "validate": "alidade.pipelines.applications.validate",
     **dict.fromkeys(("hand_eye", "imu_static", "magcal"), "alidade.pipelines.applications.one_liners"),
 }
 _API = "alidade.pipelines.applications.api"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from alidade.pipelines import methods
 from alidade.pipelines.applications.fleet.montecarlo import simulate_and_solve
-from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines.applications.session import open_session
 from benchmarks.measure import Ratio, costs
 
 
@@ -28,4 +28,4 @@ def run() -> Iterator[Ratio]:
 
 def _by_file(name: str, path: Path) -> None:
     methods.simulate(name, None, 0, path)
-    calibrate(path, ["batch"])
+    open_session(path).calibrations(["batch"])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines.applications.session import open_session
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.result import Calibration
@@ -30,7 +30,7 @@ def run() -> Iterator[Ratio]:
         folder = Path(name)
         for method in _METHODS:
             simulate(method, None, 1, folder / "session.mcap")
-            (calibration,) = calibrate(folder / "session.mcap", ["batch"])
+            (calibration,) = open_session(folder / "session.mcap").calibrations(["batch"])
             page = folder / f"{method}.html"
             (written,) = costs([partial(_write, calibration, page)])
             compared = f"making the report of {method} over {_WRITTEN:g} s"

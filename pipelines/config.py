@@ -36,7 +36,11 @@ if TYPE_CHECKING:
     from alidade.pipelines.recording.recording import Recording
 
 
-def configured(recording: Recording, override: Path | Config | None = None) -> tuple[Recording, Config]:
+# What overrides a recording's own config: a Config, its keys, or a YAML file.
+Settings = Config | Mapping[str, Any] | str | Path | None
+
+
+def configured(recording: Recording, override: Settings = None) -> tuple[Recording, Config]:
     """A recording with the topics and columns of its config, and this config, overridden as by `load_config`.
 
     Raises InputError.
@@ -45,8 +49,9 @@ def configured(recording: Recording, override: Path | Config | None = None) -> t
     return recording.with_config(config.topics.values(), config.columns), config
 
 
-def load_config(attachment: bytes | None, override: Path | Config | None = None) -> Config:
+def load_config(attachment: bytes | None, override: Settings = None) -> Config:
     """The config in a recording's attachment, overridden key by key by a file or another config. Raises InputError."""
+    override = _file_or_config(override)
     base = _read(attachment, f"attachment {ATTACHMENT}") if attachment is not None else {}
     more: dict[Any, Any] = {}
     gaussian_prior = None
@@ -70,6 +75,19 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
         raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
     config = config.of(str(override) if override is not None else f"attachment {ATTACHMENT}")
     return config if gaussian_prior is None else config.with_prior(gaussian_prior)
+
+
+def _file_or_config(given: object) -> Path | Config | None:
+    if given is None or isinstance(given, Config | Path):
+        return given
+    if isinstance(given, str):
+        return Path(given)
+    if not isinstance(given, Mapping):
+        raise InputError(f"config: a file, an alidade.Config or its keys are needed, not {type(given).__name__}")
+    try:
+        return model().model_validate(dict(given))
+    except ValidationError as error:
+        raise InputError(f"config: {first_error(error, model())[1]}") from error
 
 
 @cache

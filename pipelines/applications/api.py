@@ -19,7 +19,7 @@ from pydantic import BaseModel, ValidationError
 from alidade.factors.so3 import Array
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.config import load_config
+from alidade.pipelines.config import Settings, load_config
 from alidade.pipelines.config import model as _config_model
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import AttitudeRate, EngineName
@@ -32,7 +32,6 @@ from alidade.pipelines.recording.checks import (
     clean,
     nanoseconds,
 )
-from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.shapes import Rows, as_dates, rows_by_name
 from alidade.pipelines.settings import Config as _BaseConfig
@@ -40,13 +39,10 @@ from alidade.pipelines.settings import first_error
 from alidade.pipelines.simulation.simulated import Simulated
 
 if TYPE_CHECKING:
-    from alidade.pipelines.applications.apply import Applied
     from alidade.pipelines.applications.comparison import Comparison
     from alidade.pipelines.applications.fleet.write import FleetResult
     from alidade.pipelines.applications.follow.guidance import View
-    from alidade.pipelines.applications.noise import NoiseStudy
     from alidade.pipelines.applications.planning import Plan
-    from alidade.pipelines.applications.validate import Validated
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration
 
@@ -79,8 +75,6 @@ class Config(_Model):
 
 # What can be opened: a recording, its files, simulated data, a method's own data or its fields by name.
 Source = str | Path | list[str | Path] | Simulated | Mapping[str, Any] | Any
-# Settings that override the recording's own: an alidade.Config, its keys, or a YAML file.
-Settings = _BaseConfig | Mapping[str, Any] | str | Path | None
 
 # No session takes longer, s; stamps in ns, and in us after ten seconds, look as if one had.
 _LONGEST = 1e7
@@ -118,14 +112,13 @@ def open(
 
 
 def _open(source: Source, method: str | None, config: Settings, strict: bool) -> Session:
-    override = _override(config)
     if isinstance(source, str | Path | list | tuple):
-        return Session.read(open_recording(_files(source), strict), method, override)
+        return Session.read(open_recording(source, strict), method, config)
     if isinstance(source, Simulated):
-        text = load_config(source.config.encode(), override)
+        text = load_config(source.config.encode(), config)
         chosen = methods.method(method or text.method or "")
         return Session(chosen, source.data, text, known=source.truth)
-    settings = load_config(None, override)
+    settings = load_config(None, config)
     name = method or settings.method
     if name is None:
         raise InputError("arrays do not say which method they are for: open(..., method=...)")
@@ -136,30 +129,10 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     return Session(chosen, data, settings)
 
 
-def _override(config: object) -> Path | _BaseConfig | None:
-    """A config, or the file of one. Raises InputError when it is neither."""
-    if config is None or isinstance(config, _BaseConfig | Path):
-        return config
-    if isinstance(config, str):
-        return Path(config)
-    if isinstance(config, Mapping):
-        return Config(config)
-    raise InputError(f"config: a file, an alidade.Config or its keys are needed, not {type(config).__name__}")
-
-
 def load_settings(config: Settings, more: Mapping[str, Any]) -> _BaseConfig:
     """A config with these keys where it does not have them itself. Raises InputError."""
-    given = load_config(None, _override(config)).model_dump(exclude_unset=True)
+    given = load_config(None, config).model_dump(exclude_unset=True)
     return Config({**more, **given})
-
-
-def _files(source: str | Path | Sequence[Any]) -> Where:
-    """A recording's path, or the paths of its files. Raises InputError when a list has anything else."""
-    if isinstance(source, str | Path):
-        return source
-    if not all(isinstance(file, str | Path) for file in source):
-        raise InputError("open([...]) takes the files of one recording; calibrate([...]) takes several recordings")
-    return [Path(file) for file in source]
 
 
 def calibrate(
@@ -219,7 +192,7 @@ def load(path: str | Path, config: Settings = None) -> SavedCalibration:
     from alidade.pipelines.reports.calibration import load_calibration
     from alidade.pipelines.reports.known import with_covariance
 
-    return with_covariance(load_calibration(Path(path), load_config(None, _override(config))), Path(path))
+    return with_covariance(load_calibration(Path(path), load_config(None, config)), Path(path))
 
 
 def simulate(
@@ -258,7 +231,7 @@ def plan(
     from alidade.pipelines.applications.planning import make_plan
 
     named = None if scenario is None else str(scenario)
-    return make_plan(method, named, _override(config), require)
+    return make_plan(method, named, config, require)
 
 
 def follow(
@@ -286,7 +259,7 @@ def follow(
     from alidade.pipelines.applications.follow.sources import source_of
 
     earlier = None if prior is None else Path(prior)
-    settings = Following(method, _override(config), window, patience, check=True, prior=earlier)
+    settings = Following(method, config, window, patience, check=True, prior=earlier)
     with source_of(str(path), say=lambda _: None) as source:
         return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
 
@@ -301,40 +274,6 @@ def compare(
     from alidade.pipelines.applications.comparison import compared
 
     return compared(open(source, method, config), window)
-
-
-def validate(
-    recording: str | Path,
-    calibration: str | Path | Calibration,
-    *,
-    method: str | None = None,
-    config: Settings = None,
-    strict: bool = False,
-) -> Validated:
-    """Test a calibration on another recording: `.verdict`, `.sentence`, `.held.steps`.
-
-    `calibration` is a result.json, a calibration.yaml, or what `calibrate` returns.
-
-    Raises:
-        InputError: recording, config or calibration cannot be used, or the calibration is another method's.
-    """
-    from alidade.pipelines.applications.validate import validate as run
-
-    given = Path(calibration) if isinstance(calibration, str | Path) else calibration
-    return run(Path(recording), given, method, _override(config), strict)
-
-
-def noise(
-    recording: str | Path, *, config: Settings = None, strict: bool = False, auto_columns: bool = False
-) -> NoiseStudy:
-    """Allan deviation of the sensors of a recording at rest: `.sensors`, and `.config`, what a Config takes of it.
-
-    Raises:
-        InputError: the recording cannot be used, or nothing in it is at rest.
-    """
-    from alidade.pipelines.applications.noise import noise_of
-
-    return noise_of(Path(recording), strict, _override(config), auto_columns)
 
 
 def fleet(
@@ -359,66 +298,6 @@ def fleet(
 
     settings = FleetSettings.of(method, None if config is None else Path(config), solver, window, prior)
     return run_fleet([str(each) for each in recordings], settings, Path(out), None, jobs, names)
-
-
-def export(calibration: str | Path | Calibration | SavedCalibration, form: str) -> str:
-    """The text of a calibration: px4, ardupilot, betaflight, inav, ros2, kalibr, openvins, realsense, oak; tf, urdf.
-
-    Raises:
-        InputError: the calibration cannot be used, or has no such format.
-    """
-    from alidade.pipelines.reports.export_formats import exported
-
-    return exported(load(calibration) if isinstance(calibration, str | Path) else _saved(calibration), form)
-
-
-def _saved(calibration: Calibration | SavedCalibration) -> SavedCalibration:
-    from alidade.pipelines.reports.calibration import saved
-    from alidade.pipelines.reports.result import Calibration as Made
-
-    return saved(calibration) if isinstance(calibration, Made) else calibration
-
-
-def apply(
-    recording: str | Path | Sequence[str | Path],
-    calibration: str | Path | Calibration | SavedCalibration,
-    out: str | Path,
-    *,
-    config: Settings = None,
-    suffix: str = "_calibrated",
-    strict: bool = False,
-    auto_columns: bool = False,
-) -> Applied:
-    """Copy a recording to an MCAP file with corrected topics beside the recorded ones: `.topics`, `.notes`.
-
-    Raises:
-        InputError: recording, config or calibration cannot be used, or the calibration corrects nothing in the
-            recording.
-    """
-    from alidade.pipelines.applications.apply import apply_calibration
-
-    given = Path(calibration) if isinstance(calibration, str | Path) else _saved(calibration)
-    return apply_calibration(_files(recording), given, Path(out), _override(config), suffix, strict, auto_columns)
-
-
-def certificate(
-    results: str | Path,
-    fields: str | Path | None = None,
-    *,
-    before: str | Path | None = None,
-    out: str | Path | None = None,
-    pdf: bool = False,
-    dcc: bool = False,
-) -> tuple[tuple[Path, ...], list[str]]:
-    """Write a calibration certificate from a result; returns its files and the fields that are not stated.
-
-    Raises:
-        InputError: a file cannot be used, or the result is none to certify.
-    """
-    from alidade.pipelines.reports.certificate import write_certificate
-
-    stated, earlier, folder = (None if each is None else Path(each) for each in (fields, before, out))
-    return write_certificate(Path(results), stated, earlier, folder, pdf, dcc)
 
 
 def _check_seed(seed: object) -> None:

@@ -1,6 +1,6 @@
 """Recordings with corrected sensors: a calibration applied to what an IMU or a magnetometer measured.
 
-    applied = apply_calibration("session.mcap", Path("calibration.yaml"), Path("corrected.mcap"))
+    applied = apply("session.mcap", "calibration.yaml", "corrected.mcap")
 
 Everything recorded is copied as it is, block by block. Behind each block of a topic that the calibration corrects stand
 its corrected messages in ROS 2's form, with the stamps and log times of the recorded ones. Covariances are J C J^T, J
@@ -20,7 +20,7 @@ import numpy as np
 
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
-from alidade.pipelines.config import configured
+from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.methods.triads import numeric_jacobian
@@ -28,23 +28,20 @@ from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.array_container import encode_series, ros2_schema
 from alidade.pipelines.recording.mcap_writer import McapOutput, replacing
 from alidade.pipelines.recording.plausibility import is_there
-from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.streams import StreamReader
 from alidade.pipelines.recording.topics import TEMPERATURE
-from alidade.pipelines.reports.calibration import load_calibration
+from alidade.pipelines.reports.calibration import SavedCalibration, as_saved
 
 if TYPE_CHECKING:
     from alidade.pipelines.estimation.problem import Array
     from alidade.pipelines.methods import Correction
     from alidade.pipelines.recording.container import MessageBlock
     from alidade.pipelines.recording.opening import Where
-    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.series import Stamps
-    from alidade.pipelines.reports.calibration import SavedCalibration
+    from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config
 
-# What the name of a corrected topic ends with.
-SUFFIX = "_calibrated"
 # Of a sensor's RMS, for the derivatives of its correction.
 _STEP = 1e-3
 # Covariance of what was not measured, as ROS has it.
@@ -77,22 +74,26 @@ class Applied:
     notes: tuple[str, ...]
 
 
-def apply_calibration(
-    where: Where,
-    calibration: Path | SavedCalibration,
-    out: Path,
-    override: Path | Config | None = None,
-    suffix: str = SUFFIX,
+def apply(
+    recording: Where,
+    calibration: str | Path | Calibration | SavedCalibration,
+    out: str | Path,
+    *,
+    config: Settings = None,
+    suffix: str = "_calibrated",
     strict: bool = False,
     auto_columns: bool = False,
 ) -> Applied:
-    """Write a recording with corrected topics beside the recorded ones, as MCAP; whole or not at all.
+    """Copy a recording to an MCAP file with corrected topics beside the recorded ones: `.topics`, `.notes`.
+
+    It is written whole or not at all.
 
     Args:
-        where: the recording.
-        calibration: calibration.yaml, or its content; of a file the config is that of the recording.
+        recording: a file, a folder, or the files of one.
+        calibration: calibration.yaml, or what `calibrate` or `load` returns; of a file the config is that of the
+            recording.
         out: file to be written.
-        override: overrides the recording's own config key by key.
+        config: overrides the recording's own config key by key.
         suffix: what is added to the name of a topic for that of the corrected one.
         strict: refuse a recording of which anything is lost.
         auto_columns: use the columns of tables that `alidade info` proposes where the config describes none.
@@ -101,37 +102,38 @@ def apply_calibration(
         InputError: recording, config or calibration cannot be used, the calibration corrects no sensor of the
             recording, a correction needs what was not recorded, or the file cannot be written.
     """
-    recording, config = configured(open_recording(where, strict), override)
+    opened, settings = configured(open_recording(recording, strict), config)
     if auto_columns:
-        recording, config = with_columns(recording, config)
-    if isinstance(calibration, Path):
-        calibration = load_calibration(calibration, config)
-    parts = [recording.container, *getattr(recording.container, "parts", ())]
-    if out.exists() and any(path.exists() and out.samefile(path) for part in parts for path in (part.path, part.data)):
-        raise InputError(f"{out}: that is the recording; give another file")
-    corrections = methods.method(calibration.method).report.corrections
+        opened, settings = with_columns(opened, settings)
+    known, path = as_saved(calibration, settings), Path(out)
+    parts = [opened.container, *getattr(opened.container, "parts", ())]
+    if path.exists() and any(
+        file.exists() and path.samefile(file) for part in parts for file in (part.path, part.data)
+    ):
+        raise InputError(f"{path}: that is the recording; give another file")
+    corrections = methods.method(known.method).report.corrections
     if not corrections:
-        raise InputError(f"method {calibration.method} corrects no sensor's readings: there is nothing to apply")
+        raise InputError(f"method {known.method} corrects no sensor's readings: there is nothing to apply")
     made = {
         each.topic: topic
         for each in corrections
-        if config.base(each.topic) in recording.topics
-        and (topic := _corrected(recording, config, calibration, each, suffix)) is not None
+        if settings.base(each.topic) in opened.topics
+        and (topic := _corrected(opened, settings, known, each, suffix)) is not None
     }
     if not made:
-        names = " and ".join(config.base(each.topic) for each in corrections)
+        names = " and ".join(settings.base(each.topic) for each in corrections)
         raise InputError(
-            f"{recording.path}: nothing is there that the calibration (method {calibration.method}) corrects on "
-            f"{names}; {recording.there()}; `topics:` in the config can rename"
+            f"{opened.path}: nothing is there that the calibration (method {known.method}) corrects on "
+            f"{names}; {opened.there()}; `topics:` in the config can rename"
         )
     for each in corrections:
         if each.frame_of in made and each.topic in made:
             frame = made[each.frame_of].messages.frame_id
             made[each.topic] = replace(made[each.topic], messages=replace(made[each.topic].messages, frame_id=frame))
     topics = tuple(made.values())
-    with replacing(out) as stream:
-        _write(stream, recording, topics)
-    return Applied(out, topics, (*_notes(calibration), *recording.notes))
+    with replacing(path) as stream:
+        _write(stream, opened, topics)
+    return Applied(path, topics, (*_notes(known), *opened.notes))
 
 
 def _notes(calibration: SavedCalibration) -> Iterator[str]:

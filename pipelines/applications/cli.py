@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from alidade.pipelines import deadline, parallel, progress
 from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.cube_commands import cube_layout, cube_print
 from alidade.pipelines.applications.options import ConfigFile, Json, Quiet, RecordingPath, RecordingPaths
+from alidade.pipelines.errors import InputError, nearest_three, printable
 from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
@@ -193,10 +195,8 @@ def calibrate(
     """
     from tempfile import TemporaryDirectory
 
-    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.joint import calibrate_together
     from alidade.pipelines.applications.session import open_session
-    from alidade.pipelines.errors import InputError
     from alidade.pipelines.recording.opening import describe_recordings, group_recordings
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
@@ -257,7 +257,6 @@ def compare(
     Exit code 0 they agree, 2 unusable input, 4 they do not: incremental and batch differ by more than a sigma, or (with
     --out) both halves of the recording by more than chance.
     """
-    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.comparison import compared
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.reports import terminal
@@ -324,7 +323,6 @@ def follow(
     """
     from alidade.pipelines.applications.follow.follow import follow as run
     from alidade.pipelines.applications.follow.follower import Settings
-    from alidade.pipelines.errors import InputError
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import write_results
 
@@ -359,7 +357,6 @@ def validate(
 
     Has the device changed, and what error remains? Exit code 0 valid, 2 unusable input, 3 not observable, 4 changed.
     """
-    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.validate import validate as run
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import validation_json
@@ -367,7 +364,7 @@ def validate(
 
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
         with progress.doing("validating"):
-            validated = run(session, calibration, method, config, strict)
+            validated = run(session, calibration, method=method, config=config, strict=strict)
         written = write_validation(out or _beside(session, "validation"), validated)
     if as_json:
         print(validation_json(validated))
@@ -390,7 +387,6 @@ def simulate(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a recording, with its truth."""
-    from alidade.pipelines import progress
     from alidade.pipelines.methods import simulate as run
     from alidade.pipelines.reports import terminal
 
@@ -413,7 +409,6 @@ def scenarios(
     """
     from alidade.pipelines import methods
     from alidade.pipelines.display.table import Column, Table
-    from alidade.pipelines.errors import InputError, nearest_three
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import plain_json
     from alidade.pipelines.simulation.scenario import summary
@@ -453,7 +448,6 @@ def plan(
 
     Exit code 3 if the motion falls short of the requirements.
     """
-    from alidade.pipelines import progress
     from alidade.pipelines.applications.planning import make_plan, requirements
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.html import render_html
@@ -490,7 +484,6 @@ def info(
 
     With which topics, what is missing, and the contents of the recording.
     """
-    from alidade.pipelines import progress
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
     from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
@@ -527,13 +520,12 @@ def noise(
 
     Gyros, accelerometers, magnetometers; prints the section `noise` of the config.
     """
-    from alidade.pipelines import deadline, progress
-    from alidade.pipelines.applications.noise import noise_of
+    from alidade.pipelines.applications.noise import noise as measured
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.noise_report import noise_json, noise_report, write_noise
 
     with progress.shown(quiet), deadline.within(time_limit):
-        study = noise_of(session, strict, config, auto_columns)
+        study = measured(session, config=config, strict=strict, auto_columns=auto_columns)
     written = () if out is None else write_noise(out, study)
     if as_json:
         print(noise_json(study), end="")
@@ -552,7 +544,6 @@ def demo(
 
     With all three solvers; prints the path of the report.
     """
-    from alidade.pipelines import progress
     from alidade.pipelines.applications.comparison import Comparison
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.methods import simulate as simulated
@@ -593,7 +584,6 @@ def montecarlo(
     Simulates and calibrates many recordings, and compares their errors with the sigmas (NEES, coverage). The same
     command resumes after an interruption.
     """
-    from alidade.pipelines import progress
     from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study
     from alidade.pipelines.applications.fleet.pages import study_report
     from alidade.pipelines.applications.fleet.write import write_study
@@ -638,7 +628,6 @@ def fleet(
 
     The same command resumes after an interruption.
     """
-    from alidade.pipelines import progress
     from alidade.pipelines.applications.fleet.fleet import Settings
     from alidade.pipelines.applications.fleet.write import run_fleet
     from alidade.pipelines.reports import terminal
@@ -675,7 +664,7 @@ def export(
     """
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.calibration import load_calibration
-    from alidade.pipelines.reports.export_formats import exported
+    from alidade.pipelines.reports.export_formats import export as exported
     from alidade.pipelines.reports.plain_json import plain_json
     from alidade.pipelines.reports.whole import write_file
 
@@ -709,13 +698,14 @@ def apply(
 
     Gyro, accelerometer, magnetometer: /imu/data becomes /imu/data_calibrated beside it.
     """
-    from alidade.pipelines import progress
-    from alidade.pipelines.applications.apply import apply_calibration
+    from alidade.pipelines.applications.apply import apply as run
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import applied_json
 
     with progress.shown(quiet or as_json):
-        applied = apply_calibration(recording, calibration, out, config, suffix, strict, auto_columns)
+        applied = run(
+            recording, calibration, out, config=config, suffix=suffix, strict=strict, auto_columns=auto_columns
+        )
     if as_json:
         print(applied_json(applied))
         return
@@ -739,9 +729,9 @@ def certificate(
     certificate.html for printing, certificate.json for programs.
     """
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.certificate import write_certificate
+    from alidade.pipelines.reports.certificate import certificate as write
 
-    written, missing = write_certificate(results, fields, before, out, pdf, digital)
+    written, missing = write(results, fields, before=before, out=out, pdf=pdf, dcc=digital)
     terminal.say(f"Wrote {', '.join(map(str, written))}")
     if missing:
         terminal.say(f"not stated: {', '.join(missing)}")
@@ -806,8 +796,6 @@ def main() -> None:
 
 def _of_system(error: OSError) -> str:
     """A file or a folder that the system refuses, TMPDIR without room among them, in one line."""
-    from alidade.pipelines.errors import printable
-
     where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
     return f"{printable(where)}: {error.strerror or printable(str(error))}"
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from alidade.pipelines import progress
 from alidade.pipelines.applications.options import ConfigFile, Json, Quiet
 from alidade.pipelines.errors import InputError
 
@@ -25,7 +26,6 @@ def cube_layout(
 
     From pictures of all sides; ids and sizes come from the config.
     """
-    from alidade.pipelines import progress
     from alidade.pipelines.config import configured
     from alidade.pipelines.methods.cube.layout import cube_layout as estimate
     from alidade.pipelines.methods.cube.layout import layout_yaml

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from alidade.factors.so3 import Array
 from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
-from alidade.pipelines.config import load_config
+from alidade.pipelines.config import Settings, load_config
 from alidade.pipelines.diagnostics.noise_spectrum import AxisNoise, axis_noise
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.errors import InputError
@@ -95,28 +95,28 @@ class _Device(NamedTuple):
     sensors: dict[str, Array]
 
 
-def noise_of(
-    path: Path, strict: bool = False, config: Path | Config | None = None, auto_columns: bool = False
+def noise(
+    recording: str | Path, *, config: Settings = None, strict: bool = False, auto_columns: bool = False
 ) -> NoiseStudy:
-    """The noise of every gyro, accelerometer and magnetometer of a recording.
+    """Allan deviation of the sensors of a recording at rest: `.sensors`, and `.config`, what a Config takes of it.
 
     Args:
-        path: the recording.
-        strict: refuse it if anything of it is lost.
+        recording: with gyros, accelerometers or magnetometers.
+        config: the columns of tables, topics made of others, and those with rates alone.
+        strict: refuse a recording of which anything is lost.
         auto_columns: take what `alidade info` concludes of the columns of tables, where the config describes none.
-        config: YAML file with the columns of tables, topics made of others, and those with rates alone.
 
     Raises:
         InputError: recording or config cannot be used, there is no such sensor, or nothing in it is at rest.
     """
-    settings = load_config(None, config)
-    recording = open_recording(path, strict).with_config(settings.topics.values(), settings.columns)
+    settings, path = load_config(None, config), Path(recording)
+    opened = open_recording(path, strict).with_config(settings.topics.values(), settings.columns)
     if auto_columns:
-        recording, _ = with_columns(recording, settings)
+        opened, _ = with_columns(opened, settings)
     rates = _rates_alone(settings)
     names = [
         name
-        for name, topic in recording.topics.items()
+        for name, topic in opened.topics.items()
         if (topic.type in (messages.IMU, messages.MAGNETIC_FIELD) or name in rates)
         and topic.is_readable
         and topic.count
@@ -124,17 +124,17 @@ def noise_of(
     if not names:
         kinds = f"{messages.IMU} or {messages.MAGNETIC_FIELD}"
         raise InputError(
-            f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {recording.there()}; tables need "
+            f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {opened.there()}; tables need "
             "--auto-columns or --config with their `columns`, rates alone their topic under `topics` in it, as head_imu"
         )
     found: list[SensorNoise] = []
     troubles: list[str] = []
     notes: list[str] = []
-    with deadline.usual(recording.duration_s):
+    with deadline.usual(opened.duration_s):
         some = deadline.until_passed(names, "the noise of {} and of what follows it".format, 1)
         for name in progress.track(some, "noise", len(names)):
             try:
-                found += _topic_noise(recording, name, notes)
+                found += _topic_noise(opened, name, notes)
             except InputError as error:
                 troubles.append(str(error))
         notes += filter(None, [deadline.stopped()])
@@ -142,8 +142,8 @@ def noise_of(
         raise InputError(
             "; ".join([*troubles, *notes]) or f"{path}: {', '.join(names)}: no sensor, all values are zero or NaN"
         )
-    notes = [*recording.notes, *troubles, *notes]
-    return NoiseStudy(path.name, recording.epoch_ns, recording.duration_s, tuple(found), tuple(notes))
+    notes = [*opened.notes, *troubles, *notes]
+    return NoiseStudy(path.name, opened.epoch_ns, opened.duration_s, tuple(found), tuple(notes))
 
 
 def _rates_alone(settings: Config) -> set[str]:

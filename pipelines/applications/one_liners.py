@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from alidade.factors import so3
-from alidade.pipelines.applications.api import Settings, calibrate, load_settings
+from alidade.pipelines.applications.api import calibrate, load_settings
+from alidade.pipelines.config import Settings
 from alidade.pipelines.estimation.problem import Array
 
 if TYPE_CHECKING:

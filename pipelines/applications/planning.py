@@ -13,18 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from alidade.pipelines import methods, progress
+from alidade.pipelines.config import Settings
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods import Method, Scenario
-from alidade.pipelines.settings import Config
 
 _MOST_STEPS = 3
 # A change that brings less information than this on what is missing, nats, is not worth the trouble.
@@ -132,7 +131,7 @@ class Plan:
 def make_plan(
     method_name: str,
     scenario: str | None = None,
-    config_file: Path | Config | None = None,
+    config_file: Settings = None,
     require: Mapping[str, float] | None = None,
     most_steps: int = _MOST_STEPS,
 ) -> Plan:
@@ -171,7 +170,7 @@ def make_plan(
 def predict(
     method_name: str,
     scenario: Scenario,
-    config_file: Path | Config | None,
+    config_file: Settings,
     require: Mapping[str, float],
     seeds: Sequence[int] | None = None,
     made: Made | None = None,
@@ -204,7 +203,7 @@ def predict(
 
 
 def _predicted(
-    method_name: str, scenario: Scenario, config_file: Path | Config | None, require: Mapping[str, float], seed: int
+    method_name: str, scenario: Scenario, config_file: Settings, require: Mapping[str, float], seed: int
 ) -> Prediction:
     """Of one draw."""
     from alidade.pipelines.applications.session import Session
@@ -241,7 +240,7 @@ def requirements(given: Sequence[str]) -> dict[str, float]:
 
 
 def _candidates(
-    method: Method, before: Prediction, config_file: Path | Config | None, require: Mapping[str, float], made: Made
+    method: Method, before: Prediction, config_file: Settings, require: Mapping[str, float], made: Made
 ) -> Iterator[Step]:
     """Each possible change with what it would bring to the worst draw; those that cannot be recorded are left out."""
     seeds = (before.worst,)

@@ -22,7 +22,7 @@ from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_prior, walks
 from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
-from alidade.pipelines.config import configured, load_config
+from alidade.pipelines.config import Settings, configured, load_config
 from alidade.pipelines.diagnostics.change_test import (
     Stability,
     change_finding,
@@ -113,7 +113,7 @@ class Session:
         cls,
         recording: Recording,
         method_name: str | None,
-        config_file: Path | Config | None,
+        config_file: Settings,
         auto_topics: bool = False,
         prior: Path | None = None,
         auto_columns: bool = False,
@@ -170,7 +170,7 @@ class Session:
         return replace(self, data=self.method.read(recording, self.config), recording=recording)
 
     @classmethod
-    def of(cls, method: Method, simulated: Simulated, config_file: Path | Config | None = None) -> Session:
+    def of(cls, method: Method, simulated: Simulated, config_file: Settings = None) -> Session:
         """A simulated recording that was never written."""
         config = load_config(simulated.config.encode(), config_file)
         return cls(method, simulated.data, config, known=simulated.truth)
@@ -498,7 +498,7 @@ class Session:
 
 
 def open_session(
-    path: Where, method: str | None = None, config: Path | Config | None = None, strict: bool = False, **more: Any
+    path: Where, method: str | None = None, config: Settings = None, strict: bool = False, **more: Any
 ) -> Session:
     """Open a recording for calibration: a file, a folder of parts, a pattern of names, or a list of parts.
 
@@ -509,13 +509,6 @@ def open_session(
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method, config, **more)
     return replace(session, read_s=time.perf_counter() - start)
-
-
-def calibrate(
-    path: Where, solvers: Sequence[str], method: str | None = None, config: Path | Config | None = None
-) -> list[Calibration]:
-    """One calibration a solver, from one reading of a recording (exceptions as of `Session.calibrate`)."""
-    return open_session(path, method, config).calibrations(solvers)
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:

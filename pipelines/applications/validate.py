@@ -8,20 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines import deadline, progress
+from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.session import Session, resolve_method
 from alidade.pipelines.applications.sharing import device_prior, walks
-from alidade.pipelines.config import configured
+from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.estimation.problem import Estimate
-from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
 from alidade.pipelines.reports.known import load_known, with_covariance
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.settings import Config
 
 # Eigenvalues of a correlation matrix below this share of the largest are rounding.
 _RANK = 1e-9
@@ -108,48 +106,50 @@ class Validated:
 
 
 def validate(
-    path: Path,
-    calibration_file: Path | Calibration,
-    method_name: str | None = None,
-    config_file: Path | Config | None = None,
+    recording: str | Path,
+    calibration: str | Path | Calibration,
+    *,
+    method: str | None = None,
+    config: Settings = None,
     strict: bool = False,
 ) -> Validated:
-    """The errors of a recording before and after compensation.
+    """Test a calibration on another recording: `.verdict`, `.sentence`, `.held.steps`.
 
     Args:
-        path: the recording.
-        calibration_file: calibration.yaml, result.json, or a calibration that was just made.
-        method_name: overrides the config's.
-        config_file: overrides the recording's own config key by key.
+        recording: the other one.
+        calibration: a result.json, a calibration.yaml, or what `calibrate` returns.
+        method: overrides the config's.
+        config: overrides the recording's own config key by key.
         strict: refuse a recording of which anything is lost.
 
     Raises:
         InputError: recording, config or calibration cannot be used, or the calibration is another method's.
     """
-    if isinstance(calibration_file, Path):
-        calibration = with_covariance(load_known(calibration_file), calibration_file)
+    path = Path(recording)
+    if isinstance(calibration, Calibration):
+        known = saved(calibration)
     else:
-        calibration = saved(calibration_file)
-    recording, config = configured(open_recording(path, strict), config_file)
-    name = resolve_method(method_name or calibration.method, recording, config)
-    calibration.of_method(name)
-    chosen = method(name)
-    data = chosen.read(recording, config)
-    values = calibration.values
-    validations = chosen.report.validate(data, config, values)
-    if calibration.recording.sha256 == recording.sha256():
-        return Validated(calibration, path.name, validations, True, recording.notes)
-    session = Session(chosen, data, config, recording)
+        known = with_covariance(load_known(Path(calibration)), Path(calibration))
+    opened, settings = configured(open_recording(path, strict), config)
+    name = resolve_method(method or known.method, opened, settings)
+    known.of_method(name)
+    chosen = methods.method(name)
+    data = chosen.read(opened, settings)
+    values = known.values
+    validations = chosen.report.validate(data, settings, values)
+    if known.recording.sha256 == opened.sha256():
+        return Validated(known, path.name, validations, True, opened.notes)
+    session = Session(chosen, data, settings, opened)
     with session.usual_time():
-        held, estimate, own = _held(session, calibration)
-        lost = (*recording.notes, *filter(None, [deadline.stopped()]))
+        held, estimate, own = _held(session, known)
+        lost = (*opened.notes, *filter(None, [deadline.stopped()]))
     if held is None or estimate is None:
-        return Validated(calibration, path.name, validations, False, lost)
-    of_device = walks(chosen, config, [name for name in own if name in calibration.parameters])
+        return Validated(known, path.name, validations, False, lost)
+    of_device = walks(chosen, settings, [name for name in own if name in known.parameters])
     fixed = {name: values[name] for name in of_device if name in values}
-    device = chosen.report.validate(data, config, own | _conditioned(estimate, fixed))
-    best = chosen.report.validate(data, config, own)
-    return Validated(calibration, path.name, validations, False, lost, held, device, best)
+    device = chosen.report.validate(data, settings, own | _conditioned(estimate, fixed))
+    best = chosen.report.validate(data, settings, own)
+    return Validated(known, path.name, validations, False, lost, held, device, best)
 
 
 def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float]:

@@ -57,6 +57,8 @@ def open_container(where: Where, strict: bool = False) -> Container:
 
 def _open(where: Where) -> Container:
     if not isinstance(where, (str, Path)):
+        if not all(isinstance(file, str | Path) for file in where):
+            raise InputError("open([...]) takes the files of one recording; calibrate([...]) takes several recordings")
         return _together([Path(one) for one in where])
     path = Path(where)
     if path.is_dir():

@@ -261,6 +261,17 @@ def load_calibration(path: Path, config: Config | None = None) -> SavedCalibrati
         raise invalid(path, "a calibration.yaml", error) from error
 
 
+def as_saved(given: str | Path | Calibration | SavedCalibration, config: Config | None = None) -> SavedCalibration:
+    """What calibration.yaml says of a calibration; of a file with the config that its formulas are for.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    if isinstance(given, str | Path):
+        return load_calibration(Path(given), config)
+    return saved(given) if isinstance(given, Calibration) else given
+
+
 def rotations_of(calibration: Calibration) -> dict[str, SavedRotation]:
     """The parameters that are rotation vectors, as quaternions."""
     values: Mapping[str, float] = {name: p.value for name, p in calibration.parameters.items()}

@@ -120,10 +120,16 @@ def _recordings(result: Result) -> list[_Recording]:
     return [_Recording(r.recording, r.sha256, r.start, r.duration_s, r.dof) for r in result.recordings]
 
 
-def write_certificate(
-    results: Path, fields: Path | None, before: Path | None, out: Path | None, pdf: bool = False, digital: bool = False
+def certificate(
+    results: str | Path,
+    fields: str | Path | None = None,
+    *,
+    before: str | Path | None = None,
+    out: str | Path | None = None,
+    pdf: bool = False,
+    dcc: bool = False,
 ) -> tuple[tuple[Path, ...], list[str]]:
-    """Write the certificate of a calibration to files; returns their paths and the fields that nobody stated.
+    """Write a calibration certificate from a result; returns its files and the fields that are not stated.
 
     Args:
         results: folder of a calibration, or its result.json.
@@ -131,15 +137,16 @@ def write_certificate(
         before: an earlier calibration of the item, result.json or calibration.yaml, as found against it.
         out: folder; None: that of the results.
         pdf: print it, by WeasyPrint.
-        digital: write a Digital Calibration Certificate.
+        dcc: write a Digital Calibration Certificate.
 
     Raises:
         InputError: a file cannot be used, the result is none to certify, there is no WeasyPrint that works, or a field
             that a digital certificate needs is not stated.
     """
-    path = results / "result.json" if results.is_dir() else results
-    result, stated = _read_result(path), _read_fields(fields)
-    earlier = {} if before is None else _earlier(before, result.method)
+    path, earlier_path = Path(results), None if before is None else Path(before)
+    path = path / "result.json" if path.is_dir() else path
+    result, stated = _read_result(path), Fields() if fields is None else _read_fields(Path(fields))
+    earlier = {} if earlier_path is None else _earlier(earlier_path, result.method)
     rows = _rows(result, stated, earlier)
     for name in stated.limits:
         if name not in {row.name for row in rows}:
@@ -148,15 +155,15 @@ def write_certificate(
         name for name, value in stated.model_dump(exclude={"remarks", "limits", "country"}).items() if value is None
     ]
     content = _content(result, stated, rows, missing)
-    page = render_html(certificate_report(result, stated, rows, missing, before))
+    page = render_html(certificate_report(result, stated, rows, missing, earlier_path))
     matrix = result.covariance
     files: dict[str, Content] = {
         "certificate.html": page,
         "certificate.pdf": _printed(page) if pdf else None,
-        "certificate.xml": digital_certificate(content, matrix.order, matrix.matrix) if digital else None,
+        "certificate.xml": digital_certificate(content, matrix.order, matrix.matrix) if dcc else None,
         "certificate.json": json.dumps(content, indent=1, allow_nan=False) + "\n",
     }
-    return write_whole(out or path.parent, files), missing
+    return write_whole(path.parent if out is None else Path(out), files), missing
 
 
 def _read_result(path: Path) -> Result:
@@ -167,9 +174,7 @@ def _read_result(path: Path) -> Result:
     return result
 
 
-def _read_fields(path: Path | None) -> Fields:
-    if path is None:
-        return Fields()
+def _read_fields(path: Path) -> Fields:
     content = load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path)) or {}
     try:
         return Fields.model_validate(content)

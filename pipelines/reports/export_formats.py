@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,18 +12,22 @@ from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.triads import TRIADS
 from alidade.pipelines.reports import triad_export
-from alidade.pipelines.reports.calibration import SavedCalibration, SavedTransform
+from alidade.pipelines.reports.calibration import SavedCalibration, SavedTransform, as_saved
+from alidade.pipelines.reports.result import Calibration
 
 _SAID = "covariance of small rotations about the parent's axes, rad^2, by rows"
 _PLACE = "only the rotation is calibrated: put the translation in"
 
 
-def exported(saved: SavedCalibration, form: str) -> str:
-    """The text of a calibration in a format: mounting rotations as static transforms, or gain and offset of triads.
+def export(calibration: str | Path | Calibration | SavedCalibration, form: str) -> str:
+    """The text of a calibration: px4, ardupilot, betaflight, inav, ros2, kalibr, openvins, realsense, oak; tf, urdf.
+
+    Gain and offset of sensors of three axes, or mounting rotations as static transforms.
 
     Raises:
-        InputError: there is no such format for the calibration.
+        InputError: the calibration cannot be used, or has no such format.
     """
+    saved = as_saved(calibration)
     has_triad = any(f"{name}_k11" in saved.parameters for name in TRIADS)
     formats = {**(triad_export.FORMATS if has_triad else {}), **(MOUNT_FORMATS if saved.transforms else {})}
     if not formats:

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import alidade
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import names
 from alidade.pipelines.methods import simulate as write
 from alidade.pipelines.recording.shapes import rows_by_name
 from tests.support.forms import split
+from tests.support.solved import calibrate
 
 HEAD = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
 

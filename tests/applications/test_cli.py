@@ -246,7 +246,7 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
 
     with monkeypatch.context() as patched:
         for name in (
-            "alidade.pipelines.applications.session.calibrate",
+            "alidade.pipelines.applications.session.open_session",
             "alidade.pipelines.applications.follow.follow.follow",
         ):
             patched.setattr(name, worked)

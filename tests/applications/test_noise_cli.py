@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from alidade.pipelines.applications.noise import even_pieces, noise_of
+from alidade.pipelines.applications.noise import even_pieces, noise
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.recording import series
@@ -140,7 +140,7 @@ def test_stretches_of_a_recording_in_motion_are_pooled(alidade: Command, tmp_pat
     run = alidade("noise", tmp_path / "s.mcap")
     assert run.code == 0, run.err
     assert "3 static intervals" in run.out
-    (found, _) = noise_of(tmp_path / "s.mcap").sensors
+    (found, _) = noise(tmp_path / "s.mcap").sensors
     for start, end in found.rests:
         assert not motion[(t >= start) & (t <= end)].any()
     assert 40.0 < found.length_s < 55.0
@@ -189,7 +189,7 @@ def test_gaps_lost_samples_and_nan(tmp_path: Path) -> None:
     keep[10_000:12_000] = False
     jitter = 2e-3 * rng.random(len(t))
     write_session(tmp_path / "s.mcap", {"/imu": series.ImuSeries(stamps(t + jitter)[keep], gyro[keep], accel[keep])})
-    found, _ = noise_of(tmp_path / "s.mcap").sensors
+    found, _ = noise(tmp_path / "s.mcap").sensors
     assert found.rate_hz == pytest.approx(100.0, rel=1e-3)
     assert 100 < found.filled < 250
     assert len(found.rests) == 2
@@ -202,7 +202,7 @@ def test_readings_that_a_driver_holds_are_measured_once(tmp_path: Path) -> None:
     t, gyro, _ = device(np.random.default_rng(4), 60.0)
     session = series.ImuSeries(stamps(grid(4 * len(t), 0.0025)), np.repeat(gyro, 4, axis=0))
     write_session(tmp_path / "s.mcap", {"/imu": session})
-    study = noise_of(tmp_path / "s.mcap")
+    study = noise(tmp_path / "s.mcap")
     (found,) = study.sensors
     assert found.rate_hz == pytest.approx(100.0)
     assert f"/imu gyro: repeats the reading before, used once: {3 * len(t)}" in study.notes
@@ -270,7 +270,7 @@ def test_rests_of_broad_trials(shared_data: Path) -> None:
 def test_noise_of_a_broad_trial(shared_data: Path, tmp_path: Path) -> None:
     trial = read_trial(shared_data / "broad" / "21_undisturbed_fast_combined.mat")
     write_session(tmp_path / "s.mcap", {"/imu": series.ImuSeries(stamps(trial.t), trial.gyro)})
-    (gyro,) = noise_of(tmp_path / "s.mcap").sensors
+    (gyro,) = noise(tmp_path / "s.mcap").sensors
     for axis in gyro.axes.values():
         found = {c.name: c for c in axis.fit.coefficients}
         assert found["N"].value == pytest.approx(1e-4, rel=0.25)
@@ -281,7 +281,7 @@ def test_noise_of_a_broad_trial(shared_data: Path, tmp_path: Path) -> None:
 
 
 def test_contract_recordings_have_the_noise_they_were_made_with(shared_data: Path) -> None:
-    cube = {s.kind: s for s in noise_of(shared_data / "contract" / "cube_nominal.mcap").sensors}
+    cube = {s.kind: s for s in noise(shared_data / "contract" / "cube_nominal.mcap").sensors}
     assert len(cube["gyro"].rests) == 24
     for kind, density in (("accel", 1.5e-3), ("mag", 5e-8)):
         for axis in cube[kind].axes.values():
@@ -289,7 +289,7 @@ def test_contract_recordings_have_the_noise_they_were_made_with(shared_data: Pat
 
 
 def test_a_real_imu_on_a_table(shared_data: Path) -> None:
-    gyro, accel = noise_of(shared_data / "openaxes_imu9" / "adxl.mcap").sensors
+    gyro, accel = noise(shared_data / "openaxes_imu9" / "adxl.mcap").sensors
     for sensor, low, high in ((gyro, 5e-5, 2e-4), (accel, 2e-4, 2e-3)):
         for axis in sensor.axes.values():
             (white,) = (c for c in axis.fit.coefficients if c.name == "N")
@@ -305,6 +305,6 @@ def test_readings_that_differ_by_less_than_any_noise_are_one_value(size: float, 
     t, _, accel = device(rng, 60.0)
     imu = series.ImuSeries(stamps(t), np.asarray(size * rng.integers(-3, 4, accel.shape), dtype=float), accel)
     write_session(tmp_path / "s.mcap", {"/imu": imu})
-    study = noise_of(tmp_path / "s.mcap")
+    study = noise(tmp_path / "s.mcap")
     assert [sensor.kind for sensor in study.sensors] == ["accel"]
     assert sum("reads the same value whenever it is at rest" in note for note in study.notes) == 3

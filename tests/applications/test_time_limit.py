@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from alidade.pipelines import deadline, parallel
-from alidade.pipelines.applications.noise import noise_of
+from alidade.pipelines.applications.noise import noise
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.recording import series
@@ -146,11 +146,11 @@ def test_noise_takes_the_topics_for_which_there_is_time(tmp_path: Path, clock: l
     imu = series.ImuSeries(stamps, 1e-4 * rng.normal(size=(n, 3)), [0.0, 0.0, 9.8] + 1e-3 * rng.normal(size=(n, 3)))
     topics = {"/first/imu": imu, "/second/imu": imu}
     write_session(tmp_path / "s.mcap", topics)
-    study = noise_of(tmp_path / "s.mcap")
+    study = noise(tmp_path / "s.mcap")
     assert {sensor.topic for sensor in study.sensors} == set(topics)
     with deadline.within(1.0):
         clock[0] += 2.0
-        study = noise_of(tmp_path / "s.mcap")
+        study = noise(tmp_path / "s.mcap")
     assert {sensor.topic for sensor in study.sensors} == {"/first/imu"}
     assert any("stopped the noise of /second/imu" in note for note in study.notes)
 

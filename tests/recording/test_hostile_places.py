@@ -21,7 +21,7 @@ from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml
 from alidade.pipelines.recording.opening import bag_metadata, group_recordings
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import load_calibration
-from alidade.pipelines.reports.certificate import write_certificate
+from alidade.pipelines.reports.certificate import certificate
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.simulation.scenario import load_scenario
 from tests.support.command import Command
@@ -31,7 +31,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "config": lambda path: load_config(None, path),
     "prior": load_known,
     "calibration": load_calibration,
-    "certificate": lambda path: write_certificate(path, None, None, None),
+    "certificate": certificate,
 }
 
 

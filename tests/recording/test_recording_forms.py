@@ -17,7 +17,7 @@ from gtsam import Rot3
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from alidade.pipelines.applications.session import calibrate, session_facts
+from alidade.pipelines.applications.session import session_facts
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method, simulate
@@ -36,6 +36,7 @@ from tests.support import forms, live
 from tests.support.forms import header, ros2_recording
 from tests.support.recorded import T0, assert_same, session
 from tests.support.short_problems import FOUR_POSITIONS
+from tests.support.solved import calibrate
 from tests.support.turning import turning, write_csv
 
 BRISK = EulerMotion(

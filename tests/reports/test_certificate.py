@@ -14,7 +14,7 @@ import pytest
 from alidade import calibrate, simulate
 from alidade.factors.chi_square import student
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.reports.certificate import write_certificate
+from alidade.pipelines.reports.certificate import certificate
 from tests.support.browser import fits
 from tests.support.command import Command
 
@@ -79,7 +79,7 @@ def test_fewer_degrees_of_freedom_need_a_larger_factor(results: Path, tmp_path: 
     for fit in changed["chi_square"]["families"].values():
         fit["dof"] = 6.0
     (tmp_path / "result.json").write_text(json.dumps(changed))
-    write_certificate(tmp_path, None, None, None)
+    certificate(tmp_path)
     rows = {row["name"]: row for row in json.loads((tmp_path / "certificate.json").read_text())["results"]}
     shares = np.array([share for source, share in rows["gyro_bias_x"]["budget"].items() if "prior" not in source])
     assert rows["gyro_bias_x"]["degrees"] == pytest.approx(6.0 / (shares**2).sum(), rel=1e-6)
@@ -92,7 +92,7 @@ def test_expanded_uncertainties_are_those_of_the_gum_tree_calculator(results: Pa
     for i, fit in enumerate(changed["chi_square"]["families"].values()):
         fit["dof"] = 5.0 + i
     (tmp_path / "result.json").write_text(json.dumps(changed))
-    write_certificate(tmp_path, None, None, None)
+    certificate(tmp_path)
     freedoms = {name: fit["dof"] for name, fit in changed["chi_square"]["families"].items()}
     rows = json.loads((tmp_path / "certificate.json").read_text())["results"]
     for row in rows:
@@ -120,7 +120,7 @@ def test_fields_that_mean_nothing(results: Path, tmp_path: Path, fields: str, me
     path = tmp_path / "certificate.yaml"
     path.write_text(fields)
     with pytest.raises(InputError, match=message):
-        write_certificate(results, path, None, tmp_path / "out")
+        certificate(results, path, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -129,9 +129,9 @@ def test_what_is_no_result_is_not_certified(results: Path, tmp_path: Path) -> No
     changed["status"] = "inconsistent"
     (tmp_path / "result.json").write_text(json.dumps(changed))
     with pytest.raises(InputError, match="is inconsistent, there is nothing to certify"):
-        write_certificate(tmp_path, None, None, None)
+        certificate(tmp_path)
     with pytest.raises(InputError, match="cannot be opened"):
-        write_certificate(tmp_path / "none", None, None, None)
+        certificate(tmp_path / "none")
 
 
 def pages(pdf: bytes) -> int:
@@ -163,7 +163,7 @@ def test_it_is_printed_page_by_page(results: Path, tmp_path: Path, alidade: Comm
 def test_without_a_printer_nothing_is_written(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "weasyprint", None)
     with pytest.raises(InputError, match=r"--pdf needs WeasyPrint, pip install 'alidade\[pdf\]', and Pango"):
-        write_certificate(results, None, None, tmp_path / "out", pdf=True)
+        certificate(results, out=tmp_path / "out", pdf=True)
     assert not (tmp_path / "out").exists()
 
 
@@ -176,7 +176,7 @@ def test_of_several_recordings_each_counts_with_its_freedoms(results: Path, tmp_
     changed["noise"] = []
     changed["budget"]["theta_y"] = {f"recording {name}": 0.3 for name in sources} | {"prior of gyro_skew_xz": 0.1}
     (tmp_path / "result.json").write_text(json.dumps(changed))
-    write_certificate(tmp_path, None, None, None)
+    certificate(tmp_path)
     rows = {row["name"]: row for row in json.loads((tmp_path / "certificate.json").read_text())["results"]}
     assert rows["theta_y"]["degrees"] == pytest.approx(1.0 / (0.3**2 / 20.0 + 0.3**2 / 5.0))
     page = (tmp_path / "certificate.html").read_text()

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
@@ -21,6 +20,7 @@ from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.support.builders import IDEAL
 from tests.support.command import Command
 from tests.support.damage import boundaries, cuts, flips, rewrite, spoilt
+from tests.support.solved import calibrate
 
 LOS = LosScenario(
     duration_s=7.0,

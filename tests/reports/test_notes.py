@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from tests.support.builders import make_calibration
+from tests.support.solved import calibrate
 
 
 def test_a_gyro_turned_by_90_degrees_is_found_and_told(tmp_path: Path) -> None:

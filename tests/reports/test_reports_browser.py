@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.reports.calibration_report import report_html
 from tests.support.browser import drawn, needs_browser, sheets
+from tests.support.solved import calibrate
 
 SCENARIOS = {
     "los": "{duration_s: 15, gyro_rate_hz: 200, image_rate_hz: 20}",

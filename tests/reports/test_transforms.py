@@ -14,7 +14,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration, saved
-from alidade.pipelines.reports.export_formats import exported, roll_pitch_yaw
+from alidade.pipelines.reports.export_formats import export, roll_pitch_yaw
 from alidade.pipelines.reports.result import Calibration
 
 FRAMES = {
@@ -68,9 +68,9 @@ def test_the_covariance_is_that_of_rotations_about_the_parents_axes(calibration:
 def test_tf_and_urdf_say_the_same(read_back: SavedCalibration) -> None:
     published = re.findall(
         r"--qw (\S+) --qx (\S+) --qy (\S+) --qz (\S+) --frame-id (\w+) --child-frame-id (\w+)",
-        exported(read_back, "tf"),
+        export(read_back, "tf"),
     )
-    robot = ElementTree.fromstring(f"<robot>{exported(read_back, 'urdf')}</robot>")
+    robot = ElementTree.fromstring(f"<robot>{export(read_back, 'urdf')}</robot>")
     joints = robot.findall("joint")
     assert len(published) == len(joints) == len(read_back.transforms)
     for found, joint, each in zip(published, joints, read_back.transforms.values(), strict=True):

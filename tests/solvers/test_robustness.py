@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import method
@@ -28,6 +27,7 @@ from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from alidade.pipelines.solvers.linearization import Group
 from tests.support.judged import judge
+from tests.support.solved import calibrate
 
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],

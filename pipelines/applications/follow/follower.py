@@ -21,6 +21,7 @@ import numpy as np
 from alidade.pipelines.applications.follow.guidance import WAITING, View, Watch, view_of
 from alidade.pipelines.applications.follow.sources import Source
 from alidade.pipelines.applications.session import Session
+from alidade.pipelines.config import Settings as Override
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.camera_clock import Clock
@@ -31,7 +32,6 @@ from alidade.pipelines.recording.opening import file_identity
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from alidade.pipelines.solvers.incremental import IncrementalSolver
 from alidade.pipelines.solvers.window import check_window
@@ -69,7 +69,7 @@ class Settings:
     """
 
     method: str | None = None
-    config: Path | Config | None = None
+    config: Override = None
     window: float | None = 1.0
     patience: float = 30.0
     checkpoint: Path | None = None

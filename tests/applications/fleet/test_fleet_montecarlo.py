@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, _first, run_study, simulate_and_solve
-from alidade.pipelines.applications.session import Session, calibrate
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import method, names
 from alidade.pipelines.reports.result_json import truth_errors
 from benchmarks import consistency
 from tests.support.browser import fits
 from tests.support.fleet_command import alidade
+from tests.support.solved import calibrate
 
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 

@@ -24,7 +24,6 @@ from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.serve import LiveServer
 from alidade.pipelines.applications.follow.sources import Source
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
@@ -34,6 +33,7 @@ from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from benchmarks.initialisation import nees
 from tests.support.builders import IDEAL
 from tests.support.command import Command
+from tests.support.solved import calibrate
 
 ROOT = Path(__file__).resolve().parents[3]
 BRISK = EulerMotion(

