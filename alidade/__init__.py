@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.reports.certificate import certificate
     from alidade.pipelines.reports.export_formats import export
     from alidade.pipelines.reports.result import Calibration
-    from alidade.pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.simulation.scenario import Simulated
     from alidade.pipelines.solvers.chain import IndeterminateError
 
 __all__ = [
@@ -67,7 +67,7 @@ _MODULES = {
     "InputError": "alidade.pipelines.errors",
     "Method": "alidade.pipelines.methods",
     "Session": "alidade.pipelines.applications.session",
-    "Simulated": "alidade.pipelines.simulation.simulated",
+    "Simulated": "alidade.pipelines.simulation.scenario",
     "apply": "alidade.pipelines.applications.apply",
     "certificate": "alidade.pipelines.reports.certificate",
     "export": "alidade.pipelines.reports.export_formats",

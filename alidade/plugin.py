@@ -31,10 +31,8 @@ from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions
 from alidade.pipelines.recording.streams import StreamReader, imu_series
 from alidade.pipelines.recording.topics import IMU, MAG, Setting, Topic, wanted
 from alidade.pipelines.settings import Config, MethodSection
-from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from alidade.pipelines.simulation.scenario import ScenarioPart, sways
-from alidade.pipelines.simulation.sensors import by_axis, recording_config
-from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
+from alidade.pipelines.simulation.scenario import EPOCH_NS, ScenarioPart, Simulated, sways
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing, by_axis, recording_config, sample_times
 
 # fmt: off
 __all__ = [

@@ -20,7 +20,7 @@ from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.settings import Config, Sensors
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import minimum, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.levenberg import Solution

@@ -24,7 +24,7 @@ from alidade.pipelines.applications.follow.sources import Source
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from benchmarks.measure import Ratio, resident_mib
 
 MINUTES = float(os.environ.get("ALIDADE_BENCH_MINUTES", "10"))

@@ -35,7 +35,7 @@ from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
 from alidade.pipelines.settings import Sensors
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
 

@@ -36,7 +36,7 @@ from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.shapes import Rows, as_dates, rows_by_name
 from alidade.pipelines.settings import Config as _BaseConfig
 from alidade.pipelines.settings import first_error
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.scenario import Simulated
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.comparison import Comparison
@@ -189,8 +189,7 @@ def load(path: str | Path, config: Settings = None) -> SavedCalibration:
     Raises:
         InputError: file or config cannot be used.
     """
-    from alidade.pipelines.reports.calibration import load_calibration
-    from alidade.pipelines.reports.known import with_covariance
+    from alidade.pipelines.reports.calibration import load_calibration, with_covariance
 
     return with_covariance(load_calibration(Path(path), load_config(None, config)), Path(path))
 

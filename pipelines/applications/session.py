@@ -60,10 +60,10 @@ from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.plausibility import HELD
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
-from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.reports.calibration import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import TRUTH, Config
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.solvers.window import check_window
 
 SOLVERS = ("batch", "incremental", "published")

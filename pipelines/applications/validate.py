@@ -17,8 +17,7 @@ from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdi
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.reports.calibration import SavedCalibration, saved
-from alidade.pipelines.reports.known import load_known, with_covariance
+from alidade.pipelines.reports.calibration import SavedCalibration, load_known, saved, with_covariance
 from alidade.pipelines.reports.result import Calibration
 
 # Eigenvalues of a correlation matrix below this share of the largest are rounding.

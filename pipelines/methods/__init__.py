@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config, MethodSection
-    from alidade.pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.simulation.scenario import Simulated
 
 GROUP, COMMANDS = "alidade.methods", "alidade.commands"
 _log = logging.getLogger("alidade")

@@ -1,4 +1,4 @@
-"""calibration.yaml: the result for people and for programs that apply it.
+"""calibration.yaml: the result for people and for programs that apply it; and result.json as such a calibration.
 
 saved = load_calibration(Path("out/calibration.yaml"))
 saved.value("gyro_bias_x"), saved.rotations["helmet_mount"]
@@ -21,11 +21,11 @@ from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.reports.result_json import invalid
+from alidade.pipelines.reports.result_json import invalid, read_result
 from alidade.pipelines.reports.values import Application, SensorValues, difference
 from alidade.pipelines.settings import Config
 
@@ -42,6 +42,8 @@ _FRAMES = re.compile(r"([\w ]+) to ([\w ]+)(?:,|$)")
 _STEP = 1e-6
 # Of what was found beside the parameters.
 _FEWER_DIGITS = 6
+# A covariance is symmetric, and none of its eigenvalues negative, to this share.
+_ROUNDING = 1e-6
 
 
 class _Record(BaseModel):
@@ -259,6 +261,60 @@ def load_calibration(path: Path, config: Config | None = None) -> SavedCalibrati
         raise InputError(f"{error}; a calibration.yaml as `alidade calibrate` writes it is needed") from error
     except ValidationError as error:
         raise invalid(path, "a calibration.yaml", error) from error
+
+
+def load_known(path: Path) -> SavedCalibration:
+    """Read result.json, with its joint covariance, or calibration.yaml, whose numbers count as independent.
+
+    Raises:
+        InputError: the file cannot be used.
+    """
+    data = read_bytes(path, MAX_RESULT_BYTES)
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: neither a result.json nor a calibration.yaml: it is no text") from error
+    known = _of_result(path, text) if text.lstrip().startswith("{") else load_calibration(path)
+    _ = known.start_ns  # refused now where it is no date
+    return known
+
+
+def with_covariance(known: SavedCalibration, path: Path) -> SavedCalibration:
+    """The same with the joint covariance in result.json beside a calibration.yaml, if it is of the same calibration."""
+    beside = path.with_name("result.json")
+    if path == beside or not beside.is_file():
+        return known
+    try:
+        joint = load_known(beside)
+    except InputError:
+        return known
+    ours, theirs = ((each.recording.sha256, each.solver, list(each.parameters)) for each in (known, joint))
+    return known.with_joint(joint.gaussian_prior) if ours == theirs else known
+
+
+def _of_result(path: Path, text: str) -> SavedCalibration:
+    result = read_result(path, text)
+    names = tuple(p.name for p in result.parameters)
+    covariance = np.array(result.covariance.matrix, dtype=float) if names else np.empty((0, 0))
+    if tuple(result.covariance.order) != names or covariance.shape != (len(names), len(names)):
+        raise InputError(f"{path}: not a result.json: its covariance is not that of its parameters")
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scaled = covariance / np.outer(np.where(sigmas > 0.0, sigmas, 1.0), np.where(sigmas > 0.0, sigmas, 1.0))
+    asymmetry, negative = np.abs(scaled - scaled.T).max(initial=0.0), -np.linalg.eigvalsh(scaled).min(initial=0.0)
+    if np.diag(covariance).min(initial=0.0) < 0.0 or max(asymmetry, negative) > _ROUNDING:
+        raise InputError(f"{path}: not a result.json: its covariance is none")
+    known = SavedCalibration(
+        method=result.method,
+        solver=result.solver,
+        status=result.status,
+        recording=SavedRecording(file=path.name, sha256=result.session.sha256, start=result.session.start),
+        parameters={
+            p.name: SavedParameter(value=p.value, sigma=float(sigma), unit=p.unit, verdict=p.observability)
+            for p, sigma in zip(result.parameters, sigmas, strict=True)
+        },
+        constants=result.constants or {},
+    )
+    return known.with_joint(GaussianPrior(names, np.array([p.value for p in result.parameters]), covariance, str(path)))
 
 
 def as_saved(given: str | Path | Calibration | SavedCalibration, config: Config | None = None) -> SavedCalibration:

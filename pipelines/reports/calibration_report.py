@@ -18,7 +18,6 @@ from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.triads import TRIADS
 from alidade.pipelines.noises import NOISES
 from alidade.pipelines.reports import sentences
-from alidade.pipelines.reports.budget import Limit, limits
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
 from alidade.pipelines.reports.export_formats import ros_parameters
 from alidade.pipelines.reports.html import Page, render_html
@@ -55,6 +54,7 @@ from alidade.pipelines.reports.results_table import (
     result_cards,
     result_table,
 )
+from alidade.pipelines.reports.sentences import Limit, limits
 from alidade.pipelines.reports.sketch import enlarged, rotation_text, sketch_with
 from alidade.pipelines.reports.snippets import c_code, python_code
 

@@ -26,9 +26,9 @@ from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods import method
+from alidade.pipelines.reports.calibration import load_known
 from alidade.pipelines.reports.dcc import digital_certificate
 from alidade.pipelines.reports.html import render_html
-from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
 from alidade.pipelines.reports.result_json import Result, read_result
 from alidade.pipelines.reports.whole import Content, write_whole

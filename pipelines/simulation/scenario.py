@@ -1,8 +1,9 @@
-"""Scenario files: a simulator's settings in YAML."""
+"""Scenario files, a simulator's settings in YAML; and what a simulator hands over."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -19,6 +20,10 @@ Model = TypeVar("Model", bound=BaseModel)
 _FOLDERS = (Path(__file__).parent / "scenarios", Path(__file__).resolve().parents[2] / "datasets" / "scenarios")
 
 
+# 2026-11-20 12:00 UTC: simulated recordings start here; and the year of that day for the field model.
+EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
+
+
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -28,6 +33,31 @@ class ScenarioPart(BaseModel):
     """Settings of a simulator, or a part of them: unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Simulated:
+    """A simulated recording.
+
+    Attributes:
+        data: what its method reads from such a recording.
+        truth: parameter -> true value, SI.
+        config: the recording's config, YAML: the noise that was simulated and what else the scenario says.
+        pictures: as the method writes them in place of what is measured in them; None without.
+    """
+
+    data: Any
+    truth: Mapping[str, float]
+    config: str
+    pictures: Any = None
+
+    def __iter__(self) -> Iterator[Any]:
+        """Data and truth: `data, truth = simulate(...)`."""
+        return iter((self.data, self.truth))
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Simulated {type(self.data).__name__}, {len(self.truth)} true parameters>"
 
 
 def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | None = None) -> Model:

@@ -23,8 +23,8 @@ from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plain_json import plan_json
 from alidade.pipelines.reports.plan_report import plan_report
 from alidade.pipelines.settings import Sensors
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.browser import fits
 from tests.support.pages import Page

@@ -14,7 +14,7 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, head_config,
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.settings import Sensors
-from alidade.pipelines.simulation.motion import EulerMotion
+from alidade.pipelines.simulation.sensors import EulerMotion
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.judged import judge
 

@@ -7,10 +7,10 @@ import pytest
 import alidade
 from alidade.pipelines.applications.planning import predict
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.reports.budget import REST, limits
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import result
+from alidade.pipelines.reports.sentences import REST, limits
 from tests.support.pages import Page
 
 SHORT = {"duration_s": 15.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 15.0}

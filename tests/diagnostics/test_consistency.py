@@ -35,7 +35,7 @@ from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexe
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.settings import Config, Sensors
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support.builders import IDEAL
 
 Case = tuple[Method, Any, Config]

@@ -16,8 +16,8 @@ from alidade.pipelines.diagnostics.device_changes import LEVEL, CalibrationCheck
 from alidade.pipelines.estimation.problem import Quantity, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import method
-from alidade.pipelines.reports.known import load_known
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.reports.calibration import load_known
+from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.browser import fits
 from tests.support.command import Command

@@ -11,7 +11,7 @@ from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position
 from alidade.pipelines.methods.los.simulation import LosScenario
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support.builders import IDEAL
 
 _Scenario = LosScenario | HeadScenario | IndexerScenario | CubeScenario

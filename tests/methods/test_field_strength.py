@@ -16,7 +16,7 @@ from alidade.pipelines.methods import Method, method
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.results_table import result_cards
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.scenario import Simulated
 
 SHORT: dict[str, dict[str, Any]] = {
     "tumble": {"attitudes": 20, "magnetometer": {"rate_hz": 10.0}},

@@ -25,7 +25,7 @@ from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, Tumb
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.builders import make_calibration
 from tests.support.judged import judge

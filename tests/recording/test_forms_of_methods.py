@@ -16,7 +16,7 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from datasets.broad import CONFIG as BROAD_CONFIG
 from tests.support import forms
 from tests.support.broad_trials import TRIALS, converted

@@ -20,9 +20,8 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml
 from alidade.pipelines.recording.opening import bag_metadata, group_recordings
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.reports.calibration import load_calibration
+from alidade.pipelines.reports.calibration import load_calibration, load_known
 from alidade.pipelines.reports.certificate import certificate
-from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.simulation.scenario import load_scenario
 from tests.support.command import Command
 

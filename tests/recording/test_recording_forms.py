@@ -31,7 +31,7 @@ from alidade.pipelines.recording.sources import TopicSource, inverted
 from alidade.pipelines.recording.streams import StreamReader
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support import forms, live
 from tests.support.forms import header, ros2_recording
 from tests.support.recorded import T0, assert_same, session

@@ -21,7 +21,7 @@ from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.streams import StreamReader, Temperature
 from alidade.pipelines.reports.calibration import load_calibration
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 

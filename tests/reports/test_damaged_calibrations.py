@@ -16,7 +16,7 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording import mcap_writer
 from alidade.pipelines.reports.result_json import truth_errors
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support.builders import IDEAL
 from tests.support.command import Command
 from tests.support.damage import boundaries, cuts, flips, rewrite, spoilt

@@ -26,8 +26,7 @@ from alidade.pipelines.methods.cube.scenario import (
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.static_poses import static_intervals, static_poses
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.simulation.scenario import load_scenario
-from alidade.pipelines.simulation.simulated import YEAR
+from alidade.pipelines.simulation.scenario import YEAR, load_scenario
 
 QUIET = CubeNoise(gyro_density=1e-12, gyro_bias_walk=0.0, accel_density=1e-12, mag_density=1e-18, corner_px=1e-6)
 EXACT = CubeScenario(

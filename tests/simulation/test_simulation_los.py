@@ -22,7 +22,7 @@ from alidade.pipelines.methods.los.simulation import (
     simulate_los,
     simulate_motion,
 )
-from alidade.pipelines.simulation.motion import EulerMotion
+from alidade.pipelines.simulation.sensors import EulerMotion
 
 SILENT = LosNoise(gyro_density=0.0, gyro_bias_walk=0.0, encoder=0.0, los_error=0.0, los_roll=0.0)
 STRAIGHT = LosAngles(delta_px=0, delta_pz=0, delta_gx=0, delta_gy=0, delta_gz=0)

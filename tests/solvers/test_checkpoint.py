@@ -21,7 +21,7 @@ from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.methods.los.recording import read_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.settings import Sensors
-from alidade.pipelines.simulation.motion import EulerMotion
+from alidade.pipelines.simulation.sensors import EulerMotion
 from alidade.pipelines.solvers.batch import minimum, solve, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver, solve_incremental

@@ -22,7 +22,7 @@ from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexe
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
 from alidade.pipelines.methods.triads import triad_names
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from alidade.pipelines.solvers.linearization import Group

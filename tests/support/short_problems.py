@@ -11,7 +11,7 @@ from alidade.pipelines.methods.head import model as head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 
 LOS = LosScenario(duration_s=15.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
 SWAY = EulerMotion(

@@ -34,7 +34,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
-from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.reports.calibration import load_known
 
 if TYPE_CHECKING:
     from alidade.pipelines.estimation.problem import SqrtInformation

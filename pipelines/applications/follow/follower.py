@@ -30,7 +30,7 @@ from alidade.pipelines.recording.container import file_sha256
 from alidade.pipelines.recording.growing import GrowingFiles
 from alidade.pipelines.recording.opening import file_identity
 from alidade.pipelines.recording.recording import Recording, open_recording
-from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.reports.calibration import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from alidade.pipelines.solvers.incremental import IncrementalSolver

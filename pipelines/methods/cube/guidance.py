@@ -25,7 +25,7 @@ from alidade.pipelines.methods.cube.simulation import attitudes
 from alidade.pipelines.methods.cube.static_poses import static_poses
 from alidade.pipelines.methods.place import STRENGTH_ADVICE
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.simulated import YEAR
+from alidade.pipelines.simulation.scenario import YEAR
 
 # Poses that determine the twelve numbers of a triad, and those of published practice: each of six faces thrice.
 _FEWEST_POSES, _POSES_A_FACE = 4, 3

@@ -45,10 +45,9 @@ from alidade.pipelines.methods.cube.scenario import (
 )
 from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from alidade.pipelines.simulation.sensors import by_axis, drift, measured, strength_measured, true_values
-from alidade.pipelines.simulation.simulated import EPOCH_NS, YEAR, Simulated
+from alidade.pipelines.simulation.scenario import EPOCH_NS, YEAR, Simulated
+from alidade.pipelines.simulation.sensors import by_axis, drift, measured, sample_times, strength_measured, true_values
 from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]

@@ -24,19 +24,20 @@ from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import Board, SensorSheets, Tag
-from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
-from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
+from alidade.pipelines.simulation.scenario import EPOCH_NS, NotNegative, Positive, ScenarioPart, Simulated
 from alidade.pipelines.simulation.sensors import (
+    EulerMotion,
+    Swing,
     Warming,
     by_axis,
     drift,
     measured,
     read_by,
     recording_config,
+    sample_times,
     true_values,
 )
-from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]

@@ -21,8 +21,7 @@ from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.indexer.parameters import NUISANCE
 from alidade.pipelines.methods.indexer.recording import JOINTS, IndexerData
 from alidade.pipelines.settings import SensorSheets
-from alidade.pipelines.simulation.motion import sample_times
-from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
+from alidade.pipelines.simulation.scenario import EPOCH_NS, NotNegative, Positive, ScenarioPart, Simulated
 from alidade.pipelines.simulation.sensors import (
     Warming,
     by_axis,
@@ -30,9 +29,9 @@ from alidade.pipelines.simulation.sensors import (
     measured,
     read_by,
     recording_config,
+    sample_times,
     true_values,
 )
-from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 
 Array = NDArray[np.float64]
 

@@ -29,18 +29,19 @@ from alidade.pipelines.methods.los.recording import JOINTS, LosData
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import SensorSheets
-from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart, Share
+from alidade.pipelines.simulation.scenario import EPOCH_NS, NotNegative, Positive, ScenarioPart, Share, Simulated
 from alidade.pipelines.simulation.sensors import (
+    EulerMotion,
+    Swing,
     Warming,
     by_axis,
     drift,
     measured,
     read_by,
     recording_config,
+    sample_times,
     true_values,
 )
-from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
 
 Array = NDArray[np.float64]
 

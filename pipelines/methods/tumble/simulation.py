@@ -21,9 +21,8 @@ from alidade.pipelines.methods.tumble.scenario import (
     TumbleScenario,
     tumble_config,
 )
-from alidade.pipelines.simulation.motion import sample_times
-from alidade.pipelines.simulation.sensors import by_axis, drift, measured, strength_measured
-from alidade.pipelines.simulation.simulated import EPOCH_NS, YEAR, Simulated
+from alidade.pipelines.simulation.scenario import EPOCH_NS, YEAR, Simulated
+from alidade.pipelines.simulation.sensors import by_axis, drift, measured, sample_times, strength_measured
 
 Array = NDArray[np.float64]
 

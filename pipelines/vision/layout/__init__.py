@@ -20,10 +20,9 @@ from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.layout.additional import LINE_TIME, shutters, with_intrinsics
 from alidade.pipelines.vision.layout.bundle import moved, refined_pictures
 from alidade.pipelines.vision.layout.covariance import Covariance, covariance
-from alidade.pipelines.vision.layout.pictures import Gathered, Shots, gathered
 from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_told, joint
 from alidade.pipelines.vision.layout.robust import Fit, fitted
-from alidade.pipelines.vision.layout.sights import Sights, linearized
+from alidade.pipelines.vision.layout.sights import Gathered, Shots, Sights, gathered, linearized
 from alidade.pipelines.vision.pose import TagBody, part
 
 __all__ = ["LINE_TIME", "Layout", "Shots", "TagSeen", "estimate_layout"]

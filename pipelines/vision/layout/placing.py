@@ -19,9 +19,8 @@ from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.layout.additional import nothing
 from alidade.pipelines.vision.layout.bundle import adjusted, loss, refined_pictures
-from alidade.pipelines.vision.layout.pictures import Gathered
 from alidade.pipelines.vision.layout.robust import Fit, fitted
-from alidade.pipelines.vision.layout.sights import Bundle, Index, Sights, linearized
+from alidade.pipelines.vision.layout.sights import Bundle, Gathered, Index, Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, part, planar_solutions
 
 # Sum of squares of a tag in a picture, eight numbers in sigmas, beyond which it counts less and less.

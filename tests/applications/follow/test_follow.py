@@ -29,7 +29,7 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import ClockSheet
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from benchmarks.initialisation import nees
 from tests.support.builders import IDEAL
 from tests.support.command import Command

@@ -24,8 +24,8 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_hea
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, simulate_indexer
 from alidade.pipelines.methods.los.simulation import LosScenario, simulate_los
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 
 
 def _wanted(found: object) -> dict[str, str]:

@@ -23,7 +23,7 @@ from alidade.pipelines.methods.los.simulation import LosScenario, los_config, si
 from alidade.pipelines.recording.growing import GrowingFiles
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Sensors
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support.builders import IDEAL
 from tests.support.live import Bridge, Message, messages, paced, write
 

@@ -27,7 +27,7 @@ from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support import forms
 from tests.support.builders import IDEAL
 from tests.support.live import Bridge, messages, write

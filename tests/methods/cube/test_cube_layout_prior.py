@@ -19,7 +19,7 @@ from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, Layou
 from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
 from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.settings import Config, Sensors, TagsSheet
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 

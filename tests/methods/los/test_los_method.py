@@ -22,8 +22,8 @@ from alidade.pipelines.methods.los.simulation import LosAngles, LosNoise, LosSce
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config, Noise, Sensors
-from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.support.builders import IDEAL

@@ -16,7 +16,7 @@ from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.estimation.problem import Estimate, Residuals
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.scenario import Simulated
 from tests.support.command import Command
 
 TUMBLE = method("tumble")

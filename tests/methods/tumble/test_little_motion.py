@@ -18,7 +18,7 @@ from alidade.pipelines.methods.tumble.first_guess import first_guess
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.methods.tumble.ring import ring
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
-from alidade.pipelines.simulation.simulated import EPOCH_NS, Simulated
+from alidade.pipelines.simulation.scenario import EPOCH_NS, Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 

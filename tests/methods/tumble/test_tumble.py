@@ -43,8 +43,8 @@ from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.simulation.sensors import Warming
-from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from benchmarks import compass

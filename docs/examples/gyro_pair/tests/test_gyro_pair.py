@@ -21,7 +21,7 @@ from alidade.pipelines.estimation.finding import status
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental
 from gyro_pair import METHOD, ConjugateRotation, GyroPairData, GyroPairScenario, align, problem, windows
