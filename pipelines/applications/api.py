@@ -67,7 +67,6 @@ class Config(_Model):
             raise InputError(f"config: {first_error(error, type(self))[1]}") from error
 
     def __repr__(self) -> str:
-        """What was set."""
         return f"Config({self.model_dump(exclude_unset=True)})"
 
     __str__ = __repr__

@@ -78,7 +78,6 @@ class Comparison:
         return write_compare(Path(folder), self)
 
     def __repr__(self) -> str:
-        """One line."""
         solved = ", ".join(f"{c.estimate.solver} {c.status}" for c in self.calibrations)
         return f"<Comparison of {self.calibrations[0].recording}: {solved}; agree: {self.answer}>"
 

@@ -84,7 +84,6 @@ class NoiseStudy:
         return {"noise": section(self)[0]}
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<NoiseStudy of {self.recording}: {', '.join(f'{s.topic} {s.kind}' for s in self.sensors)}>"
 
 

@@ -113,7 +113,6 @@ class Plan:
     steps: tuple[Step, ...]
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<Plan {self.method}: {self.now.status}, with {len(self.steps)} changes {self.best.status}>"
 
     @property

@@ -176,7 +176,6 @@ class Session:
         return cls(method, simulated.data, config, known=simulated.truth)
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<Session {self.method.name} of {self.name}>"
 
     @property

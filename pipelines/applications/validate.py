@@ -49,7 +49,6 @@ class Validated:
     best: Sequence[Validation] = ()
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<Validated {self.calibration.method} on {self.recording}: {self.verdict}>"
 
     @property

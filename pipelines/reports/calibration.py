@@ -162,7 +162,6 @@ class SavedCalibration(_Record, SensorValues):
         return self.model_dump(by_alias=True, mode="json")
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<SavedCalibration {self.method}, {self.solver}, of {self.recording.file}: {self.status}>"
 
     def value(self, name: str) -> float:

@@ -52,7 +52,6 @@ class Page:
     height_px: int = 640
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<Page of {len(self.html) // 1000} kB; .write(path) saves it>"
 
     def _repr_html_(self) -> str:

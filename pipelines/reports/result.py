@@ -318,7 +318,6 @@ class Calibration(SensorValues):
         return write_results(Path(folder), self)
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<Calibration {self.method.name}, {self.estimate.solver}, of {self.recording}: {self.status}>"
 
     def __str__(self) -> str:

@@ -56,7 +56,6 @@ class Simulated:
         return iter((self.data, self.truth))
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<Simulated {type(self.data).__name__}, {len(self.truth)} true parameters>"
 
 

@@ -26,6 +26,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from alidade.pipelines import progress
 from alidade.pipelines.applications.fleet import require_extra
 from alidade.pipelines.errors import InputError
 
@@ -83,6 +84,35 @@ def cluster(scheduler: str | None, jobs: int | None) -> Iterator[Client]:
         _require_workers(client, _REACH)
         _require_version(client)
         yield client
+
+
+def work_off(
+    function: Callable[..., Any],
+    tasks: Mapping[str, tuple[Any, ...]],
+    take: Callable[[str, Any], None],
+    what: str,
+    scheduler: str | None,
+    jobs: int | None,
+) -> bool:
+    """Give the result of every task to `take`, by its name; returns whether Ctrl-C came before the end.
+
+    Args:
+        function: see `completed`.
+        tasks: name -> its arguments; without any there is no cluster.
+        take: is given the results as they come.
+        what: name of the work in the progress display.
+        scheduler, jobs: see `cluster`.
+    """
+    if not tasks:
+        return False
+    with cluster(scheduler, jobs) as client:
+        try:
+            for name, result in progress.track(completed(client, function, tasks), what, len(tasks)):
+                take(name, result)
+        except KeyboardInterrupt:  # answered at once: workers take a while to end
+            print("interrupted: what is finished is written", file=sys.stderr, flush=True)
+            return True
+    return False
 
 
 def completed(
@@ -195,12 +225,6 @@ def _local(jobs: int | None) -> Iterator[Any]:
             yield local
     finally:
         runner.stop()
-
-
-def answer_interruption() -> bool:
-    """Answers Ctrl-C at once: workers take a while to end."""
-    print("interrupted: what is finished is written", file=sys.stderr, flush=True)
-    return True
 
 
 def _require_workers(client: Client, timeout: float) -> None:

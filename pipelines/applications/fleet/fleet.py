@@ -14,10 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from alidade.pipelines import methods, progress
+from alidade.pipelines import methods
 from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.fleet import require_extra
-from alidade.pipelines.applications.fleet.engine import Killed, answer_interruption, cluster, completed, source_version
+from alidade.pipelines.applications.fleet.engine import Killed, source_version, work_off
 from alidade.pipelines.applications.fleet.histories import packed
 from alidade.pipelines.applications.fleet.recordings import Recording, as_date, from_metadata, from_name, local
 from alidade.pipelines.applications.fleet.store import (
@@ -142,36 +142,22 @@ def calibrate_fleet(
         for name, recording in recordings.items()
         if name not in unchanged
     }
-    fresh, again, interrupted = _calibrated_all(tasks, store, scheduler, jobs)
+    fresh: dict[str, RecordingResult] = {}  # that are not to be kept
+
+    def take(name: str, result: Any) -> None:
+        if isinstance(result, Killed):
+            fresh[name] = quarantined()
+        elif result is None:
+            unchanged.add(name)
+        elif "sha256" in result:
+            store.add(name, result)
+        else:
+            fresh[name] = result
+
+    interrupted = work_off(calibrate_recording, tasks, take, "calibrating", scheduler, jobs)
     known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}
     results = {name: _placed(name, known[name], named[name]) for name in recordings if name in known}
-    return Outcome(results, len(recordings), len(unchanged) + again, interrupted)
-
-
-def _calibrated_all(
-    tasks: Mapping[str, tuple[Any, ...]], store: Store[RecordingResult], scheduler: str | None, jobs: int | None
-) -> tuple[dict[str, RecordingResult], int, bool]:
-    """Results that are not to be kept; how many kept ones stand; and whether Ctrl-C came before the end."""
-    fresh: dict[str, RecordingResult] = {}
-    again = 0
-    if not tasks:
-        return fresh, again, False
-    with cluster(scheduler, jobs) as client:
-        try:
-            for name, result in progress.track(
-                completed(client, calibrate_recording, tasks), "calibrating", len(tasks)
-            ):
-                if isinstance(result, Killed):
-                    fresh[name] = quarantined()
-                elif result is None:
-                    again += 1
-                elif "sha256" in result:
-                    store.add(name, result)
-                else:
-                    fresh[name] = result
-        except KeyboardInterrupt:
-            return fresh, again, answer_interruption()
-    return fresh, again, False
+    return Outcome(results, len(recordings), len(unchanged), interrupted)
 
 
 def calibrate_recording(

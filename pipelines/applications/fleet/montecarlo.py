@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from alidade.factors.so3 import Array
-from alidade.pipelines import methods, progress
+from alidade.pipelines import methods
 from alidade.pipelines.applications.fleet import require_extra, statistics
-from alidade.pipelines.applications.fleet.engine import Killed, answer_interruption, cluster, completed, source_version
+from alidade.pipelines.applications.fleet.engine import Killed, source_version, work_off
 from alidade.pipelines.applications.fleet.store import (
     ParameterError,
     RunResult,
@@ -147,20 +147,16 @@ def run_study(
     tasks = {
         str(seed): (method, settings, seed, tuple(solvers), window) for seed in seeds if str(seed) not in store.results
     }
-    kept, interrupted = len(seeds) - len(tasks), False
+    kept = len(seeds) - len(tasks)
     killed: dict[str, dict[str, RunResult]] = {}
-    if tasks:
-        with cluster(scheduler, jobs) as client:
-            try:
-                for name, result in progress.track(
-                    completed(client, simulate_and_solve, tasks), "simulating and solving", len(tasks)
-                ):
-                    if isinstance(result, Killed):
-                        killed[name] = dict.fromkeys(solvers, quarantined())
-                    else:
-                        store.add(name, result)
-            except KeyboardInterrupt:
-                interrupted = answer_interruption()
+
+    def take(name: str, result: Any) -> None:
+        if isinstance(result, Killed):
+            killed[name] = dict.fromkeys(solvers, quarantined())
+        else:
+            store.add(name, result)
+
+    interrupted = work_off(simulate_and_solve, tasks, take, "simulating and solving", scheduler, jobs)
     known = {**store.results, **killed}
     results = {seed: known[str(seed)] for seed in seeds if str(seed) in known}
     name = Path(scenario or chosen.default_scenario()).stem

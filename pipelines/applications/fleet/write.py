@@ -42,7 +42,6 @@ class FleetResult:
         return [*self.outcome.summary, sentence(units)]
 
     def __repr__(self) -> str:
-        """One line."""
         return f"<FleetResult: {self.outcome.summary[0]}>"
 
 
