@@ -23,7 +23,7 @@ from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_grav
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.recording.table_topics import TableTopic, tables_of
-from alidade.pipelines.recording.table_units import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
+from alidade.pipelines.recording.table_values import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
 from alidade.pipelines.settings import Config
 

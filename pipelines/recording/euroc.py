@@ -19,7 +19,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.camera_files import camera
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
-from alidade.pipelines.recording.table_times import nanoseconds
+from alidade.pipelines.recording.table_values import nanoseconds
 from alidade.pipelines.recording.tables import numbers, read_columns, table_form
 
 

@@ -25,8 +25,15 @@ from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, MultiPartContainer, combined_sha256, file_sha256
 from alidade.pipelines.recording.images import VideoFile
 from alidade.pipelines.recording.sources import Axes, along
-from alidade.pipelines.recording.table_times import check_steps, nanoseconds, of_rate
-from alidade.pipelines.recording.table_units import COMPATIBLE, TIME_UNITS, UNITS, unit_of
+from alidade.pipelines.recording.table_values import (
+    COMPATIBLE,
+    TIME_UNITS,
+    UNITS,
+    check_steps,
+    nanoseconds,
+    of_rate,
+    unit_of,
+)
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns, table_form
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]

@@ -23,7 +23,7 @@ from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
-from alidade.pipelines.recording.table_units import unit_in, unit_named
+from alidade.pipelines.recording.table_values import unit_in, unit_named
 
 Stamps = NDArray[np.int64]
 
@@ -53,7 +53,7 @@ class TableForm:
         delimiter: between cells; a blank stands for one or more.
         decimal: mark of a fraction, a point or a comma.
         names: of its columns; `column 1` and so on where it has no header.
-        units: of its columns as the header has them, in the words of `table_units.UNITS`; empty where it says nothing.
+        units: of its columns as the header has them, in the words of `table_values.UNITS`; empty where it says nothing.
         first: number of lines ahead of its first row.
         width: cells of a row.
         preamble: what stands ahead of the header.
@@ -337,7 +337,7 @@ def _is_trajectory(path: Path, data: Path, form: TableForm) -> bool:
 
 
 def _trajectory(path: Path, data: Path, form: TableForm) -> series.PoseSeries:
-    from alidade.pipelines.recording.table_times import nanoseconds
+    from alidade.pipelines.recording.table_values import nanoseconds
 
     rows, _ = _whole_rows(path, data, form, range(len(_TUM)))
     columns: dict[str, Any] = dict(zip(_TUM, np.array(rows, dtype=np.str_).T, strict=True))

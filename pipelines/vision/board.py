@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.parallel import UNREADABLE, detections
 from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose
-from alidade.pipelines.vision.tags import Detections
+from alidade.pipelines.vision.tags import UNREADABLE, Detections, detections
 
 # A picture's own attitude settles the flips of the pictures up to this much later.
 _FRESH_NS = 200_000_000

@@ -19,8 +19,7 @@ from alidade.factors import so3
 from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.parallel import UNREADABLE, decode
-from alidade.pipelines.vision.tags import Picture, detect
+from alidade.pipelines.vision.tags import UNREADABLE, Picture, decode, detect
 
 LOST = "target not found"
 POOR = "target's points do not move together"

@@ -13,7 +13,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.recording import Recording, open_recording
-from alidade.pipelines.recording.table_times import nanoseconds
+from alidade.pipelines.recording.table_values import nanoseconds
 
 N = 60
 T = [f"{1000 + 0.02 * i:.3f}" for i in range(N)]

@@ -16,8 +16,7 @@ from alidade.pipelines.methods.cube.layout import cube_layout
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.layout import Layout, Shots, estimate_layout
-from alidade.pipelines.vision.layout.additional import nothing, with_intrinsics
-from alidade.pipelines.vision.layout.bundle import moved, shared_rows
+from alidade.pipelines.vision.layout.bundle import moved, nothing, shared_rows, with_intrinsics
 from alidade.pipelines.vision.layout.placing import mirrored
 from alidade.pipelines.vision.layout.sights import Bundle, Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, estimate_pose

@@ -15,8 +15,8 @@ from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag
 from alidade.pipelines.vision import board as vision
 from alidade.pipelines.vision.board import Sight, board_attitudes, body_poses
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.parallel import UNREADABLE
 from alidade.pipelines.vision.pose import TagBody
+from alidade.pipelines.vision.tags import UNREADABLE
 
 CAMERA = Camera(
     640,

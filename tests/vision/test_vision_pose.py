@@ -10,8 +10,7 @@ import pytest
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose
-from alidade.pipelines.vision.refinement import refine_by_pycolmap, refine_here
+from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose, refine_by_pycolmap, refine_here
 from alidade.pipelines.vision.tags import Detections
 
 K = np.array([[1150.0, 0, 641.3], [0, 1155.0, 477.8], [0, 0, 1]])

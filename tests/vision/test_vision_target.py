@@ -10,7 +10,7 @@ from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.parallel import UNREADABLE
+from alidade.pipelines.vision.tags import UNREADABLE
 from alidade.pipelines.vision.target import LOST, los_errors
 
 FOCAL = 2000.0

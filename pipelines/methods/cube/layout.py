@@ -63,7 +63,7 @@ def _tags(recording: Recording, config: Config) -> list[tuple[int, Detections]]:
     topic = config.topic(IMAGE)
     if topic not in recording.topics:
         return _detections(recording, config)
-    from alidade.pipelines.vision.parallel import detections
+    from alidade.pipelines.vision.tags import detections
 
     pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
     seen = detections(pictures, config.section(CubeConfig).tag_family, read_camera(recording, config))

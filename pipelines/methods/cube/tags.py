@@ -82,7 +82,7 @@ def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: di
 
 def _pictures(recording: Recording, config: Config, data: CubeData, dropped: dict[str, int]) -> Sightings:
     """Tags found in the pictures of the static intervals; the others are not looked at."""
-    from alidade.pipelines.vision.parallel import UNREADABLE, detections
+    from alidade.pipelines.vision.tags import UNREADABLE, detections
 
     assert data.camera is not None
     epoch_ns, (start, stop) = data.epoch_ns, static_intervals(data, config).T

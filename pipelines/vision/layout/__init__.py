@@ -17,8 +17,7 @@ from alidade.factors.so3 import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.layout.additional import LINE_TIME, shutters, with_intrinsics
-from alidade.pipelines.vision.layout.bundle import moved, refined_pictures
+from alidade.pipelines.vision.layout.bundle import LINE_TIME, moved, refined_pictures, shutters, with_intrinsics
 from alidade.pipelines.vision.layout.covariance import Covariance, covariance
 from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_told, joint
 from alidade.pipelines.vision.layout.robust import Fit, fitted

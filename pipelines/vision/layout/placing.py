@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.so3 import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.vision.layout.additional import nothing
-from alidade.pipelines.vision.layout.bundle import adjusted, loss, refined_pictures
+from alidade.pipelines.vision.layout.bundle import adjusted, loss, nothing, refined_pictures
 from alidade.pipelines.vision.layout.robust import Fit, fitted
 from alidade.pipelines.vision.layout.sights import Bundle, Gathered, Index, Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, part, planar_solutions

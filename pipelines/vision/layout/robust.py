@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.so3 import Array
-from alidade.pipelines.vision.layout.additional import Additional
-from alidade.pipelines.vision.layout.bundle import adjusted
+from alidade.pipelines.vision.layout.bundle import Additional, adjusted
 from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights, linearized
 
 # Degrees of freedom of the t distribution.
