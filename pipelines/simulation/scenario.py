@@ -101,12 +101,19 @@ def _find(name_or_path: str | Path, folder: Path | None) -> Path:
 
 
 def sways(
-    motion: Mapping[str, Sequence[Any]] | None, sway: Mapping[str, float]
+    scenario: Mapping[str, Any], key: str, who: str, sway: Mapping[str, float]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """A motion with one more sway about each axis."""
+    """A scenario with one more sway about each axis of the motion under a key, and what that is in words.
+
+    Args:
+        scenario: as a mapping.
+        key: of a motion in it: yaw, pitch and roll, or None.
+        who: sways, for the words.
+        sway: amplitude_deg and frequency_hz.
+    """
     for i, axis in enumerate(("yaw", "pitch", "roll")):
         # Sways of one frequency on two axes would be one sway about an axis between them.
         more = {**sway, "frequency_hz": round(sway["frequency_hz"] + 0.04 * i, 3)}
-        now: dict[str, Sequence[Any]] = {"yaw": [], "pitch": [], "roll": [], **(motion or {})}
-        words = f"sway by {more['amplitude_deg']:g} deg at {more['frequency_hz']:g} Hz in {axis}"
-        yield words, {**now, axis: [*now[axis], more]}
+        now: dict[str, Sequence[Any]] = {"yaw": [], "pitch": [], "roll": [], **(scenario[key] or {})}
+        words = f"{who}: sway by {more['amplitude_deg']:g} deg at {more['frequency_hz']:g} Hz in {axis}"
+        yield words, {**scenario, key: {**now, axis: [*now[axis], more]}}

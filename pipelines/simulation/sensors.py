@@ -67,6 +67,14 @@ def sample_times(duration_s: float, rate_hz: float, phase: float = 0.0) -> Array
     return np.asarray(np.round(t[t < duration_s] * 1e9) / 1e9)
 
 
+def exposures(stamps: Array, offset: float, skew: float) -> Array:
+    """When pictures with these stamps (K,), s, were taken, s: an offset later, less a skew, s/s, since the first one.
+
+    The one formula of simulators; `estimation.camera_clock.Clock` is that of the graphs, which they do not know.
+    """
+    return np.asarray(stamps + offset - skew * (stamps - stamps[0]))
+
+
 class Warming(ScenarioPart):
     """What a sensor's temperature does: it goes from one to another, slower and slower."""
 

@@ -7,7 +7,7 @@ integrated over one window are conjugate, dB(d) = bRa dA aRb, exactly, with neit
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -16,16 +16,18 @@ from scipy.linalg import block_diag
 
 # isort: off
 from alidade.plugin import (
-    AXES, COLORS, EPOCH_NS, ROT3, Array, ChecklistItem, Config, Estimate, EulerMotion, FaultModel, Figure, Formula,
-    Guidance, GyroPath, Increments, InputError, Level, Method, Model, Motion, NoiseSpec, Numbers, ParameterSpec, Plot,
-    Problem, Recording, Report, Residuals, Scenario, ScenarioPart, Simulated, Simulator, StreamReader, Swing, Topic,
-    Validation, Vectors, apply, by_axis, check_overlap, imu_series, messages, nanoseconds, pair, parameter_problem,
-    recording_config, rms, sample_times, scalar, so3, stated, swaying, swayed, sways, turned,
+    AXES, COLORS, EPOCH_NS, ROT3, Array, Config, Estimate, EulerMotion, FaultModel, Figure, Formula, Guidance, GyroPath,
+    Increments, InputError, Level, Method, Model, Motion, NoiseSpec, Numbers, ParameterSpec, Plot, Problem, Recording,
+    Report, Residuals, ScenarioPart, Simulated, Simulator, StreamReader, Swing, Topic, Validation, Vectors, apply,
+    by_axis, check_overlap, imu_series, messages, nanoseconds, pair, parameter_problem, recording_config, rms,
+    sample_times, scalar, so3, stated, swaying, swayed, sways, turned,
 )  # fmt: skip
 
 MAX_OFFSET_S = 0.5  # the time offset is searched for within this
 WINDOW_S, WINDOW_SAMPLES = 0.1, 20  # windows that are compared are at least this long: short against turns
 MIN_WINDOWS = 10
+TURN = np.deg2rad(20.0)  # about each axis, that `follow` asks for
+SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}  # that `plan` proposes to add
 GYRO_A, GYRO_B = (Topic(f"gyro_{each}", f"/gyro_{each}/imu", messages.RATES) for each in "ab")
 B_DENSITY = NoiseSpec("gyro_b_density", "rad/s/√Hz", "Gyro b white noise.", 5e-5)
 PARAMETERS = (
@@ -177,17 +179,6 @@ def advice(weights: Mapping[str, float]) -> Motion:
     return Motion("record longer", why="the bias difference is not determined yet")
 
 
-def checklist(data: GyroPairData, _: Config) -> list[ChecklistItem]:
-    """Turns about the axes of a."""
-    return swayed("body", turned(data.a_t, data.a_gyro), np.deg2rad(20.0), "turn the body about its", "body")
-
-
-def variations(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """A planned motion with one more sway."""
-    for words, motion in sways(scenario["motion"], {"amplitude_deg": 20.0, "frequency_hz": 0.29}):
-        yield f"the body: {words}", {**scenario, "motion": motion}
-
-
 def compared(data: GyroPairData, values: Mapping[str, float]) -> tuple[Array, Array, Array]:
     """Starts of windows (n,), s, and mean rates (n, 3), rad/s in a: by gyro a, and by gyro b as the formulas say."""
     start, by_a, by_b = rates(data, values.get("time_offset", 0.0))
@@ -249,7 +240,7 @@ def simulate(scenario: GyroPairScenario, seed: int, _images: bool = False) -> Si
         samples.append((t, rate + biases[-1] + gyro.density * np.sqrt(gyro.rate_hz) * rng.standard_normal(rate.shape)))
     data = GyroPairData(EPOCH_NS, *samples[0], *samples[1], scenario.gyro_a.density, scenario.gyro_b.density)
     truth = by_axis(rotation=so3.log(aRb), bias_difference=biases[1] - so3.rotate(so3.inverse(aRb), biases[0]))
-    truth |= {"time_offset": scenario.time_offset_s}
+    truth["time_offset"] = scenario.time_offset_s
     return Simulated(data, truth, recording_config("gyro_pair", scenario, {}))
 
 
@@ -267,6 +258,9 @@ METHOD = Method(
     published=published,
     faults=FaultModel({f"{g}_t": (f"{g}_gyro",) for g in "ab"}, {f"{g}_gyro": (f"gyro {g}", AXES) for g in "ab"}),
     simulator=Simulator(scenario=GyroPairScenario, simulate=simulate),
-    guidance=Guidance(checklist=checklist, variations=variations),
+    guidance=Guidance(
+        checklist=lambda d, _: swayed("body", turned(d.a_t, d.a_gyro), TURN, "turn the body about its", "body"),
+        variations=lambda scenario: sways(scenario, "motion", "the body", SWAY),
+    ),
     report=Report(formulas=lambda *_: FORMULAS, figures=figures, validate=validate),
 )

@@ -37,9 +37,8 @@ _SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
     """Proposed changes of a scenario: a phrase and the changed scenario."""
-    for who, key in (("head", "head"), ("platform", "platform")):
-        for words, motion in sways(scenario[key], _SWAY):
-            yield f"the {who}: {words}", {**scenario, key: motion}
+    for key in ("head", "platform"):
+        yield from sways(scenario, key, f"the {key}", _SWAY)
 
 
 # Random walk of a platform's rate that acts as a bias, rad/s/sqrt(s): an aircraft's manoeuvres.

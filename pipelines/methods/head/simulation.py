@@ -32,6 +32,7 @@ from alidade.pipelines.simulation.sensors import (
     Warming,
     by_axis,
     drift,
+    exposures,
     measured,
     read_by,
     recording_config,
@@ -288,7 +289,7 @@ def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array
         seen &= (t < start) | (t >= end)
     t = t[seen]
     cRb, vRh = _mount(scenario.camera_mount_deg), _mount(scenario.helmet_mount_deg)
-    at = t + scenario.time_offset_s - effects["clock_skew"] * (t - t[0])
+    at = exposures(t, scenario.time_offset_s, effects["clock_skew"])
     filtered = so3.exp(effects["vision_filter"] * _acceleration(scenario, at))
     cRh = so3.compose(cRb, scenario.head.attitude(at), filtered, vRh)
     turned = so3.log(so3.multiply(so3.inverse(cRh[0]), cRh))

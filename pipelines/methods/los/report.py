@@ -16,6 +16,7 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.units import rounded
+from alidade.pipelines.estimation.camera_clock import Clock
 from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
@@ -286,11 +287,11 @@ def rates(data: LosData, values: Mapping[str, float]) -> Array:
 
 def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:
     """When pictures were taken (n,), s, no further than gyro and gimbal were recorded."""
-    skew = values.get("clock_skew", 0.0) * (stamps - data.image_t[0])
+    clock = Clock(float(data.image_t[0]), values.get("time_offset", 0.0), values.get("clock_skew", 0.0))
     delay = values.get("encoder_delay", 0.0)
     first = max(data.gyro_t[0], data.gimbal_t[0] + delay)
     last = min(data.gyro_t[-1], data.gimbal_t[-1] + delay)
-    return np.clip(stamps + values.get("time_offset", 0.0) - skew, first, last)
+    return np.clip(clock.taken(stamps - clock.begun), first, last)
 
 
 def angles(data: LosData, at: Array, values: Mapping[str, float]) -> Array:

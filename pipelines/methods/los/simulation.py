@@ -36,6 +36,7 @@ from alidade.pipelines.simulation.sensors import (
     Warming,
     by_axis,
     drift,
+    exposures,
     measured,
     read_by,
     recording_config,
@@ -398,7 +399,7 @@ def targets(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) 
         seen &= (stamps < start) | (stamps >= end)
     stamps = stamps[seen]
     effects = motion.effects
-    t = stamps + effects["time_offset"] - effects["clock_skew"] * (stamps - stamps[0])
+    t = exposures(stamps, effects["time_offset"], effects["clock_skew"])
     # What would be taken beyond the recording's ends is left out.
     stamps, t = stamps[motion.covers(t)], t[motion.covers(t)]
     nRb = scenario.carrier.attitude(t)
