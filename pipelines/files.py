@@ -68,6 +68,12 @@ def dump_yaml(content: object, width: int = 80, is_sorted: bool = True) -> str:
     return text.getvalue()
 
 
+def yaml_float(value: float) -> str:
+    """A float that YAML 1.1 takes for one too: 5e-05 is a string there, 5.0e-05 is not."""
+    text = repr(value)
+    return text if "." in text else text.replace("e", ".0e")
+
+
 def flow_yaml(value: object) -> str:
     """A scalar, a list or a mapping in one line of YAML."""
     if isinstance(value, dict):

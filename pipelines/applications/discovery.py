@@ -351,8 +351,8 @@ def _split_imu(recording: Recording, used: set[str]) -> TopicSource | None:
     """A gyro and an accelerometer on two topics, as some drivers publish them; None where there are not both."""
     free = [n for n, t in recording.topics.items() if t.type == messages.IMU and t.count and n not in used]
     there = {name: imu for name in free if (imu := _rates(recording, name)) is not None} if len(free) > 1 else {}
-    gyros = [n for n, imu in there.items() if _has_gyro(imu) and not _has_accel(imu)]
-    accels = [n for n, imu in there.items() if _has_accel(imu) and not _has_gyro(imu)]
+    gyros = [n for n, imu in there.items() if _has(imu, "gyro") and not _has(imu, "accel")]
+    accels = [n for n, imu in there.items() if _has(imu, "accel") and not _has(imu, "gyro")]
     if not gyros or not accels:
         return None
     pairs = [(difflib.SequenceMatcher(None, g, a).ratio(), g, a) for g in gyros for a in accels]
@@ -360,17 +360,13 @@ def _split_imu(recording: Recording, used: set[str]) -> TopicSource | None:
     return TopicSource(gyro=gyro, accel=accel)
 
 
-def _has_gyro(imu: ImuSeries) -> bool:
-    return is_there("gyro", imu.gyro, imu.gyro_cov)
+def _has(imu: ImuSeries, kind: str) -> bool:
+    return is_there(kind, getattr(imu, kind), getattr(imu, f"{kind}_cov"))
 
 
 def _has_attitude(recording: Recording, topic: str) -> bool:
     imu = _rates(recording, topic)
     return imu is not None and bool((imu.wxyz_cov[:, 0, 0] >= 0.0).any() and imu.wxyz.any())
-
-
-def _has_accel(imu: ImuSeries) -> bool:
-    return is_there("accel", imu.accel, imu.accel_cov)
 
 
 def _of_type(recording: Recording, topic: Topic, used: set[str]) -> list[str]:

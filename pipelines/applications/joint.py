@@ -502,9 +502,5 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
 
 def _freedoms(by_itself: Calibration) -> float | None:
     """Degrees of freedom of a recording about its own noise; None: it was stated, or there is no chi-square."""
-    estimate = by_itself.estimate
-    return (
-        estimate.chi_square.dof
-        if estimate.chi_square and any(level.noise.estimated for level in estimate.levels)
-        else None
-    )
+    chi_square, levels = by_itself.estimate.chi_square, by_itself.estimate.levels
+    return chi_square.dof if chi_square and any(level.noise.estimated for level in levels) else None

@@ -33,7 +33,6 @@ from alidade.pipelines.diagnostics.change_test import (
 )
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
-from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
 from alidade.pipelines.diagnostics.observability import finite_covariance
@@ -224,7 +223,7 @@ class Session:
     def facts(self) -> SessionFacts:
         """Topics, rates, gaps and losses of the recording, whose stamps are not kept then; the length of arrays."""
         if self.recording is None:
-            start, stop = self.faults.span(self.data)
+            start, stop = self.method.faults.span(self.data)
             return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
         facts = session_facts(self.recording, self.config)
         self.recording.forget_times()
@@ -277,7 +276,7 @@ class Session:
 
     def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
         """The time for a calibration, where no command has set one."""
-        stamps = [time for time in self.faults.times(self.data) if len(time)]
+        stamps = [time for time in self.method.faults.times(self.data) if len(time)]
         start = min((float(time[0]) for time in stamps), default=0.0)
         return deadline.usual(max((float(time[-1]) for time in stamps), default=0.0) - start, online)
 
@@ -354,17 +353,12 @@ class Session:
         dense = problem.at_gyro_rate(estimate.attitudes, problem.numbers(estimate))
         return replace(estimate, attitudes=dense), [_carried(estimate.attitudes, dense)]
 
-    @property
-    def faults(self) -> FaultModel:
-        """What can be wrong with the data."""
-        return self.method.faults
-
     def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float], str]:
         """Parameters of either half of the recording, held-out residuals by family, and what the time limit stopped."""
         with self.usual_time():
             halves, predicted = {}, {}
             if not deadline.passed(_HALVES):
-                halves = split_halves(self.method.graph, self.faults, self.data, self.config)
+                halves = split_halves(self.method.graph, self.method.faults, self.data, self.config)
                 deadline.passed(_HALVES)
             if not deadline.passed(_HELD_OUT):
                 predicted = held_out_residuals(self.problem())
@@ -378,14 +372,14 @@ class Session:
         findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted)
         if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
             return findings
-        hypotheses = misstatements(self.method.graph, self.faults, self.data, self.config)
+        hypotheses = misstatements(self.method.graph, self.method.faults, self.data, self.config)
         if not hypotheses and not is_suspect(estimate, findings):
             return findings
         severe = any(each.severity > Severity.NOTE for each in contradicted)
         freed = self._freed[0] if severe and self._freed is not None else None
         with progress.doing("testing hypotheses"):
             hypotheses = hypotheses or find_hypotheses(
-                self.method.graph, self.faults, self.data, self.config, estimate, freed
+                self.method.graph, self.method.faults, self.data, self.config, estimate, freed
             )
         deadline.passed(_HYPOTHESES)
         # A fault that explains more than freeing what is fixed is what these contradictions come from.
@@ -425,10 +419,10 @@ class Session:
         if stable is None or not stable.changed:
             return stable, None
         parts: Mapping[str, SplitHalf] = {}
-        if self.faults.cut and not deadline.passed(_SEGMENTS):
+        if self.method.faults.cut and not deadline.passed(_SEGMENTS):
             with progress.doing("solving both sides of a change"):
                 parts = solve_segments(
-                    self.method.graph, self.faults, self.data, self.config, stable.time_s, estimate.levels
+                    self.method.graph, self.method.faults, self.data, self.config, stable.time_s, estimate.levels
                 )
         return stable, change_finding(stable, parts, quantities, ratio)
 

@@ -105,6 +105,12 @@ class Changes:
     rates: Mapping[str, Rate] = field(default_factory=dict)
 
     @property
+    def judged(self) -> tuple[Change, ...]:
+        """Every number's step after every recording, those found as they are with all of them."""
+        found = {(step.name, step.after): step for step in self.found}
+        return tuple(found.get((step.name, step.after), step) for step in self.steps)
+
+    @property
     def any(self) -> bool:
         """Whether anything changed."""
         return bool(self.found) or any(each.significant for each in self.together)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from alidade.pipelines.estimation.problem import Quantity
 
 _G = 9.80665  # standard gravity, m/s^2
@@ -85,6 +87,16 @@ def rounded(value: float, digits: int = 2) -> str:
         return f"{value:.{digits}g}"
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
     return f"{round(value, decimals):.{max(decimals, 0)}f}"
+
+
+def significant(value: float, digits: int) -> str:
+    """A number to so many digits, never with an exponent or trailing zeros."""
+    return np.format_float_positional(value, precision=digits, fractional=False, trim="-")
+
+
+def minute(date: str) -> str:
+    """A date of ISO 8601 to the minute."""
+    return date[:16].replace("T", " ")
 
 
 def format_estimate(quantity: Quantity, value: float, sigma: float) -> str:

@@ -164,8 +164,43 @@ class Container(ABC):
         return missing
 
     def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
-        """Sentences about what is lost, and when in a session that starts at start_ns, Unix ns."""
-        return describe_losses(self.losses, self.missing, self.size, start_ns, duration_s)
+        """Sentences about what is lost, one a kind, and when in a session that starts at start_ns, Unix ns.
+
+        Args:
+            start_ns: None leaves out when the losses are.
+            duration_s: length of the session.
+        """
+        missing = self.missing
+        messages = f"; messages lost: {', '.join(f'{n} of {topic}' for topic, n in missing.items())}" if missing else ""
+        notes = []
+        damaged = [loss for loss in self.losses if loss.kind == "damage"]
+        if damaged:
+            size, chunks = sum(loss.size for loss in damaged), sum(loss.chunks for loss in damaged)
+            what = f"{chunks} {'chunk' if chunks == 1 else 'chunks'}, " if chunks else ""
+            where = f": {what}{size} of {self.size} bytes from byte {damaged[0].at} on cannot be used" if size else ""
+            reason = damaged[0].reason if size else ", ".join(dict.fromkeys(loss.reason for loss in damaged))
+            notes.append(f"the recording is damaged{where} ({reason}){_when(damaged, start_ns, duration_s)}{messages}")
+            messages = ""
+        for loss in self.losses:
+            if loss.kind == "cut":
+                lost = f", the last {loss.size} of {self.size} bytes cannot be used" if loss.size else ""
+                when = _when([loss], start_ns, duration_s)
+                notes.append(f"the recording is truncated: it ends without its closing records{lost}{when}{messages}")
+                messages = ""
+            elif loss.kind == "summary":
+                notes.append(
+                    f"the recording's summary at byte {loss.at} cannot be used ({loss.reason}); no message is in it"
+                )
+            elif loss.kind == "attachment":
+                notes.append(f"the attachment {loss.reason} is damaged and not used")
+        undefined = sum(loss.size for loss in self.losses if loss.kind == "definition")
+        if undefined:
+            notes.append(
+                f"the recording is damaged: {undefined} messages cannot be read, it does not define their channel"
+            )
+        if messages:
+            notes.append(f"the recording has fewer messages than it says{messages}")
+        return tuple(notes)
 
     @property
     def attachments(self) -> tuple[str, ...]:
@@ -294,48 +329,6 @@ def file_sha256(path: Path) -> str:
 def combined_sha256(digests: Iterable[str]) -> str:
     """SHA-256 of several digests (their 32 bytes each), in order, hexadecimal."""
     return hashlib.sha256(b"".join(map(bytes.fromhex, digests))).hexdigest()
-
-
-def describe_losses(
-    losses: Sequence[DataLoss], missing: Mapping[str, int], total: int, start_ns: int | None, duration_s: float
-) -> tuple[str, ...]:
-    """Sentences about losses, one a kind.
-
-    Args:
-        losses: of a file.
-        missing: topic -> messages known to be lost.
-        total: bytes of the file.
-        start_ns: start of the session, Unix ns; None leaves out when the losses are.
-        duration_s: length of the session.
-    """
-    messages = f"; messages lost: {', '.join(f'{n} of {topic}' for topic, n in missing.items())}" if missing else ""
-    notes = []
-    damaged = [loss for loss in losses if loss.kind == "damage"]
-    if damaged:
-        size, chunks = sum(loss.size for loss in damaged), sum(loss.chunks for loss in damaged)
-        what = f"{chunks} {'chunk' if chunks == 1 else 'chunks'}, " if chunks else ""
-        where = f": {what}{size} of {total} bytes from byte {damaged[0].at} on cannot be used" if size else ""
-        reason = damaged[0].reason if size else ", ".join(dict.fromkeys(loss.reason for loss in damaged))
-        notes.append(f"the recording is damaged{where} ({reason}){_when(damaged, start_ns, duration_s)}{messages}")
-        messages = ""
-    for loss in losses:
-        if loss.kind == "cut":
-            lost = f", the last {loss.size} of {total} bytes cannot be used" if loss.size else ""
-            when = _when([loss], start_ns, duration_s)
-            notes.append(f"the recording is truncated: it ends without its closing records{lost}{when}{messages}")
-            messages = ""
-        elif loss.kind == "summary":
-            notes.append(
-                f"the recording's summary at byte {loss.at} cannot be used ({loss.reason}); no message is in it"
-            )
-        elif loss.kind == "attachment":
-            notes.append(f"the attachment {loss.reason} is damaged and not used")
-    undefined = sum(loss.size for loss in losses if loss.kind == "definition")
-    if undefined:
-        notes.append(f"the recording is damaged: {undefined} messages cannot be read, it does not define their channel")
-    if messages:
-        notes.append(f"the recording has fewer messages than it says{messages}")
-    return tuple(notes)
 
 
 def _when(losses: Sequence[DataLoss], start_ns: int | None, duration_s: float) -> str:

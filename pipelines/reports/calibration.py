@@ -21,7 +21,7 @@ from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, load_yaml, read_bytes, yaml_float
 from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.reports.result import Calibration
@@ -199,7 +199,9 @@ def calibration_yaml(calibration: Calibration) -> str:
         flat.fa.set_flow_style()
         return flat
 
-    Representer.add_representer(float, _float)
+    Representer.add_representer(
+        float, lambda made, value: made.represent_scalar("tag:yaml.org,2002:float", yaml_float(value))
+    )
     content = saved(calibration).model_dump(by_alias=True, mode="json")
     for entry in content["parameters"].values():
         if entry["applied"] is None:
@@ -372,12 +374,6 @@ def _frames(meaning: str) -> tuple[str, str]:
     match = _FRAMES.match(meaning)
     assert match is not None
     return match[1], match[2]
-
-
-def _float(representer: Any, value: float) -> Any:
-    """A float that YAML 1.1 takes for one too: 5e-05 is a string there, 5.0e-05 is not."""
-    text = repr(value)
-    return representer.represent_scalar("tag:yaml.org,2002:float", text if "." in text else text.replace("e", ".0e"))
 
 
 def _plain(row: Mapping[str, object]) -> dict[str, object]:

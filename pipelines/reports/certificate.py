@@ -15,13 +15,13 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import NormalDist
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from alidade.factors.chi_square import student
 from alidade.pipelines.display.table import Cell, Column, Table
-from alidade.pipelines.display.units import human_unit, to_digits_of
+from alidade.pipelines.display.units import human_unit, minute, to_digits_of
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
@@ -104,20 +104,11 @@ class Row:
     budget: Mapping[str, float]
 
 
-class _Recording(NamedTuple):
-    recording: str
-    sha256: str
-    start: str
-    duration_s: float
-    dof: float | None
-
-
-def _recordings(result: Result) -> list[_Recording]:
+def _recordings(result: Result) -> list[dict[str, Any]]:
     """The recordings that the result is from; the name of a single one is not in it."""
-    one = result.session
-    if not result.recordings:
-        return [_Recording("", one.sha256, one.start, one.duration_s, None)]
-    return [_Recording(r.recording, r.sha256, r.start, r.duration_s, r.dof) for r in result.recordings]
+    keys = ("recording", "sha256", "start", "duration_s", "dof")
+    each: Sequence[object] = result.recordings or [result.session]
+    return [{key: getattr(one, key, "" if key == "recording" else None) for key in keys} for one in each]
 
 
 def certificate(
@@ -235,7 +226,7 @@ def _content(result: Result, stated: Fields, rows: Sequence[Row], missing: Seque
         "method": result.method,
         "solver": result.solver,
         "status": result.status,
-        "recordings": [each._asdict() for each in _recordings(result)],
+        "recordings": _recordings(result),
         "software": result.software,
         "results": [asdict(row) for row in rows],
     }
@@ -284,23 +275,19 @@ def _identity(result: Result, text: Mapping[str, str]) -> tuple[tuple[str, str],
         ("manufacturer, type", f"{text['manufacturer']}, {text['type']}"),
         ("serial number", text["serial"]),
         ("received", text["received"]),
-        ("calibrated", f"{_minute(result.session.start)} UTC"),
+        ("calibrated", f"{minute(result.session.start)} UTC"),
         *((name, text[name]) for name in ("issued", "place", "environment", "procedure")),
         ("evaluation", f"method {result.method}, {result.solver} solver, alidade {result.software.get('alidade')}"),
         *(
             (
                 "" if i else first,
-                f"{part.recording}{', ' if part.recording else ''}{_minute(part.start)} UTC, {part.duration_s:.1f} s, "
-                f"SHA-256 {part.sha256}",
+                f"{part['recording']}{', ' if part['recording'] else ''}{minute(part['start'])} UTC, "
+                f"{part['duration_s']:.1f} s, SHA-256 {part['sha256']}",
             )
             for i, part in enumerate(recordings)
         ),
         ("traceability", text["traceability"]),
     )
-
-
-def _minute(date: str) -> str:
-    return date[:16].replace("T", " ")
 
 
 def _result_table(rows: Sequence[Row], readable: Sequence[_Readable], result: Result, stated: Fields) -> Table:

@@ -10,6 +10,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import yaml_float
 from alidade.pipelines.methods.triads import TRIADS
 from alidade.pipelines.reports import triad_export
 from alidade.pipelines.reports.calibration import SavedCalibration, SavedTransform, as_saved
@@ -105,6 +106,4 @@ def ros_parameters(saved: SavedCalibration, names: Collection[str]) -> str:
 def _text(value: object) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_text, value))}]"
-    text = repr(value) if isinstance(value, float) else str(value)
-    # 1e-05 is a string to some readers of YAML, 1.0e-05 to none.
-    return text.replace("e", ".0e") if isinstance(value, float) and "e" in text and "." not in text else text
+    return yaml_float(value) if isinstance(value, float) else str(value)

@@ -11,7 +11,7 @@ import numpy as np
 from alidade.pipelines.diagnostics.device_changes import Change
 from alidade.pipelines.display.figure import COLORS, Figure, Plot, milliseconds
 from alidade.pipelines.display.table import Table
-from alidade.pipelines.display.units import format_estimate, human_unit, rounded
+from alidade.pipelines.display.units import format_estimate, human_unit, minute, rounded
 from alidade.pipelines.estimation.parameters import kind
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports.result import Calibration
@@ -59,7 +59,7 @@ def _when(likely: float, soonest: float) -> str:
 def recording_blocks(calibration: Calibration) -> list[Plot | Table]:
     """Tables and figures for the report."""
     parts, known = calibration.recordings, {q.name: q for q in calibration.problem.quantities}
-    rows = tuple((p.recording, p.start[:16].replace("T", " "), f"{p.duration_s:.0f} s", p.status) for p in parts)
+    rows = tuple((p.recording, minute(p.start), f"{p.duration_s:.0f} s", p.status) for p in parts)
     own = []
     for name in dict.fromkeys(n.name for p in parts for n in p.parameters if n.name in known):
         numbers = [next((n for n in p.parameters if n.name == name), None) for p in parts]

@@ -16,6 +16,7 @@ from alidade.pipelines.diagnostics.allan import allan_variance
 from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
 from alidade.pipelines.display.figure import AXES, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
+from alidade.pipelines.display.units import significant
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plain_json import plain_json
 from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
@@ -211,12 +212,8 @@ def _of(sensor: SensorNoise, axis: str, name: str) -> Coefficient:
 
 def _cell(c: Coefficient, factor: float) -> str:
     if c.value is None or c.sigma is None:
-        return f"< {_digits(factor * c.high, 2)}"
-    return f"{_digits(factor * c.value, 3)} ±{_digits(100.0 * c.sigma / c.value, 2)}%"
-
-
-def _digits(x: float, count: int) -> str:
-    return np.format_float_positional(x, precision=count, fractional=False, trim="-")
+        return f"< {significant(factor * c.high, 2)}"
+    return f"{significant(factor * c.value, 3)} ±{significant(100.0 * c.sigma / c.value, 2)}%"
 
 
 def _scientific(c: Coefficient) -> str:

@@ -447,16 +447,15 @@ def _steps(c: Calibration) -> list[ChangeResult]:
     """Every step as it is with nothing else changed; those found as they are with all found."""
     if c.changes is None:
         return []
-    found = {(step.name, step.after): step for step in c.changes.found}
     names = [part.recording for part in c.recordings]
     return [
         ChangeResult(
             parameter=step.name,
             before=names[step.after],
             after=names[step.after + 1],
-            step=found.get((step.name, step.after), step).size,
-            sigma=found.get((step.name, step.after), step).sigma,
-            found=(step.name, step.after) in found,
+            step=step.size,
+            sigma=step.sigma,
+            found=step in c.changes.found,
         )
-        for step in c.changes.steps
+        for step in c.changes.judged
     ]

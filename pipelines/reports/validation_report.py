@@ -12,7 +12,7 @@ import numpy as np
 from alidade.pipelines.diagnostics.cross_validation import Validation, peak, rms
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Interval, Table
-from alidade.pipelines.display.units import human_unit, to_digits_of
+from alidade.pipelines.display.units import human_unit, minute, significant, to_digits_of
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
@@ -50,7 +50,7 @@ def validation_report(validated: Validated) -> Report:
         title=f"{title} validation ({validated.recording})",
         heading=f"{title}: an earlier calibration on a new recording",
         about=(
-            f"{validated.recording}, with the calibration from {source.file} of {source.start[:16].replace('T', ' ')} "
+            f"{validated.recording}, with the calibration from {source.file} of {minute(source.start)} "
             f"UTC ({calibration.solver} solver, {calibration.status}; SHA-256 of its recording {source.sha256[:16]}…)"
         ),
         summary=Summary("Is the calibration still valid?", answer, tone, validated.sentence, notes, steps),
@@ -98,7 +98,7 @@ def _error_table(validated: Validated) -> Table:
         unit, factor = _unit(v)
         more = (each.get(v.name) for each in (others if validated.device else others[:0]))
         sizes = (rms(v.before), rms(v.after), peak(v.before), peak(v.after), *more)
-        rows.append((v.name, *("" if size is None else _three_digits(factor * size) for size in sizes), unit))
+        rows.append((v.name, *("" if size is None else significant(factor * size, 3) for size in sizes), unit))
     heads = ["RMS before", "RMS after", "peak before", "peak after"]
     caption = "RMS is the root mean square. Before: nothing compensated. After: with the calibration."
     if validated.device:
@@ -109,10 +109,6 @@ def _error_table(validated: Validated) -> Table:
         )
     columns = (Column(head, group=head[:4]) for head in heads)
     return Table("", caption, ("error", *columns, Column("unit", "text")), tuple(rows), "errors", most_rows=None)
-
-
-def _three_digits(number: float) -> str:
-    return np.format_float_positional(number, precision=3, fractional=False, trim="-")
 
 
 def _plot(validation: Validation) -> Plot:

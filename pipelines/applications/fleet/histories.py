@@ -51,12 +51,6 @@ class History:
         """After which recordings all numbers together changed, where none did by itself."""
         return () if self.changes.found else tuple(each.after for each in self.changes.together if each.significant)
 
-    @property
-    def steps(self) -> tuple[Change, ...]:
-        """Of every number after every recording, those found as they are with all of them."""
-        found = {(step.name, step.after): step for step in self.changes.found}
-        return tuple(found.get((step.name, step.after), step) for step in self.changes.steps)
-
 
 def packed(sqrt_info: SqrtInformation) -> str:
     """What a recording says of its numbers, as text."""
@@ -120,7 +114,7 @@ def change_table(found: Sequence[History]) -> list[Row]:
             "changed": int(step in history.found),
         }
         for history in found
-        for step in history.steps
+        for step in history.changes.judged
     ]
 
 
@@ -149,7 +143,7 @@ def _red(each: Sequence[History]) -> list[History]:
     """The same, without steps that are no larger than most units make: these differ between recordings by nature."""
     made: dict[tuple[str, str], list[Change]] = {}
     for history in each:
-        for step in history.steps:
+        for step in history.changes.judged:
             made.setdefault((history.method, step.name), []).append(step)
     usual = {}
     for key, steps in made.items():
