@@ -32,9 +32,8 @@ from pydantic import Tag as Case
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.noises import NOISES
-from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.recording.table_topics import TableTopic
-from alidade.pipelines.recording.topics import Topic
+from alidade.pipelines.recording.topics import Topic, TopicSource
 
 # Names of the attachments that hold a recording's config and, if simulated, its truth.
 ATTACHMENT = "alidade.yaml"

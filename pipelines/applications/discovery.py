@@ -20,8 +20,7 @@ from alidade.pipelines.recording.pairing import INTERVAL, MAX_MOUNT, Pairing, pa
 from alidade.pipelines.recording.plausibility import is_there
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
-from alidade.pipelines.recording.sources import TopicSource
-from alidade.pipelines.recording.topics import Setting, Topic, wanted
+from alidade.pipelines.recording.topics import Setting, Topic, TopicSource, wanted
 from alidade.pipelines.settings import Config
 
 # Rates and attitudes belong together above this correlation of their norms.

@@ -21,10 +21,10 @@ from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.recording.table_topics import TableTopic, tables_of
 from alidade.pipelines.recording.table_values import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
+from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
 
 # What the names of three columns along x, y and z begin with or are, lower case; `gx` is a gyro's as often as not.

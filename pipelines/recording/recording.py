@@ -48,9 +48,9 @@ from alidade.pipelines.recording.decoding import (
 from alidade.pipelines.recording.messages import MessageError
 from alidade.pipelines.recording.opening import Where, open_container
 from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
-from alidade.pipelines.recording.sources import TopicSource, along, inverted, joined
 from alidade.pipelines.recording.stamps import check_clock, jitter_ns, stamp_notes
 from alidade.pipelines.recording.table_topics import TableTopic, described
+from alidade.pipelines.recording.topics import TopicSource, along, inverted, joined
 
 # Topics whose first stamp may start a session. Positions, intrinsics and static frames may be stamped long before it.
 SENSOR_STAMPED_TYPES = {*messages.SENSORS} - {

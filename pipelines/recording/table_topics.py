@@ -24,7 +24,6 @@ from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, MultiPartContainer, combined_sha256, file_sha256
 from alidade.pipelines.recording.images import VideoFile
-from alidade.pipelines.recording.sources import Axes, along
 from alidade.pipelines.recording.table_values import (
     COMPATIBLE,
     TIME_UNITS,
@@ -35,6 +34,7 @@ from alidade.pipelines.recording.table_values import (
     unit_of,
 )
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns, table_form
+from alidade.pipelines.recording.topics import Axes, along
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]

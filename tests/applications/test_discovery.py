@@ -20,7 +20,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.pairing import pair
 from alidade.pipelines.recording.recording import Recording, open_recording
-from alidade.pipelines.recording.sources import inverted
+from alidade.pipelines.recording.topics import inverted
 from tests.support import forms
 from tests.support.command import Command
 

@@ -33,7 +33,7 @@ from alidade.pipelines.methods.head.guidance import FAULTS
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support.builders import IDEAL

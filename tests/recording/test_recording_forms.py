@@ -27,9 +27,8 @@ from alidade.pipelines.recording import images, messages, series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.plausibility import density
 from alidade.pipelines.recording.recording import Recording, open_recording
-from alidade.pipelines.recording.sources import TopicSource, inverted
 from alidade.pipelines.recording.streams import StreamReader
-from alidade.pipelines.recording.topics import IMU
+from alidade.pipelines.recording.topics import IMU, TopicSource, inverted
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from tests.support import forms, live

@@ -18,7 +18,7 @@ from alidade.pipelines.estimation.problem import Attitudes, Parameter, Quantity,
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import head_plots
-from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.plots import common_plots
 from alidade.pipelines.reports.result import Calibration, quantities_of

@@ -15,7 +15,7 @@ from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.los.recording import LosData, read_los
 from alidade.pipelines.methods.los.simulation import LosCamera, LosScenario, los_config, simulate_los, simulate_pictures
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.scenario import load_scenario
 
