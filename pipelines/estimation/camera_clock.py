@@ -48,6 +48,10 @@ class Clock:
         """When (n,), s, pictures were taken whose stamps are so long after the first, s."""
         return np.asarray(self.begun + elapsed + self.late(elapsed))
 
+    def exposed(self, stamps: Array) -> Array:
+        """When (n,), s, pictures with these stamps (n,), s, were taken."""
+        return np.asarray(stamps + self.offset - self.skew * (stamps - self.begun))
+
     def elapsed(self, taken: Array) -> Array:
         """Stamps (n,) of pictures taken at these times, s, since the first."""
         return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))

@@ -368,8 +368,7 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
     rows, of = _pictures(model, [k - model.chain.first for k in keyframes])
     if len(rows) == 0:
         return Attitudes(np.empty(0), np.empty((0, 4)))
-    clock = Clock(0.0, *values.atVector(model.parameters.picture.key)[:2])
-    at = model.stamps[rows] + clock.late(model.elapsed[rows])
+    at = Clock(model.origins[0], *values.atVector(model.parameters.picture.key)[:2]).exposed(model.stamps[rows])
     return Attitudes(at, model.chain.attitudes(of, model.taken[rows], at, values))
 
 

@@ -291,7 +291,7 @@ def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:
     delay = values.get("encoder_delay", 0.0)
     first = max(data.gyro_t[0], data.gimbal_t[0] + delay)
     last = min(data.gyro_t[-1], data.gimbal_t[-1] + delay)
-    return np.clip(clock.taken(stamps - clock.begun), first, last)
+    return np.clip(clock.exposed(stamps), first, last)
 
 
 def angles(data: LosData, at: Array, values: Mapping[str, float]) -> Array:
