@@ -104,9 +104,7 @@ class WorkerPool(Generic[Thing]):
     """Objects divided among processes that keep them, or all kept by this one.
 
     Processes are forked: each begins with the state of this one and receives questions only. They end with the pool;
-        each
-    may use its share of the allowed processes. Where the system cannot fork safely (all but Linux), there is one
-    process.
+    each may use its share of the allowed processes. Where the system cannot fork safely (all but Linux), there is one.
 
     Args:
         things: objects, each asked in the process that keeps it; it may keep state there.

@@ -70,7 +70,6 @@ Sigma = Annotated[float, Field(gt=0.0), AfterValidator(_not_tiny)]
 SigmaOrZero = Annotated[float, Field(ge=0.0), AfterValidator(_not_tiny)]
 # Beyond it native code that looks for the pose of a tag ends the process.
 TagSize = Annotated[float, Field(gt=0.0, le=100.0), AfterValidator(_not_tiny)]
-# Of a logarithm: beyond it e to the power of it overflows.
 # No sensor has more, in any of the units below; beyond it arithmetic overflows.
 NoiseSigma = Annotated[float, Field(gt=0.0, le=1e3), AfterValidator(_not_tiny)]
 NoiseOrZero = Annotated[float, Field(ge=0.0, le=1e3), AfterValidator(_not_tiny)]

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from alidade.factors.so3 import Array
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema
+from alidade.pipelines.recording.container import (
+    Channel,
+    Container,
+    DataLoss,
+    MessageBlock,
+    Schema,
+    combined_sha256,
+    file_sha256,
+)
 from alidade.pipelines.recording.messages import Definition, definition_text, known
 
 # Messages of a block; those of varying size may be pictures.
@@ -135,6 +143,7 @@ class ArrayContainer(Container):
         topics: pictures are read from their iterable anew each time.
         assumptions: sentences about what was assumed.
         data: file they were read from; None: `path`.
+        files: whose digests make that of the recording; none: `path` alone.
     """
 
     def __init__(
@@ -143,9 +152,10 @@ class ArrayContainer(Container):
         topics: Mapping[str, series.Topic],
         assumptions: Sequence[str] = (),
         data: Path | None = None,
+        files: Sequence[Path] = (),
     ) -> None:
         super().__init__(path)
-        self.data, self.assumptions = data or path, tuple(assumptions)
+        self.data, self.assumptions, self._files = data or path, tuple(assumptions), files
         self.losses: list[DataLoss] = []
         self.channels, self.schemas, self.counts = {}, {}, {}
         self._topics = dict(enumerate(topics.values(), start=1))
@@ -154,6 +164,10 @@ class ArrayContainer(Container):
             self.schemas[number] = ros2_schema(kind)._replace(id=number)
             self.channels[number] = Channel(number, name, "cdr", number)
             self.counts[number] = 1 if isinstance(topic, series.CameraInfo) else len(topic)
+
+    def sha256(self) -> str:
+        """SHA-256 of the file, hexadecimal; of several that of their own digests, in order."""
+        return combined_sha256(map(file_sha256, self._files)) if self._files else super().sha256()
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
         """Messages of these channels, one channel after the other."""

@@ -6,7 +6,7 @@ is the name of its folder, `/imu0`; of a camera `/cam0/image` and `/cam0/camera_
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.camera_files import camera
-from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.recording.table_values import nanoseconds
 from alidade.pipelines.recording.tables import numbers, read_columns, table_form
 
@@ -32,27 +31,14 @@ def read_euroc(path: Path, root: Path) -> ArrayContainer:
     """Container of all sensors of a data set."""
     topics: dict[str, series.Topic] = {}
     assumptions = []
-    for table in sorted(root.glob("*/data.csv")):
+    tables = sorted(root.glob("*/data.csv"))
+    for table in tables:
         sensor = _sensor(table.with_name("sensor.yaml"))
         found = _topics(table, f"/{table.parent.name}", sensor)
         topics |= found
         if not found:
             assumptions.append(f"{table.parent.name} is not used: columns {', '.join(table_form(table, table).names)}")
-    return _DataSet(path, topics, assumptions, sorted(root.glob("*/data.csv")))
-
-
-class _DataSet(ArrayContainer):
-    """A folder of tables."""
-
-    def __init__(
-        self, path: Path, topics: Mapping[str, series.Topic], assumptions: Sequence[str], tables: Sequence[Path]
-    ) -> None:
-        super().__init__(path, topics, assumptions, tables[0])
-        self._tables = tables
-
-    def sha256(self) -> str:
-        """SHA-256 of the tables' own digests, in the order of their names."""
-        return combined_sha256(map(file_sha256, self._tables))
+    return ArrayContainer(path, topics, assumptions, tables[0], tables)
 
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:

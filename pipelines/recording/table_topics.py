@@ -22,7 +22,7 @@ from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
-from alidade.pipelines.recording.container import Container, MultiPartContainer, combined_sha256, file_sha256
+from alidade.pipelines.recording.container import Container, MultiPartContainer
 from alidade.pipelines.recording.images import VideoFile
 from alidade.pipelines.recording.table_values import (
     COMPATIBLE,
@@ -293,7 +293,12 @@ def tables_of(container: Container) -> dict[str, CsvFile]:
 
 def _with_topics(container: Container, of: Mapping[str, Mapping[str, series.Topic]]) -> Container:
     if isinstance(container, CsvFile) and of.get(container.path.name):
-        return _Described(container, of[container.path.name])
+        topics = of[container.path.name]
+        videos = [video.path for video in _videos(topics)]
+        files = [container.path, *videos] if videos else ()
+        made = ArrayContainer(container.path, topics, data=container.data, files=files)
+        made.temporary, made.incomplete = container.temporary, container.incomplete
+        return made
     if isinstance(container, MultiPartContainer):
         used = {video.path.resolve() for topics in of.values() for video in _videos(topics)}
         there = [part for part in container.parts if part.path.resolve() not in used]
@@ -301,20 +306,6 @@ def _with_topics(container: Container, of: Mapping[str, Mapping[str, series.Topi
         whole.temporary, whole.incomplete = container.temporary, container.incomplete
         return whole
     return container
-
-
-class _Described(ArrayContainer):
-    """A table whose columns are known, with the videos that it has the stamps of."""
-
-    def __init__(self, table: CsvFile, topics: Mapping[str, series.Topic]) -> None:
-        super().__init__(table.path, topics, data=table.data)
-        self.temporary, self.incomplete = table.temporary, table.incomplete
-        self._video_paths = [video.path for video in _videos(topics)]
-
-    def sha256(self) -> str:
-        """SHA-256 of the table; with videos, of its digest and theirs, in order."""
-        digest = super().sha256()
-        return combined_sha256([digest, *map(file_sha256, self._video_paths)]) if self._video_paths else digest
 
 
 def _videos(topics: Mapping[str, series.Topic]) -> list[VideoFile]:
