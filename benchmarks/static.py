@@ -13,9 +13,9 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.los import LosRateFactor, rate_matrix
 from alidade.factors.model import Array, Model, Residuals
 from alidade.factors.triad import AccelFactor
+from alidade.pipelines.estimation.linear import LinearModel
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.layout import Layout
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
@@ -45,14 +45,14 @@ class AtKnownAttitudes(Model):
         return residuals, lambda: jacobians()[1:]
 
 
-def los_rates() -> tuple[Model, Array]:
-    """The linear model of the LOS rates, 4 unknowns, and a start."""
+def linear_rates() -> tuple[Model, Array]:
+    """Rates of two rows that are linear in 4 unknowns, and a start."""
     rng = np.random.default_rng(0)
     n = ROWS // 2
-    H = rate_matrix(rng.uniform(-0.5, 0.5, (n, 2)), rng.normal(scale=0.2, size=(n, 3)))
     sigma = rng.uniform(1e-3, 2e-3, n)
-    noise = sigma[:, None] * rng.standard_normal((n, 2))
-    return LosRateFactor(np.arange(float(n)), H @ np.array([8e-3, -9e-3, 7e-3, 5e-3]) + noise, H, sigma), np.zeros(4)
+    H = rng.normal(scale=0.2, size=(n, 2, 4)) / sigma[:, None, None]
+    measured = H @ np.array([8e-3, -9e-3, 7e-3, 5e-3]) + rng.standard_normal((n, 2))
+    return LinearModel(np.arange(float(n)), measured, H), np.zeros(4)
 
 
 def accelerometer() -> tuple[Model, Array]:
@@ -86,8 +86,8 @@ def normal_equations(model: Model, start: Array) -> Array:
 
 
 def run() -> Iterator[Ratio]:
-    """LOS rates and an accelerometer. Raises AssertionError when the answers differ."""
-    for name, (model, start) in {"los": los_rates(), "cube": accelerometer()}.items():
+    """Linear rates and an accelerometer. Raises AssertionError when the answers differ."""
+    for name, (model, start) in {"los": linear_rates(), "cube": accelerometer()}.items():
         work = [partial(ours, model, start), partial(normal_equations, model, start)]
         x, y = (solve() for solve in work)
         assert np.linalg.norm(x - y) < SAME * np.linalg.norm(y), f"{x} is not {y}"

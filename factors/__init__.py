@@ -13,7 +13,7 @@ _HOMES = {
     "gimbal": ("GimbalPath", "LocalMotion"),
     "gyro": ("GyroIncrementFactor",),
     "indexer": ("AxisPath", "IndexerAverageFactor"),
-    "los": ("LosDirectionFactor", "LosRateFactor", "LosContext"),
+    "los": ("LosDirectionFactor", "LosContext"),
     "loss": ("TruncatedLoss",),
     "model": ("POSE3", "ROT3", "Model"),
     "preintegration": ("GyroPath", "Increments"),

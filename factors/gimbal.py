@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from alidade.factors.model import Array
+from alidade.factors.model import Array, Stacked
 
 # Motion around a picture is smoothed over one of these times to either side, s: the longest that follows it. The first
 # is long against noise, the last follows swings of 10 Hz.
@@ -60,7 +60,7 @@ class GimbalPath:
 
 
 @dataclass(frozen=True)
-class LocalMotion:
+class LocalMotion(Stacked):
     """How gyro and gimbal move around the stamps of n pictures, smoothed.
 
     A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion
@@ -116,12 +116,6 @@ class LocalMotion:
             windows,
             None if drivers is None else np.stack([np.interp(at, gyro_t, each) for each in drivers.T], axis=1),
         )
-
-    def __getitem__(self, rows: Any) -> LocalMotion:
-        """The motion around some of the pictures."""
-        drivers = None if self.drivers is None else self.drivers[rows]
-        local = self.read[rows], self.gimbal[rows], self.rest[rows], self.rest_by_delay[rows]
-        return LocalMotion(self.rate[rows], *local, self.windows, drivers)
 
     def turned(self, begin: Array, end: Array) -> Array:
         """Rotation vectors (n, 3), rad, of the gyro between times (n, 1) from the stamps, s."""

@@ -6,16 +6,15 @@ A model knows nothing of gtsam; `on` ties it to the variables of a graph.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from itertools import chain
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.soundness import make_sound
 
 if TYPE_CHECKING:
     import gtsam
@@ -43,8 +42,18 @@ ROT3, POSE3 = LieGroup.ROT3, LieGroup.POSE3
 Block = LieGroup | int
 # Measurements on which a model is tried.
 _CHECKED = 100
+# Fields of sigmas, which may be infinite where nothing is known.
+_SIGMAS = ("sigma",)
 # Of a block: one variable that all measurements share, or one for each of them.
 Keys = int | Sequence[int] | NDArray[np.integer]
+
+
+class Stacked:
+    """A dataclass whose fields named by `stacked` hold something for each of n rows; `[rows]` selects some of them."""
+
+    def __getitem__(self, rows: Any) -> Self:
+        """The same of the selected rows."""
+        return cast(Self, select_rows(self, rows))
 
 
 class Model:
@@ -72,8 +81,11 @@ class Model:
     shapes: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __post_init__(self) -> None:
-        """Of a dataclass, which calls it when it is made."""
-        make_sound(self, self.shapes, getattr(self, "stacked", ()))
+        """Of a dataclass, which calls it when it is made. Raises ValueError, see above."""
+        try:
+            _make_sound(self)
+        except ValueError as error:
+            raise ValueError(f"{type(self).__name__}: {error}") from error
 
     if TYPE_CHECKING:
 
@@ -165,6 +177,50 @@ def check(model: Model) -> None:
                 f"{name} declares block {i} as {block!r}: its Jacobian must have shape {(n, m, dimension(block))}, "
                 f"not {np.shape(jacobian)}"
             )
+
+
+def _make_sound(model: Any) -> None:
+    """Make arrays of a model's fields that hold numbers, and raise ValueError where one is not as it declares."""
+    for field in fields(model):
+        name, value = field.name, getattr(model, field.name)
+        if str(field.type).partition(" ")[0] == "Array" and value is not None:
+            try:
+                array = np.asarray(value, dtype=float)
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{name} is no array of numbers ({error})") from error
+            object.__setattr__(model, name, array)  # the dataclass may be frozen
+            _require_numbers(name, array)
+        elif name in _SIGMAS and isinstance(value, int | float):
+            _require_numbers(name, np.array(value, dtype=float))
+        elif isinstance(value, list):
+            for i, each in enumerate(value):
+                _require_numbers(f"{name}[{i}]", each)
+        elif is_dataclass(value):
+            for part in fields(value):
+                _require_numbers(f"{name}.{part.name}", getattr(value, part.name))
+    n = len(model.time)
+    for name in {*model.shapes, *getattr(model, "stacked", ())}:
+        value = getattr(model, name)
+        if isinstance(value, np.ndarray):
+            expected = (n, *model.shapes.get(name, value.shape[1:]))
+            if value.shape != expected:
+                raise ValueError(f"{name} of {n} measurements has shape {value.shape}, not {expected}")
+        elif isinstance(value, list) and len(value) != n:
+            raise ValueError(f"{name} of {n} measurements has {len(value)} parts")
+
+
+def _require_numbers(name: str, array: Any) -> None:
+    """Raise ValueError where an array of floats has one that is not finite, or is a sigma that is not above zero."""
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+        return
+    is_sigma = name in _SIGMAS
+    sound = array > 0.0 if is_sigma else np.isfinite(array)
+    if sound.all():
+        return
+    at = tuple(np.argwhere(~sound)[0].tolist())
+    where = f"{name}{list(at)}" if at else name
+    needed = "sigmas are larger than 0" if is_sigma else "it must be finite"
+    raise ValueError(f"{where} is {array[at]:g}; {needed}")
 
 
 def stacking_key(model: Model) -> Hashable:

@@ -15,15 +15,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from operator import attrgetter
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
 from alidade.factors import so3
-
-Array = NDArray[np.float64]
+from alidade.factors.model import Array, Stacked
 
 # Neighbouring intervals that differ by more than this share are not taken as even.
 _UNEVEN = 0.05
@@ -44,7 +43,7 @@ _TOGETHER = 20_000
 
 
 @dataclass(frozen=True)
-class Increments:
+class Increments(Stacked):
     """Rotations over n windows: aRb with a the sensor at a window's start, b at its end.
 
     Attributes:
@@ -67,14 +66,6 @@ class Increments:
     scale_jacobian: Array | None = None
     driver_jacobian: Array | None = None
     stacked: ClassVar = ("duration", "wxyz", "bias_jacobian", "rate", "unseen", "scale_jacobian", "driver_jacobian")
-
-    def __getitem__(self, rows: Any) -> Increments:
-        """Those over some of the windows."""
-
-        def taken(part: Any) -> Any:
-            return None if part is None else part[rows]
-
-        return Increments(*(taken(getattr(self, name)) for name in self.stacked))
 
 
 class GyroPath:

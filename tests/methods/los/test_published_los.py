@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from alidade.factors.gimbal import GimbalPath
-from alidade.factors.los import LosRateFactor
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.methods.los.published import NAMES, published_estimate, rates, recursive_least_squares
@@ -16,6 +15,7 @@ from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, simulate_los
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.scenario import load_scenario
+from tests.support.los_rates import LosRateFactor
 
 
 def _noise_free(elevation: float, size: float = 1.0) -> tuple[LosData, np.ndarray]:
