@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.disturbances import disturbances
-from alidade.pipelines.diagnostics.error_budget import dominant_priors
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import Advise, weak_directions
+from alidade.pipelines.estimation.disturbances import intervals
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import prior_z_score
-from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate, Quantity
+from alidade.pipelines.estimation.problem import SLOW_ERROR, Array, ChiSquare, Estimate, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
@@ -45,7 +44,9 @@ class Thresholds:
     material: float = 0.5  # effect over requirement
 
 
-DEFAULT = Thresholds()
+LIMITS = Thresholds()
+# A data-sheet figure with at least this share of a variance is worth stating better; the largest ones are reported.
+_MIN_SHARE, _MAX_REPORTED = 0.2, 3
 
 
 def diagnose(
@@ -55,7 +56,6 @@ def diagnose(
     change: Finding | None = None,
     hypotheses: Sequence[Finding] = (),
     contradictions: Sequence[Finding] = (),
-    limits: Thresholds = DEFAULT,
 ) -> tuple[Finding, ...]:
     """All findings, the most severe first; equally severe ones in causal order, cause before symptom.
 
@@ -66,28 +66,27 @@ def diagnose(
         change: finding of `diagnostics.change_test`.
         hypotheses: findings of `diagnostics.hypothesis_tests`, which run where `is_suspect` is true.
         contradictions: findings of `diagnostics.stated_priors`.
-        limits: thresholds.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone
     failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": estimate.message})
     if not estimate.converged and not published:
-        return by_severity([*hypotheses, failure, *rejections(estimate, limits)])
+        return by_severity([*hypotheses, failure, *rejections(estimate)])
     # What data with a fault determine says nothing of what they would without it.
     directions = () if hypotheses else weak_directions(quantities, estimate.covariance, advise, estimate.values)
     found = [*directions, *contradictions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
-        found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
-        found += [*rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
+        found += [*_prior_conflicts(estimate, quantities), *([change] if change else [])]
+        found += [*rejections(estimate), *_noise(estimate), *_correlations(estimate)]
         found += [*_slow_errors(estimate, quantities), *disturbances(estimate)]
-    found += misfits(estimate.chi_square, estimate.levels, limits)
+    found += misfits(estimate.chi_square, estimate.levels)
     if any(finding.severity == WEAK for finding in directions):
-        found += dominant_priors(quantities, estimate.covariance)
+        found += _dominant_priors(quantities, estimate.covariance)
     if not published:
-        found += [*_far_from_prior(estimate, quantities, limits), *_ambiguity(estimate, quantities)]
+        found += [*_far_from_prior(estimate, quantities), *_ambiguity(estimate, quantities)]
     return by_severity(found)
 
 
-def is_suspect(estimate: Estimate, findings: Sequence[Finding], limits: Thresholds = DEFAULT) -> bool:
+def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
     """Whether faults of the data are to be tested as hypotheses, each by solving again."""
     if estimate.solver == "published":
         return False
@@ -96,11 +95,11 @@ def is_suspect(estimate: Estimate, findings: Sequence[Finding], limits: Threshol
         level.contradicted and (level.found or 0.0) > factor
         for level in estimate.levels
         if (families := estimate.residuals.keys() & set(level.noise.families))
-        for factor in (limits.noise_suspect if correlated & families else limits.noise_factor,)
+        for factor in (LIMITS.noise_suspect if correlated & families else LIMITS.noise_factor,)
     )
 
 
-def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity], limits: Thresholds) -> Iterator[Finding]:
+def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
     """Nuisance parameters and those of a prior tighter than usual, worst first, inseparable ones as one.
 
     Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
@@ -108,20 +107,20 @@ def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity], limits:
     P, sigma, x = estimate.covariance, estimate.sigmas, estimate.values
     nuisance = [j for j, q in enumerate(quantities) if (q.assumed or q.tight) and sigma[j] > 0.0]
     z = {j: prior_z_score(quantities[j], x[j], sigma[j], estimate.inflations[j]) or 0.0 for j in nuisance}
-    left = sorted((j for j in nuisance if abs(z[j]) > limits.prior_z), key=lambda j: -abs(z[j]))
+    left = sorted((j for j in nuisance if abs(z[j]) > LIMITS.prior_z), key=lambda j: -abs(z[j]))
     while left:
         j, worst = left[0], quantities[left[0]]
-        same = [k for k in nuisance if k != j and abs(P[j, k]) > limits.inseparable * sigma[j] * sigma[k]]
+        same = [k for k in nuisance if k != j and abs(P[j, k]) > LIMITS.inseparable * sigma[j] * sigma[k]]
         shift = P[:, j] / P[j, j] * (x[j] - worst.prior_mean)
         effect = {q.name: float(shift[i]) for i, q in enumerate(quantities) if q.required and shift[i]}
-        material = any(abs(effect.get(q.name, 0.0)) >= limits.material * q.require for q in quantities if q.required)
-        severe = material and sigma[j] < limits.determined * worst.scale
+        material = any(abs(effect.get(q.name, 0.0)) >= LIMITS.material * q.require for q in quantities if q.required)
+        severe = material and sigma[j] < LIMITS.determined * worst.scale
         others = tuple(sorted(quantities[k].name for k in same))
         yield _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)
         left = [k for k in left[1:] if k not in same]
 
 
-def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity], limits: Thresholds) -> Iterator[Finding]:
+def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
     """Calibrated parameters far from their priors, worst first: legitimate for a mount of 90 deg, and worth a note."""
     z = {
         j: float((estimate.values[j] - q.prior_mean) / q.prior_sigma)
@@ -129,7 +128,7 @@ def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity], limits: 
         if q.prior_sigma and not (q.assumed or q.tight)
     }
     for j in sorted(z, key=lambda j: -abs(z[j])):
-        if abs(z[j]) > limits.far_from_prior:
+        if abs(z[j]) > LIMITS.far_from_prior:
             yield _prior_conflict(estimate, j, z[j], (), {}, NOTE)
 
 
@@ -141,28 +140,28 @@ def _prior_conflict(
     return Finding("prior_conflict", severity, evidence)
 
 
-def rejections(estimate: Estimate, limits: Thresholds = DEFAULT) -> list[Finding]:
+def rejections(estimate: Estimate) -> list[Finding]:
     """Families of which more is rejected than outliers are, the largest share first."""
-    every = {f: r.used for f, r in estimate.residuals.items() if len(r.used) >= limits.min_few}
+    every = {f: r.used for f, r in estimate.residuals.items() if len(r.used) >= LIMITS.min_few}
     least = {
-        f: limits.rejected_note if len(used) >= limits.min_family else limits.rejected_few for f, used in every.items()
+        f: LIMITS.rejected_note if len(used) >= LIMITS.min_family else LIMITS.rejected_few for f, used in every.items()
     }
     shares = {f: share for f, used in every.items() if (share := float(np.mean(~used))) > least[f]}
     found = []
     for family in sorted(shares, key=lambda family: -shares[family]):
         share, factor = shares[family], robust_sigma(estimate.residuals[family].whitened)
         evidence = {"family": family, "share": share, "noise_factor": factor}
-        found.append(Finding("rejection", INCONSISTENT if share > limits.rejected else NOTE, evidence))
+        found.append(Finding("rejection", INCONSISTENT if share > LIMITS.rejected else NOTE, evidence))
     return found
 
 
-def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
+def _noise(estimate: Estimate) -> Iterator[Finding]:
     """Statements that the recording contradicts; an estimate far above its statement is no noise."""
     for level in estimate.levels:
         known, own = level.together, set(level.noise.families)
-        least = -np.inf if level.sigma is None else (level.found or 0.0) - limits.noise_sigmas * level.sigma
-        no_noise = bool(own) and least > limits.noise_factor
-        differs = known.contradicted or not 1.0 / limits.noise_note < known.scale < limits.noise_note
+        least = -np.inf if level.sigma is None else (level.found or 0.0) - LIMITS.noise_sigmas * level.sigma
+        no_noise = bool(own) and least > LIMITS.noise_factor
+        differs = known.contradicted or not 1.0 / LIMITS.noise_note < known.scale < LIMITS.noise_note
         is_default = level.noise.source == "default"
         alike = [_share(other) for other in estimate.levels if other is level or own & set(other.noise.families)]
         share = float(np.linalg.norm(alike)) if _share(level) == max(alike) else 0.0
@@ -178,11 +177,11 @@ def _share(level: Level) -> float:
     return level.used / (level.noise.no_noise or level.noise.spec.no_noise) if is_default else 0.0
 
 
-def _correlations(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
+def _correlations(estimate: Estimate) -> Iterator[Finding]:
     """Residuals correlated for so long that they are no noise; a correlation length counts measurements."""
     for family, length in estimate.colours.items():
         share = length / len(estimate.residuals[family].time)
-        if share > limits.correlated:
+        if share > LIMITS.correlated:
             yield Finding("correlation", INCONSISTENT, {"family": family, "share": share})
 
 
@@ -198,7 +197,7 @@ def _slow_errors(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator
         yield Finding("slow_error", NOTE, {"parameter": quantities[worst].name, "ratio": ratio})
 
 
-def misfits(chi_square: ChiSquare | None, levels: Sequence[Level], limits: Thresholds = DEFAULT) -> list[Finding]:
+def misfits(chi_square: ChiSquare | None, levels: Sequence[Level]) -> list[Finding]:
     """Chi-square of all residuals where the noise is known exactly; of single processes where levels are estimated."""
     if chi_square is None:
         return []
@@ -211,7 +210,7 @@ def misfits(chi_square: ChiSquare | None, levels: Sequence[Level], limits: Thres
         found.append(_misfit(None, total, largest, fits[largest].noise_factor, INCONSISTENT if too_large else NOTE))
     measured = {family for level in levels if level.least is None for family in level.noise.families}
     for family, (value, dof) in chi_square.families.items() if levels else ():
-        if family not in measured and dof > limits.process_dof and value > limits.noise_factor**2 * dof:
+        if family not in measured and dof > LIMITS.process_dof and value > LIMITS.noise_factor**2 * dof:
             fit = Fit.of(value, dof)
             found.append(_misfit(family, fit, family, fit.noise_factor, INCONSISTENT))
     return found
@@ -220,6 +219,44 @@ def misfits(chi_square: ChiSquare | None, levels: Sequence[Level], limits: Thres
 def _misfit(family: str | None, fit: Fit, largest: str, noise_factor: float, severity: Severity) -> Finding:
     evidence: dict[str, Any] = {"family": family, "chi_square": fit.value, "dof": fit.dof}
     return Finding("misfit", severity, {**evidence, "largest": largest, "noise_factor": noise_factor})
+
+
+def disturbances(estimate: Estimate) -> Iterator[Finding]:
+    """Intervals in which most measurements of a family are rejected, in time order."""
+    for family, residuals in estimate.residuals.items():
+        order = np.argsort(residuals.time, kind="stable")
+        time, rejected = residuals.time[order], ~residuals.used[order]
+        for first, last in intervals(rejected):
+            evidence = {
+                "family": family,
+                "since_s": float(time[first]),
+                "time_s": float(time[last - 1]),
+                "rejected": int(rejected[first:last].sum()),
+            }
+            yield Finding("disturbance", Severity.NOTE, evidence)
+
+
+def _dominant_priors(quantities: Sequence[Quantity], covariance: Array) -> Iterator[Finding]:
+    """Data-sheet figures that make most of the variance of weak parameters, the largest share first.
+
+    The share of a figure is the part of a variance that conditioning on its nuisance parameters removes:
+    P_wn P_nn^-1 P_nw over P_ww; the covariance (n, n) is in the order of the quantities.
+    """
+    variances = np.diag(covariance)
+    weak = [i for i, q in enumerate(quantities) if q.judged and variances[i] > q.require**2]
+    figures: dict[str, list[int]] = {}
+    for i, q in enumerate(quantities):
+        if q.sheet and variances[i] > 0.0:
+            figures.setdefault(q.sheet, []).append(i)
+    shares = {}
+    for figure, rows in figures.items():
+        across = covariance[np.ix_(weak, rows)]
+        removed = across @ np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True) @ across.T
+        shares[figure] = float(max(np.diag(removed) / variances[weak], default=0.0))
+    dominant = [figure for figure in sorted(shares, key=lambda figure: -shares[figure]) if shares[figure] > _MIN_SHARE]
+    for figure in dominant[:_MAX_REPORTED]:
+        evidence = {"figure": figure, "stated": quantities[figures[figure][0]].scale, "share": shares[figure]}
+        yield Finding("dominant_prior", Severity.WEAK, evidence)
 
 
 def _ambiguity(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.common_factor import Scaling, scalings
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.problem import Array, History, Quantity
+from alidade.pipelines.estimation.problem import Array, CommonFactor, History, Quantity
 
 Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]
 _RANKS: tuple[Verdict, ...] = get_args(Verdict)
@@ -36,6 +35,39 @@ _TENTHS, _MIN_MOMENTS = 10, 20
 _DEFAULT_ADVICE = Motion("vary the motion while recording, record longer, or give these parameters a tighter prior")
 
 
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """A factor that numbers have in common with the strength of what a sensor measures, in the linear approximation.
+
+    A magnetometer's K and b, and the field, fit as well when all are multiplied by one factor, which only the prior of
+    the field's strength determines. K and b in units of that strength, their shape, are what a recording determines.
+
+    Attributes:
+        factor: as the quantities have it.
+        sigma: of the strength, relative.
+        moves: (n,) what one sigma of the strength moves each number by.
+        shape: (n, n) covariance of the numbers given the strength: with `moves` squared it is that of the numbers.
+    """
+
+    factor: CommonFactor
+    sigma: float
+    moves: Array
+    shape: Array
+
+
+def scalings(quantities: Sequence[Quantity], covariance: Array, values: Array) -> list[Scaling]:
+    """The common factors of quantities with this covariance (n, n) and these values (n,), SI."""
+    found = []
+    for factor in dict.fromkeys(q.factor for q in quantities if q.factor is not None):
+        of = np.array([q.factor == factor and q.assumed for q in quantities])
+        strength = np.where(of, values, 0.0)
+        gain = strength / max(float(strength @ strength), np.finfo(float).tiny)
+        sigma = float(np.sqrt(max(float(gain @ covariance @ gain), 0.0)))
+        moves = covariance @ gain / sigma if sigma > 0.0 else np.zeros(len(values))
+        found.append(Scaling(factor, sigma, moves, covariance - np.outer(moves, moves)))
+    return found
+
+
 def verdict(quantity: Quantity, sigma: float) -> Verdict:
     """The contract's verdict on a parameter with this posterior sigma, SI."""
     if quantity.prior_sigma == 0.0:
@@ -47,7 +79,7 @@ def verdict(quantity: Quantity, sigma: float) -> Verdict:
 
 
 def verdicts(
-    quantities: Sequence[Quantity], covariance: Array, findings: Sequence[Finding] = (), values: Array | None = None
+    quantities: Sequence[Quantity], covariance: Array, findings: Sequence[Finding], values: Array
 ) -> dict[str, Verdict]:
     """Parameter -> verdict, of those with a required accuracy, and of a shape where that is required instead.
 
@@ -58,11 +90,11 @@ def verdicts(
         quantities: n of them.
         covariance: (n, n) in their order.
         findings: on the solution.
-        values: (n,) in their order; None: no shape is judged.
+        values: (n,) in their order.
     """
     sigmas = np.sqrt(np.diag(covariance)).tolist()
     found = {q.name: verdict(q, sigma) for q, sigma in zip(quantities, sigmas, strict=True) if q.judged}
-    for scaling in [] if values is None else scalings(quantities, covariance, values):
+    for scaling in scalings(quantities, covariance, values):
         shape = _shape(scaling, quantities)
         if shape.verdict and any(q.relative and q.factor == scaling.factor for q in quantities):
             found[shape.name] = shape.verdict
@@ -91,7 +123,7 @@ class DerivedNumber(NamedTuple):
 
 
 def derived(
-    quantities: Sequence[Quantity], covariance: Array, values: Array, findings: Sequence[Finding] = ()
+    quantities: Sequence[Quantity], covariance: Array, values: Array, findings: Sequence[Finding]
 ) -> list[DerivedNumber]:
     """Scale and shape of the sensors whose scale no recording separates from the strength of what they measure.
 
@@ -155,7 +187,7 @@ def finite_covariance(quantities: Sequence[Quantity], covariance: Array) -> Arra
 
 
 def weak_directions(
-    quantities: Sequence[Quantity], covariance: Array, advise: Advise | None = None, values: Array | None = None
+    quantities: Sequence[Quantity], covariance: Array, advise: Advise | None, values: Array
 ) -> tuple[Finding, ...]:
     """Weak and unobservable eigen-directions of the prior-scaled covariance (n, n), worst first.
 
@@ -164,15 +196,14 @@ def weak_directions(
     is; no direction is blamed for parameters that are all as accurate as required. It is then unobservable if its sigma
     is 0.9 of its prior's or more, else weak. Fixed quantities, and those without a required accuracy, take no part.
 
-    The strength of what a sensor measures is a direction of its own, SENSOR_scale, and the others are given it. Without
-    the values (n,) of the quantities there is none.
+    The strength of what a sensor measures is a direction of its own, SENSOR_scale, and the others are given it.
     """
     estimated = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0 and q.required]
     if not estimated:
         return ()
     covariance = finite_covariance(quantities, covariance)
     own = np.diag(covariance)
-    factors = [] if values is None else scalings(quantities, covariance, values)
+    factors = scalings(quantities, covariance, values)
     for factor in factors:
         covariance = covariance - np.outer(factor.moves, factor.moves)
     variances = np.where([q.relative for q in quantities], np.diag(covariance), own)

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.diagnostics.diagnose import DEFAULT, Thresholds
+from alidade.pipelines.diagnostics.diagnose import LIMITS
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Array, Quantity, SqrtInformation
 from alidade.pipelines.settings import Config
@@ -48,8 +48,7 @@ def contradictions(
     sqrt_info: SqrtInformation,
     freed: Sequence[Quantity],
     quantities: Sequence[Quantity],
-    ratio: float = 1.0,
-    limits: Thresholds = DEFAULT,
+    ratio: float,
 ) -> tuple[Finding, ...]:
     """Findings of kind `contradiction`, the worst first: fixed numbers that the recording contradicts.
 
@@ -60,7 +59,6 @@ def contradictions(
         freed: quantities of that graph.
         quantities: as they were solved for; what is not among them is fixed.
         ratio: of sigmas to those for white noise of the model.
-        limits: thresholds.
     """
     known = {q.name: q for q in freed}
     free = {q.name for q in quantities if q.prior_sigma != 0.0}
@@ -70,7 +68,7 @@ def contradictions(
         gain, x, information, correlation = _each_freed(sqrt_info, inside)
         z = x * np.sqrt(information) / ratio
         worst = int(np.argmax(np.abs(z)))
-        if abs(z[worst]) < limits.prior_z:
+        if abs(z[worst]) < LIMITS.prior_z:
             break
         fixed = np.flatnonzero(~inside)
         j, shifts = fixed[worst], np.zeros(len(inside))
@@ -79,8 +77,8 @@ def contradictions(
         effect = {
             name: float(shifts[i]) for i, name in enumerate(sqrt_info.names) if known[name].required and shifts[i]
         }
-        material = any(abs(shift) >= limits.material * known[name].require for name, shift in effect.items())
-        alike = fixed[np.abs(correlation[worst]) > limits.inseparable]
+        material = any(abs(shift) >= LIMITS.material * known[name].require for name, shift in effect.items())
+        alike = fixed[np.abs(correlation[worst]) > LIMITS.inseparable]
         evidence = {
             "parameter": sqrt_info.names[j],
             "unit": known[sqrt_info.names[j]].unit,

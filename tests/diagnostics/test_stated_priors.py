@@ -82,7 +82,7 @@ def test_the_score_of_a_fixed_number_is_what_it_is_alone_freed() -> None:
     fixed_at = np.append(np.linalg.lstsq(A[:, :2], y)[0], [0.0, 0.0])
     sqrt_info = SqrtInformation(names, fixed_at, A, y - A @ fixed_at, np.empty((0, 4)), np.empty(0), np.ones(4))
     freed = [Quantity(name, "", None, 1.0, 0.1) for name in names]
-    (found,) = contradictions(sqrt_info, freed, freed[:2])
+    (found,) = contradictions(sqrt_info, freed, freed[:2], 1.0)
     alone, *_ = np.linalg.lstsq(A[:, :3], y)
     covariance = np.linalg.inv(A[:, :3].T @ A[:, :3])
     evidence = found.evidence

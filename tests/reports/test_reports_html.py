@@ -50,7 +50,8 @@ def test_the_verdict_comes_first_and_numbers_are_for_people() -> None:
 def test_weak_directions_come_with_advice_and_no_formula_to_apply() -> None:
     covariance = np.diag([1e-6, 1e-6, 0.35**2, 1e-8, 1e-8, 0.0])
     calibration = make_calibration(covariance=covariance)
-    found = weak_directions(calibration.problem.quantities, covariance, lambda _: Motion("nod and shake the head"))
+    quantities, values = calibration.problem.quantities, calibration.estimate.values
+    found = weak_directions(quantities, covariance, lambda _: Motion("nod and shake the head"), values)
     page = Page(report_html(replace(calibration, findings=found)))
     assert page.text.count("What to do: nod and shake the head.") == 1
     assert page.text.count("od and shake the head") == 3  # in the verdict, by direction, in all findings

@@ -29,7 +29,7 @@ class Judged:
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
-        return verdicts(self.quantities, self.covariance)
+        return verdicts(self.quantities, self.covariance, (), np.array([q.prior_mean for q in self.quantities]))
 
     @property
     def directions(self) -> tuple[Finding, ...]:

@@ -117,7 +117,7 @@ def _sway(_: Mapping[str, float]) -> Motion:
 def _view(sigma: float) -> View:
     quantities = (Quantity("delta_px", "rad", 0.1, 0.1, 1e-3),)
     covariance = np.eye(1) * sigma**2
-    findings = weak_directions(quantities, covariance, _sway)
+    findings = weak_directions(quantities, covariance, _sway, np.zeros(1))
     wanted = ChecklistItem("sway", "1.0 deg", "turn it")
     return View(3.0, 0, quantities, np.array([0.02]), covariance, (wanted,), None, findings, _sway)
 

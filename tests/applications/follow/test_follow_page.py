@@ -53,7 +53,7 @@ def _view(time_s: float, sigma: float) -> View:
     """Of two parameters, the second of which is known well enough, and a sway that is wanted at the beginning."""
     quantities = (Quantity("delta_px", "rad", 0.1, 0.1, 1e-3), Quantity("delta_gx", "rad", 0.1, 0.1, 1e-3))
     covariance = np.diag([sigma**2, 1e-8])
-    findings = weak_directions(quantities, covariance, _sway)
+    findings = weak_directions(quantities, covariance, _sway, np.zeros(2))
     wanted = "sway the carrier about its x"
     collected = (
         ChecklistItem("sway about x", "1.0 deg", wanted, 0.5, Motion(wanted, swaying("x", "carrier"))),

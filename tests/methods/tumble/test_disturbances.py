@@ -11,7 +11,7 @@ import pytest
 
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.diagnostics.disturbances import disturbances
+from alidade.pipelines.diagnostics.diagnose import disturbances
 from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.estimation.problem import Estimate, Residuals
 from alidade.pipelines.methods import method
