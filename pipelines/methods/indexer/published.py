@@ -11,7 +11,7 @@ have been.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.windows import AxisMotion, Run, axis_motion
+from alidade.pipelines.methods.triads import numeric_jacobian
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 Array = NDArray[np.float64]
@@ -56,39 +57,16 @@ class ThinShell:
 
     Attributes:
         theta: (3,) rad.
-        cost: sum of squares at theta, (rad/s)^2.
-        half_differences: what the cost was made of.
-        sweeps: theta (sweeps, 3) after each sweep.
-        fourth_cases: how often each angle's search met s_min < s_mean > s_max, which the publication does not name: the
-            half with the lower end was kept.
+        fourth_cases: how often the search met s_min < s_mean > s_max, which the publication does not name: the half
+            with the lower end was kept.
         flat: for each angle, whether the cost did not depend on it: it then stays at the middle of its interval.
         at_edge: for each angle, whether it ended at an edge of its start interval: it may lie outside.
     """
 
     theta: Array
-    cost: float
-    half_differences: tuple[HalfDifference, ...]
-    sweeps: Array
-    fourth_cases: tuple[int, int, int]
-    flat: tuple[bool, bool, bool]
-    at_edge: tuple[bool, bool, bool]
-
-
-def thin_shell(
-    data: IndexerData, half_width: float = np.deg2rad(2.0), iterations: int = 28, sweeps: int = 1
-) -> ThinShell:
-    """Calibrate from a session.
-
-    Args:
-        data: the session; the base is level and points north, as the schedule of the publication asks.
-        half_width: of the start interval about zero, rad.
-        iterations: limit for each angle.
-        sweeps: how often the three angles are gone through; published is one.
-
-    Raises:
-        InputError: no position has whole turns forward and back.
-    """
-    return search(half_differences(data), half_width, iterations, sweeps)
+    fourth_cases: int
+    flat: tuple[bool, ...]
+    at_edge: tuple[bool, ...]
 
 
 def published_estimate(data: IndexerData, config: Config, problem: Problem) -> Estimate:
@@ -96,33 +74,30 @@ def published_estimate(data: IndexerData, config: Config, problem: Problem) -> E
 
     The publication gives no accuracy; the covariance is what gyro noise alone does to the eight components.
     """
-    found = thin_shell(data)
+    measured = half_differences(data)
+    found = search(measured)
     density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
     known = {q.name for q in problem.quantities}
     notes = [f"{name} has no influence on the cost" for name, flat in zip(NAMES, found.flat, strict=True) if flat]
     notes += [f"{name} at the edge of +-2 deg" for name, edge in zip(NAMES, found.at_edge, strict=True) if edge]
-    if any(found.fourth_cases):
-        notes.append(f"fourth case met {sum(found.fourth_cases)} times")
+    if found.fourth_cases:
+        notes.append(f"fourth case met {found.fourth_cases} times")
     return Estimate(
         solver="published",
         names=tuple(name for name in NAMES if name in known),
         values=found.theta,
-        covariance=_covariance(found, density),
+        covariance=_covariance(found.theta, measured, density),
         converged=not any(found.flat) and not any(found.at_edge),
         message="; ".join(notes) or "one sweep",
     )
 
 
-def _covariance(found: ThinShell, density: float) -> Array:
+def _covariance(theta: Array, measured: Sequence[HalfDifference], density: float) -> Array:
     """Covariance (3, 3) rad^2 of white gyro noise through the eight components; 1 rad for an unobserved angle."""
-    step = 1e-6
-    information = np.eye(3)
-    for i, half in enumerate(found.half_differences):
-        sides = [[_across(found.theta + s * d, found.half_differences)[i] for d in step * np.eye(3)] for s in (1, -1)]
-        jacobian = (np.array(sides[0]) - np.array(sides[1])).T / (2.0 * step)
-        # Half the difference of two means over half of the time each.
-        information += jacobian.T @ jacobian * half.duration / density**2
-    return np.asarray(np.linalg.inv(information))
+    J = numeric_jacobian(lambda angles: np.concatenate(_across(angles, measured)), theta, np.full(3, 1e-6))
+    # Half the difference of two means over half of the time each.
+    weights = np.repeat([half.duration for half in measured], 2) / density**2
+    return np.asarray(np.linalg.inv(np.eye(3) + (J.T * weights) @ J))
 
 
 def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
@@ -172,53 +147,39 @@ def _across(theta: ArrayLike, measured: Sequence[HalfDifference]) -> list[Array]
     return [rate[1:] if half.axis == "outer" else rate[:2] for rate, half in zip(in_t, measured, strict=True)]
 
 
-def search(measured: tuple[HalfDifference, ...], half_width: float, iterations: int = 28, sweeps: int = 1) -> ThinShell:
-    """The thin-shell search over theta_x, then theta_y, then theta_z, each with the others where they are."""
-    theta = np.zeros(3)
-    after: list[Array] = []
-    tally = _Tally()
-    for _ in range(sweeps):
-        tally = _Tally()
-        for axis in range(3):
-            theta[axis] = _shell(theta, axis, measured, half_width, iterations, tally)
-        after.append(theta.copy())
+def search(measured: Sequence[HalfDifference], half_width: float = np.deg2rad(2.0), iterations: int = 28) -> ThinShell:
+    """The thin-shell search over theta_x, then theta_y, then theta_z, each with the others where they are.
+
+    Args:
+        measured: half differences; the base is level and points north, as the schedule of the publication asks.
+        half_width: of the start interval about zero, rad.
+        iterations: limit for each angle.
+    """
+    theta, fourth_cases, flat = np.zeros(3), 0, []
+    for axis in range(3):
+        theta[axis], fourth, is_flat = _shell(theta, axis, measured, half_width, iterations)
+        fourth_cases += fourth
+        flat.append(is_flat)
     at_edge = tuple(bool(half_width - abs(angle) < 1e-6 * half_width) for angle in theta)
-    return ThinShell(
-        theta=theta,
-        cost=cost(theta, measured),
-        half_differences=measured,
-        sweeps=np.array(after),
-        fourth_cases=(tally.fourth[0], tally.fourth[1], tally.fourth[2]),
-        flat=(tally.flat[0], tally.flat[1], tally.flat[2]),
-        at_edge=(at_edge[0], at_edge[1], at_edge[2]),
-    )
-
-
-@dataclass
-class _Tally:
-    """Counts of a sweep, per angle."""
-
-    fourth: list[int] = field(default_factory=lambda: [0, 0, 0])
-    flat: list[bool] = field(default_factory=lambda: [False, False, False])
+    return ThinShell(theta, fourth_cases, tuple(flat), at_edge)
 
 
 def _shell(
-    theta: Array, axis: int, measured: Sequence[HalfDifference], half_width: float, iterations: int, tally: _Tally
-) -> float:
-    """The angle of one axis."""
+    theta: Array, axis: int, measured: Sequence[HalfDifference], half_width: float, iterations: int
+) -> tuple[float, int, bool]:
+    """The angle of one axis, how often the fourth case was met, and whether the cost is flat."""
 
     def at(angle: float) -> float:
         trial = theta.copy()
         trial[axis] = angle
         return cost(trial, measured)
 
-    low, high = -half_width, half_width
+    low, high, fourth = -half_width, half_width, 0
     for iteration in range(iterations):
         middle = 0.5 * (low + high)
         s_low, s_middle, s_high = at(low), at(middle), at(high)
         if iteration == 0 and max(s_low, s_high) - min(s_low, s_middle, s_high) <= _FLAT * s_middle:
-            tally.flat[axis] = True
-            break
+            return middle, fourth, True
         if s_low > s_middle < s_high:
             low, high = 0.5 * (middle + low), 0.5 * (middle + high)
         elif s_low <= s_middle <= s_high:
@@ -226,9 +187,9 @@ def _shell(
         elif s_low >= s_middle >= s_high:
             low = middle
         else:
-            tally.fourth[axis] += 1
+            fourth += 1
             low, high = (low, middle) if s_low <= s_high else (middle, high)
-    return 0.5 * (low + high)
+    return 0.5 * (low + high), fourth, False
 
 
 def _position(run: Run) -> int | None:

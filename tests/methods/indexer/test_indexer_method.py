@@ -17,7 +17,7 @@ from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods.indexer.model import problem
 from alidade.pipelines.methods.indexer.parameters import indexer_parameters
-from alidade.pipelines.methods.indexer.published import published_estimate, thin_shell
+from alidade.pipelines.methods.indexer.published import half_differences, published_estimate, search
 from alidade.pipelines.methods.indexer.recording import read_indexer
 from alidade.pipelines.methods.indexer.report import validate
 from alidade.pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
@@ -93,7 +93,7 @@ def test_two_positions_without_the_move_leave_theta_x_weak_and_named() -> None:
     assert abs(estimate.values[0] - truth["theta_x"]) < 3.0 * sigma["theta_x"]
     assert graph.advice is not None
     assert "inner axis" in graph.advice({"theta_x": 0.99, "theta_y": 0.02}).advice
-    assert thin_shell(data).flat[0]
+    assert search(half_differences(data)).flat[0]
 
 
 def test_the_recorded_move_makes_theta_x_observable() -> None:
