@@ -15,7 +15,7 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.model import Array, Model, Residuals
 from alidade.factors.triad import AccelFactor
-from alidade.pipelines.estimation.linear import LinearModel
+from alidade.pipelines.estimation.priors import LinearModel
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.layout import Layout
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize

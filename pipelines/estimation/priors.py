@@ -1,15 +1,16 @@
-"""Priors of variables as measurements of them: whitened rows about a vector or a rotation."""
+"""Factors beside the measurements, whitened when they are built: priors, and linear relations between vectors."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.bridge import BoundModel
 from alidade.factors.model import ROT3, Block, Model, Residuals
-from alidade.pipelines.estimation.linear import LinearModel
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 
 # A fixed quantity is held by a prior this much tighter than the accuracy wanted of it.
@@ -17,6 +18,44 @@ _PINNED = 1e-6
 # A free quantity is held by a prior this much wider than the default one. It adds next to no information, but without
 # it a smoother could not even begin where the data do not determine the quantity, or not yet.
 _FREE = 10.0
+
+
+@dataclass(frozen=True)
+class LinearModel(Model):
+    """n measurements of m whitened rows each, linear in one to three vectors. Blocks: the vectors.
+
+    Attributes:
+        time: (n,) s; 0 of what is known beforehand.
+        right: (n, m) right side.
+        first, second, third: (n, m, d) coefficients of each vector; None: there are fewer vectors.
+    """
+
+    time: Array
+    right: Array
+    first: Array
+    second: Array | None = None
+    third: Array | None = None
+    stacked: ClassVar = ("time", "right", "first", "second", "third")
+
+    @property
+    def coefficients(self) -> tuple[Array, ...]:
+        """Coefficients (n, m, d) of each vector."""
+        return tuple(each for each in (self.first, self.second, self.third) if each is not None)
+
+    @property
+    def rows(self) -> int:
+        """m."""
+        return int(self.right.shape[1])
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """The vectors' sizes."""
+        return tuple(int(each.shape[2]) for each in self.coefficients)
+
+    def __call__(self, *vectors: Array) -> Residuals:
+        """Residual sum of A_i x_i less the right side, (n, m)."""
+        parts = [np.einsum("nij,nj->ni", A, x) for A, x in zip(self.coefficients, vectors, strict=True)]
+        return sum(parts, start=-self.right), lambda: self.coefficients
 
 
 @dataclass(frozen=True)
@@ -70,9 +109,25 @@ def rotation_prior(parameter: Parameter) -> Factor:
 def vector_about(key: int, mean: Array, sigmas: Array | float, family: str = "prior") -> Factor:
     """Prior on a vector variable (d,) about `mean`, with sigmas in its own units."""
     R = np.diag(1.0 / np.broadcast_to(np.asarray(sigmas, dtype=float), mean.shape))
-    return Factor.process_of(family, LinearModel(np.zeros(1), (R @ mean)[None], R[None]).on(key))
+    return gaussian_about(key, mean, R, family)
+
+
+def gaussian_about(key: int, mean: Array, sqrt_information: Array, family: str = "prior") -> Factor:
+    """Prior on a vector variable (d,) about `mean`, with the square root (m, d) of its information."""
+    model = LinearModel(np.zeros(1), (sqrt_information @ mean)[None], sqrt_information[None])
+    return Factor.process_of(family, model.on(key))
 
 
 def rotation_about(key: int, mean: Array, sqrt_information: Array, family: str = "prior") -> Factor:
     """Prior on a Rot3 variable about `mean` (4,), with the square root (3, 3) of its information in its own frame."""
     return Factor.process_of(family, RotationPrior(np.zeros(1), mean[None], sqrt_information[None]).on(key))
+
+
+def linear_factor(blocks: Mapping[int, Array], sigma: float) -> BoundModel:
+    """The measurement 0 = sum of blocks[key] x[key], up to three of (m, d), with `sigma` in each of its m rows.
+
+    The rows are divided by sigma here. With a noise model beside them gtsam's elimination would take any row whose
+    sigma is below 1e-8, in whatever unit, for an exact constraint, which later steps then cannot handle.
+    """
+    coefficients = [block[None] / sigma for block in blocks.values()]
+    return LinearModel(np.zeros(1), np.zeros(coefficients[0].shape[:2]), *coefficients).on(*blocks)

@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.estimation.linear import linear_factor
+from alidade.pipelines.estimation.priors import linear_factor
 from alidade.pipelines.estimation.problem import Array, Factor, Step
 
 # The bias walk over a segment moves the angle by this fraction of what gyro noise does ...
@@ -118,7 +118,7 @@ class WalkingBias:
         step = self.walk * np.sqrt(spacing)
         sigma = float(np.hypot(step, _SLACK * self._unknown(spacing)))
         blocks = {self.key(node - 1): -np.eye(3), self.key(node): np.eye(3)}
-        return Factor.process_of("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))
+        return Factor.process_of("bias walk", linear_factor(blocks, sigma))
 
     def _unknown(self, segment: float) -> float:
         """Sigma that gyro noise leaves to the bias of a segment (s), rad/s."""
@@ -133,7 +133,5 @@ class WalkingBias:
         departure = self.walk * np.sqrt(segment / 12.0) * share
         sigma = float(np.hypot(departure, _MEAN_SLACK * self._unknown(segment) * share))
         blocks = {self.mean_key(node): 1.0, self.mean_key(node - 1): share - 1.0, self.key(node): -share}
-        factor = linear_factor(
-            {key: scale * np.eye(3) for key, scale in blocks.items()}, dict.fromkeys(blocks, np.zeros(3)), sigma
-        )
+        factor = linear_factor({key: scale * np.eye(3) for key, scale in blocks.items()}, sigma)
         return Factor.process_of("definition", factor)

@@ -13,7 +13,6 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.triad import TriadPriorFactor, calibration, triad
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.linear import linear_factor
 from alidade.pipelines.estimation.parameters import (
     ParameterSpec,
     accel_square,
@@ -24,7 +23,7 @@ from alidade.pipelines.estimation.parameters import (
     scalar,
     stated,
 )
-from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
+from alidade.pipelines.estimation.priors import gaussian_about, prior_sigmas, rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
 from alidade.pipelines.methods.place import FIELD, known_field
@@ -186,9 +185,7 @@ def first_priors(parameters: Parameters) -> list[Factor]:
     factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in parameters.zeros]
     if parameters.field is not None and parameters.field_prior is not None:
         key, (mean, root) = parameters.field.key, parameters.field_prior
-        factors.append(
-            Factor.process_of("prior", linear_factor({key: np.asarray(np.linalg.inv(root))}, {key: mean}, 1.0))
-        )
+        factors.append(gaussian_about(key, mean, np.asarray(np.linalg.inv(root))))
     return factors
 
 

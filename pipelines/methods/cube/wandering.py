@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from alidade.pipelines.estimation.linear import linear_factor
-from alidade.pipelines.estimation.priors import vector_about
+from alidade.pipelines.estimation.priors import linear_factor, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor
 from alidade.pipelines.methods.cube.static_poses import StaticPoses
 
@@ -63,10 +62,10 @@ class GaussMarkovDeviation:
         first, none = k == 0, np.zeros(3)
         before = {} if first else {deviation_key(k - 1): -self.correlation[k] * np.eye(3)}
         blocks = {key: np.eye(3), **before}
-        walk = linear_factor(blocks, dict.fromkeys(blocks, none), float(self.sigma[k]))
+        walk = linear_factor(blocks, float(self.sigma[k]))
         summed = {} if first else {sum_key(k - 1): -np.eye(3)}
         blocks = {sum_key(k): np.eye(3), key: -share * np.eye(3), **summed}
-        step = linear_factor(blocks, dict.fromkeys(blocks, none), _STEADY / float(np.sqrt(2.0 * count)))
+        step = linear_factor(blocks, _STEADY / float(np.sqrt(2.0 * count)))
         found = [Factor.process_of("bias walk", walk), Factor.process_of("definition", step)]
         if k == count - 1:
             found.append(vector_about(sum_key(k), none, _STEADY / float(np.sqrt(2.0)), "definition"))
