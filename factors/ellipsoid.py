@@ -49,9 +49,8 @@ def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
     length = np.linalg.norm(vectors, axis=1)
     g = vectors / length[:, None] @ K
     slope = np.linalg.norm(g, axis=1)
-    trace = ((K**2).sum() - slope**2) / length
     curvature = (((g @ K.T) ** 2).sum(axis=1) - slope**4) / length
-    return np.asarray(sigma**2 * (0.5 * trace / slope - curvature / slope**3))
+    return sagitta(raw, (sigma**2)[:, None, None] * np.eye(3), numbers) - sigma**2 * curvature / slope**3
 
 
 def sagitta(raw: Array, scatter: Array, numbers: Array) -> Array:

@@ -17,10 +17,6 @@ from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
 
-_CONFIG: Source = "config"
-_MESSAGE: Source = "message"
-_DEFAULT: Source = "default"
-
 # Order of the differences that separate a sensor's white noise from its motion: motion is smooth, noise is not.
 _ORDER = 6
 # Means of so many samples are looked at, one after the other, until two of them agree to this part: below a sensor's
@@ -61,11 +57,12 @@ def stated(
     own = NOISES[spec] if isinstance(spec, str) else spec
     given: float | None = getattr(config.noise, own.name, None)
     assert own.default is not None
-    figure, source = own.default, _DEFAULT
+    figure = own.default
+    source: Source = "default"
     if given is not None:
-        figure, source = float(given), _CONFIG
+        figure, source = float(given), "config"
     elif message is not None:
-        figure, source = float(message), _MESSAGE
+        figure, source = float(message), "message"
     # Who takes the config's figures for exact wants no level estimated.
     known = config.noise_known if given is not None or config.noise_known == 0.0 else ROUGHLY
     of = None if rows is None else tuple(rows)
@@ -77,10 +74,9 @@ def repeatability(sensor: str, config: Config, family: str) -> Level:
 
     Where nobody states it, it counts as hardly known, and as none where noise is said to be known exactly.
     """
-    noise = replace(stated(f"{sensor}_repeatability", config, None, (family,)), beside=True)
-    if noise.source == _CONFIG:
-        return Level(noise)
-    return Level(replace(noise, known=_HARDLY)) if noise.known else Level(noise, scale=0.0)
+    level = estimated(f"{sensor}_repeatability", config, (family,), beside=True)
+    is_stated = level.noise.source == "config" or level.noise.known > 0.0
+    return level if is_stated else replace(level, scale=0.0)
 
 
 def estimated(
@@ -88,7 +84,7 @@ def estimated(
 ) -> Level:
     """A noise whose level the marginal likelihood finds, its prior by what is stated; else within a factor seven."""
     noise = replace(stated(name, config, message, families), beside=beside)
-    if noise.source == _DEFAULT and noise.known:
+    if noise.source == "default" and noise.known:
         return Level(replace(noise, known=_HARDLY))
     return Level(noise)
 
@@ -107,7 +103,7 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     held = replace(noise, families=())
     if found is None:
         # A default that samples do not determine is estimated from residuals.
-        return Level(noise if noise.source == _DEFAULT else held)
+        return Level(noise if noise.source == "default" else held)
     ratio, spread = found[0] / noise.stated, max(found[1], _TRUSTED)
     level = weighed(Level(held, 1.0, ratio, ratio * spread))
     if noise.families and level.scale < _MUCH_SMALLER:
@@ -187,7 +183,7 @@ def walking(config: Config) -> Level:
     A default is that of no particular sensor, and a better one's residuals say how far below it is.
     """
     noise = stated("gyro_bias_walk", config)
-    if noise.source != _DEFAULT or noise.known == 0.0:
+    if noise.source != "default" or noise.known == 0.0:
         return Level(noise)
     return Level(replace(noise, families=("bias walk", "definition")), least=_SMALLEST_WALK)
 

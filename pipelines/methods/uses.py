@@ -37,12 +37,13 @@ def along(matrices: Array, vectors: Array) -> Array:
     return np.asarray(vectors @ np.swapaxes(matrices, -1, -2))
 
 
-def gyro_reading(true: Truth, rate: Array, force: Array, prefix: str = "gyro") -> Array:
+def gyro_reading(true: Truth, rate: Array, force: Array) -> Array:
     """Gyro reading (I + S) w + G f + bias, (..., U, 3); missing parameters are 0."""
-    S = true.matrix([[f"{prefix}_{'scale' if i == j else 'skew'}_{_sorted(i, j)}" for j in "xyz"] for i in "xyz"])
+    S = true.matrix(
+        [[f"gyro_scale_{i}" if i == j else f"gyro_skew_{min(i, j)}{max(i, j)}" for j in "xyz"] for i in "xyz"]
+    )
     sensitivity = true.matrix([[f"gyro_g_{i}{j}" for j in "xyz"] for i in "xyz"])
-    bias = true.xyz(f"{prefix}_bias")
-    return rate + along(S, rate) + along(sensitivity, force) + bias[..., None, :]
+    return rate + along(S, rate) + along(sensitivity, force) + true.xyz("gyro_bias")[..., None, :]
 
 
 def triad_uses(true: Truth, sensors: Sensors) -> list[Use]:
@@ -50,10 +51,6 @@ def triad_uses(true: Truth, sensors: Sensors) -> list[Use]:
     found = [_heading(true, sensors)] if "mag_k11" in true else []
     found += [_rate(sensors)] if "gyro_k11" in true or "gyro_bias_x" in true else []
     return found + ([_force(sensors)] if "accel_k11" in true else [])
-
-
-def _sorted(i: str, j: str) -> str:
-    return i if i == j else "".join(sorted(i + j))
 
 
 def _heading(true: Truth, sensors: Sensors) -> Use:

@@ -21,6 +21,8 @@ Picture = NDArray[np.uint8]
 
 # A pixel is integrated over n by n parts of its area: (n, contrast of the texture in it, grey levels, up to which).
 _PARTS = ((1, 20.0), (2, 80.0), (4, np.inf))
+# Grey levels of a printed tag in daylight.
+_BLACK, _WHITE = 20.0, 220.0
 # About so many at a time, which stay in the cache with all that is made of them on the way.
 _PIXELS = 8192
 
@@ -55,11 +57,9 @@ class Quad:
     position: Array
 
 
-def tag_quad(
-    tag_id: int, size: float, cRt: ArrayLike, position: ArrayLike, black: float = 20.0, white: float = 220.0
-) -> Quad:
+def tag_quad(tag_id: int, size: float, cRt: ArrayLike, position: ArrayLike) -> Quad:
     """A tag 36h11 whose black square has the edge `size` (m); its white margin is one eighth of that wide."""
-    texture = np.where(tag_bits(tag_id), white, black)
+    texture = np.where(tag_bits(tag_id), _WHITE, _BLACK)
     return Quad(texture, (1.25 * size, 1.25 * size), np.asarray(cRt, dtype=float), np.asarray(position, dtype=float))
 
 

@@ -91,10 +91,6 @@ def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
     return plots
 
 
-def _angles(values: dict[str, float]) -> Array:
-    return np.array([values.get(name, 0.0) for name in THETA])
-
-
 def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | None:
     """Direction of each position's half difference across its axis, before and after turning it by theta."""
     try:
@@ -105,7 +101,7 @@ def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | Non
     rows: list[list[float]] = []
     for name, theta, color in (
         ("as measured", np.zeros(3), COLORS[6]),
-        ("compensated", _angles(values), COLORS[0]),
+        ("compensated", several(values, THETA), COLORS[0]),
     ):
         labels, across = [], []
         for half in found:
@@ -144,8 +140,8 @@ def _contributions(turning: list[Group], values: dict[str, float]) -> Plot:
     for group in turning:
         n = len(group.gyro)
         factor = IndexerAverageFactor.of(group.gyro, group.rates, 1.0, 0.0)
-        bias = [values.get(name, 0.0) for name in BIAS]
-        by_theta = factor(*(np.tile(block, (n, 1)) for block in (_angles(values), bias)))[1]()[0].reshape(-1, 3)
+        blocks = (np.tile(several(values, names), (n, 1)) for names in (THETA, BIAS))
+        by_theta = factor(*blocks)[1]()[0].reshape(-1, 3)
         position = f"{group.run.axis}, other at {round(np.rad2deg(group.run.other)) % 360} deg"
         information[position] = information.get(position, np.zeros(3)) + (by_theta**2).sum(axis=0)
     total = np.sum(list(information.values()), axis=0)
