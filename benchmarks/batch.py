@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.attitude import ahrs_factors
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Array, Problem
@@ -24,6 +23,7 @@ from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import minimum, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.levenberg import Solution
+from benchmarks.ahrs import ahrs_factors
 from benchmarks.measure import Ratio, costs, growth
 
 IDEAL = Config.model_validate({"sensors": "ideal"}).sensors

@@ -8,12 +8,12 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.attitude import ahrs_factors
 from alidade.factors.gyro import GyroIncrementFactor
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.problem import ChainLayout, Factor
 from alidade.pipelines.solvers.layout import Layout
 from alidade.pipelines.solvers.linearization import Linearization
+from benchmarks.ahrs import ahrs_factors
 from benchmarks.measure import Ratio, costs
 
 SAMPLES, WINDOWS = 300_000, 36_000

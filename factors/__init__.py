@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "attitude": ("VisionAttitudeFactor", "ahrs_factors"),
+    "attitude": ("VisionAttitudeFactor",),
     "gimbal": ("GimbalPath", "LocalMotion"),
     "gyro": ("GyroIncrementFactor",),
     "indexer": ("AxisPath", "IndexerAverageFactor"),

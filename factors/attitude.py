@@ -1,4 +1,4 @@
-"""Factors of the head method: rotation increments and attitudes seen by a camera.
+"""Factor of the head method: attitudes seen by a camera.
 
 Frames: v helmet IMU, b platform, c camera fixed to the platform, h marker frame fixed to the helmet, i the platform's
 frame at the session's start, held fixed ("inertial"). Source: methods page, section 3; the relative rates of
@@ -11,51 +11,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-import gtsam
 import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.gyro import PLATFORM, Derivatives, by_platform_errors, carried, needed, parted, platform_errors
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
-from alidade.factors.preintegration import GyroPath, Increments
+from alidade.factors.preintegration import GyroPath
 
 # Numbers of the pictures' errors, columns of their block in this order: time offset, clock skew, angle scale, filter.
 PICTURE = 4
 # rad, beyond which a scale of angles fades out.
 FADE = np.deg2rad(150.0)
-
-
-def ahrs_factors(
-    keys_i: list[int], keys_j: list[int], bias_keys: list[int], increments: Increments, bias_hat: Array, variance: Array
-) -> list[gtsam.AHRSFactor]:
-    """Native factors iRv_j = iRv_i dV(bias) for n windows.
-
-    With iRv = iRb bRv and the platform's rotation iRb integrated from its own gyro these are the relative-attitude
-    factors, exactly: the platform's gyro noise only adds to the variance, which is isotropic and so the same in
-    every frame.
-
-    Args:
-        keys_i, keys_j, bias_keys: n keys each, of Rot3, Rot3 and a 3-vector.
-        increments: the helmet gyro over the windows, integrated with bias_hat taken off.
-        bias_hat: (3,), rad/s.
-        variance: (n,), rad^2 per axis, of each increment.
-    """
-    factors = []
-    covariance = variance[:, None, None] * np.eye(3)
-    for n, (i, j, b) in enumerate(zip(keys_i, keys_j, bias_keys, strict=True)):
-        duration = float(increments.duration[n])
-        params = gtsam.PreintegratedRotationParams()
-        params.setGyroscopeCovariance(covariance[n] / duration)
-        measured = gtsam.PreintegratedAhrsMeasurements(
-            params,
-            bias_hat,
-            duration,
-            so3.to_gtsam(increments.wxyz[n]),
-            increments.bias_jacobian[n],
-            covariance[n],
-        )
-        factors.append(gtsam.AHRSFactor(i, j, b, measured))
-    return factors
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ def test_the_native_graph_has_the_gyro_between_its_keyframes_and_converges() -> 
 
 def test_static_minimum_is_that_of_the_normal_equations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(static, "ROWS", 3_000)
-    for model, start in (static.los_rates(), static.accelerometer()):
+    for model, start in (static.linear_rates(), static.accelerometer()):
         np.testing.assert_allclose(static.ours(model, start), static.normal_equations(model, start), rtol=1e-6)
 
 

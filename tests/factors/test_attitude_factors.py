@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
-from alidade.factors.attitude import VisionAttitudeFactor, ahrs_factors
+from alidade.factors.attitude import VisionAttitudeFactor
 from alidade.factors.gyro import GyroIncrementFactor, symmetric
 from alidade.factors.model import Array
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
+from benchmarks.ahrs import ahrs_factors
 from tests.support.numerics import assert_rows_are_independent
 
 RNG = np.random.default_rng(1)

@@ -13,12 +13,12 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.attitude import ahrs_factors
 from alidade.factors.model import ROT3, Array, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
 from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
 from alidade.pipelines.solvers.batch import solve_batch
+from benchmarks.ahrs import ahrs_factors
 
 BIAS, MOUNT = gtsam.symbol("b", 0), gtsam.symbol("C", 0)
 LAST = 11_980  # the record's last samples jump

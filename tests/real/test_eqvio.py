@@ -10,7 +10,7 @@ from alidade.factors.model import Array
 from alidade.factors.testing import assert_jacobians
 from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.solvers.batch import solve_batch
-from datasets import eqvio
+from tests.support import eqvio
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,6 @@
 strapped to a gyro is the los method with a gimbal that stands still, but its targets are near: a moving camera sees
 them turn. So the graph holds where the camera was and how far each feature is, by its inverse depth.
 
-    python -m datasets.eqvio
-
 Frames: v gyro (IMU), c camera (x right, y down, z ahead), w does not turn. The mount is vRc.
 """
 
@@ -22,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.attitude import ahrs_factors
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import ROT3, Array, Model, Residuals
@@ -37,6 +34,7 @@ from alidade.pipelines.estimation.problem import (
     rotation_vector_coordinates,
 )
 from alidade.pipelines.solvers.batch import solve_batch
+from benchmarks.ahrs import ahrs_factors
 
 Index = NDArray[np.intp]
 
@@ -79,9 +77,9 @@ class Recording:
     seen: Array
     published: Array
 
-    def thinned(self, stride: int, start: float = 0.0, stop: float = np.inf) -> Recording:
-        """Every so many frames of those within [start, stop), s."""
-        keep = (self.time >= start) & (self.time < stop) & (np.arange(len(self.time)) % stride == 0)
+    def thinned(self, stride: int, start: float = 0.0) -> Recording:
+        """Every so many frames of those from `start`, s, on."""
+        keep = (self.time >= start) & (np.arange(len(self.time)) % stride == 0)
         rows = keep[self.frame]
         frame = (np.cumsum(keep) - 1)[self.frame[rows]]
         return Recording(
@@ -343,23 +341,3 @@ def solve(recording: Recording) -> tuple[Array, Estimate]:
     """The first guess of vRc and the estimate."""
     start, bias = hand_eye(recording)
     return start, solve_batch(problem(recording.thinned(GRAPH_STRIDE), start, bias))
-
-
-def main() -> None:
-    """Prints mounts and their errors against the published one."""
-    recording = read()
-    start, estimate = solve(recording)
-    off = np.rad2deg(error(start, recording.published))
-    print(f"two views: {np.linalg.norm(off):.3f} deg off the published mount")
-    off = np.rad2deg(error(so3.exp(estimate.values[3:6]), recording.published))
-    print(f"graph: {np.linalg.norm(off):.3f} deg off, about x, y, z of the camera {np.round(off, 3)}")
-    print(f"sigmas {np.round(np.rad2deg(estimate.sigmas[3:6]), 3)} deg; {estimate.message}")
-    print(f"time offset {1e3 * estimate.values[6]:.2f} ({1e3 * estimate.sigmas[6]:.2f}) ms")
-    assert estimate.chi_square is not None
-    for family, (square, dof) in estimate.chi_square.families.items():
-        print(f"{family}: sum of squares {square:.0f}, degrees of freedom {dof:.0f}")
-    print(f"features set aside: {estimate.rejected['features']}")
-
-
-if __name__ == "__main__":
-    main()
