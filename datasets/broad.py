@@ -16,16 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array, Mask
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import carried, helmet_gyro
-
-Array = NDArray[np.float64]
 
 EPOCH_NS = 1_600_000_000_000_000_000  # the trials carry no date
 VISION_RATE_HZ = 25.0
@@ -59,7 +57,7 @@ class Trial:
     gyro: Array
     force: Array
     attitude: Array
-    moving: NDArray[np.bool_]
+    moving: Mask
 
 
 def read_trial(path: Path) -> Trial:

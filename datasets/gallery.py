@@ -19,11 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from datasets import imu_tk_xsens, imucal
 
-Array = NDArray[np.float64]
 GRAVITY = 9.81  # m/s^2
 Values = Mapping[str, float]
 

@@ -15,14 +15,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.recording import CubeData
-
-Array = NDArray[np.float64]
 
 EPOCH_NS = 1_400_000_000_000_000_000  # the recording carries no date
 

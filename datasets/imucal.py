@@ -18,13 +18,11 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.indexer.recording import IndexerData
-
-Array = NDArray[np.float64]
 
 EPOCH_NS = 1_600_000_000_000_000_000  # the session carries no date
 RATE_HZ = 204.8

@@ -14,16 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array, Mask
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.layout import Layout, Shots, estimate_layout
 from alidade.pipelines.vision.pose import TagBody, estimate_pose
 from alidade.pipelines.vision.tags import Detections
-
-Array = NDArray[np.float64]
 
 _CORNER_PX = 0.2
 
@@ -110,7 +108,7 @@ def _reprojection(block: Block, body: TagBody) -> list[float]:
     return [pose.rms_px for pose in poses if pose is not None and len(pose.ids) > 1]
 
 
-def _apart(found: TagBody, published: TagBody, keep: NDArray[np.bool_]) -> tuple[float, float]:
+def _apart(found: TagBody, published: TagBody, keep: Mask) -> tuple[float, float]:
     """Root mean square distance (m) and angle (rad) between the tags of two layouts laid over each other."""
     a, b = found.corners.reshape(-1, 3), published.corners[keep].reshape(-1, 3)
     turn = so3.align(b - b.mean(axis=0), a - a.mean(axis=0))

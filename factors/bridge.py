@@ -13,9 +13,9 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Mask
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import (
     POSE3,
@@ -128,7 +128,7 @@ class BoundModel:
         """What `factor.linearize` gives, in a third of the time: that has gtsam take Jacobians key by key."""
         return jacobian_factor(self.keys, [*self.widths, 1], self._augmented(values, self.loss))
 
-    def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
+    def used(self, values: gtsam.Values) -> Mask:
         """Which of the n measurements the loss lets count; all of them without one."""
         return self._counts(self.residuals(values), self.loss) > 0.5
 
@@ -150,7 +150,7 @@ class BoundModel:
         other._last = None
         return other
 
-    def only(self, kept: NDArray[np.bool_]) -> BoundModel:
+    def only(self, kept: Mask) -> BoundModel:
         """The model of some of its n measurements. Only for a model that names what is `stacked`."""
         rows = np.flatnonzero(kept)
         tied = [column if isinstance(column, int) else [column[i] for i in rows] for column in self.columns]

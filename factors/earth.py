@@ -10,9 +10,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from alidade.factors.array import Array
 
 # Of the earth against inertial space, rad/s.
 EARTH_RATE = 7.292115e-5

@@ -7,8 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from alidade.factors.array import Index
 from alidade.factors.model import Array, Stacked
 
 # Motion around a picture is smoothed over one of these times to either side, s: the longest that follows it. The first
@@ -38,7 +39,7 @@ class GimbalPath:
         if len(self.t) < 4 or self.angles.shape != (len(self.t), 2):
             raise ValueError(f"needs stamps (G,) and angles (G, 2), G >= 4; got {self.t.shape} and {self.angles.shape}")
 
-    def weights(self, at: ArrayLike) -> tuple[NDArray[np.intp], Array]:
+    def weights(self, at: ArrayLike) -> tuple[Index, Array]:
         """The four samples (n, 4) around each time and their weights (n, 4), Lagrange's polynomials."""
         at = np.asarray(at, dtype=float)
         first = np.clip(np.searchsorted(self.t, at, side="right") - 2, 0, len(self.t) - 4)

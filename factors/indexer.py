@@ -20,9 +20,10 @@ from itertools import pairwise
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from alidade.factors import so3
+from alidade.factors.array import Index
 from alidade.factors.gyro import by_symmetric, needed, symmetric
 from alidade.factors.model import Array, Block, Model, Residuals
 
@@ -180,7 +181,7 @@ class AxisPath:
         total = np.diff(turned, axis=0) + np.array(swept)
         return np.asarray(total / np.diff(edges)[:, None, None, None])
 
-    def _interpolation(self, at: Array, i: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+    def _interpolation(self, at: Array, i: Index) -> tuple[Array, Index]:
         """Weights and indexes (n, 4) of the samples that make the angles at the times, in the intervals i.
 
         Cubic: the straight line between the two neighbours, corrected by the curvature that the next two show.
@@ -232,7 +233,7 @@ def gyro_edges(t: Array) -> Array:
     return np.concatenate([[2.0 * t[0] - middle[0]], middle, [2.0 * t[-1] - middle[-1]]])
 
 
-def gyro_means(edges: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
+def gyro_means(edges: Array, rate: Array, cuts: Index) -> Array:
     """Mean gyro rates (n, 3) over the samples from cut to cut (n + 1,), weighed with the intervals between edges."""
     edges = edges[cuts[0] : cuts[-1] + 1]
     moved = rate[cuts[0] : cuts[-1]] * np.diff(edges)[:, None]

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array as Array
+from alidade.factors.array import Index
 
 if TYPE_CHECKING:
     import gtsam
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
     from alidade.factors.bridge import BoundModel
     from alidade.factors.loss import TruncatedLoss
 
-Array = NDArray[np.float64]
 # Whitened residuals (n, m) and, on demand, their Jacobians by the blocks, (n, m, d) each.
 Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
 
@@ -246,7 +247,7 @@ def stack_models(parts: Sequence[Any]) -> Any:
     return replace(first, **{name: stack_models([getattr(part, name) for part in parts]) for name in first.stacked})
 
 
-def select_rows(whole: Any, rows: NDArray[np.intp]) -> Any:
+def select_rows(whole: Any, rows: Index) -> Any:
     """A model, array or list of some measurements."""
     if whole is None or isinstance(whole, np.ndarray):
         return whole if whole is None else whole[rows]

@@ -19,9 +19,10 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from alidade.factors import so3
+from alidade.factors.array import Index
 from alidade.factors.model import Array, Stacked
 
 # Neighbouring intervals that differ by more than this share are not taken as even.
@@ -128,7 +129,7 @@ class GyroPath:
             self._kept[number] = _Block(t[inner], rate, drivers, self._starts[number])
         return self._kept[number]
 
-    def _found(self, i: NDArray[np.intp], of: Callable[[_Block], Array], adds: bool = False) -> Array:
+    def _found(self, i: Index, of: Callable[[_Block], Array], adds: bool = False) -> Array:
         """Per-sample values (n, ...) from the blocks of samples (n,).
 
         Args:
@@ -234,7 +235,7 @@ class GyroPath:
         by = [to_end @ self._moments(i, s, begun, vector) for vector in vectors]
         return replace(turned, scale_jacobian=by[0], driver_jacobian=by[1] if len(by) == 2 else None)
 
-    def _moments(self, i: NDArray[np.intp], s: Array, begun: Array, vector: Callable[[_Block], Array]) -> Array:
+    def _moments(self, i: Index, s: Array, begun: Array, vector: Callable[[_Block], Array]) -> Array:
         """Integral over windows of the attitude matrix times each component of a vector, (n, 3, 3 d): [i, d a + b].
 
         Within a sample interval the attitude's integral is taken with the vector's mean, which leaves out a twelfth of
@@ -251,12 +252,12 @@ class GyroPath:
         start, stop = np.split(until.reshape(len(i), 3, -1), 2)
         return np.asarray(stop - start)
 
-    def _line(self, i: NDArray[np.intp], vector: Callable[[_Block], Array]) -> tuple[Array, Array]:
+    def _line(self, i: Index, vector: Callable[[_Block], Array]) -> tuple[Array, Array]:
         """A vector (n, d) of the blocks' at samples, and its slope until the next."""
         before = self._found(i, vector)
         return before, (self._found(i + 1, vector) - before) / (self.t[i + 1] - self.t[i])[:, None]
 
-    def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:
+    def _place(self, at: Array) -> tuple[Index, Array]:
         """The sample intervals that hold the times, (n,), and the time since their start, (n, 1), s."""
         i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
         return i, (at - self.t[i])[:, None]

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from alidade.factors.array import Array
+
 if TYPE_CHECKING:
     import gtsam
 
-Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 # Below this angle (rad) the closed forms lose more digits to cancellation than their series truncate.

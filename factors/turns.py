@@ -11,9 +11,9 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Index
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 from alidade.factors.preintegration import running_product, trapezoid_excess
 from alidade.factors.triad import parts
@@ -113,9 +113,9 @@ class Samples:
     """
 
     t: Array
-    first: NDArray[np.intp]
-    last: NDArray[np.intp]
-    turn: NDArray[np.intp]
+    first: Index
+    last: Index
+    turn: Index
     step: Array
 
     @classmethod

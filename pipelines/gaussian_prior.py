@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 
 # Of correlated numbers, the least variance of a combination that counts as known, in their own.
 _LEAST = 1e-14

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, load_config

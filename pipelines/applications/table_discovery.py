@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S

@@ -19,11 +19,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import interval
-
-Array = NDArray[np.float64]
 
 NOISES = ("Q", "N", "B", "K")
 

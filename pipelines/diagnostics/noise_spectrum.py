@@ -18,14 +18,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array, Mask
 from alidade.factors.chi_square import interval, quantile
 from alidade.pipelines.diagnostics.allan import NOISES, AllanCurve, allan_curve, confidence
 from alidade.pipelines.diagnostics.spectral_lines import Line, find_lines, without_lines
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # Power of sqrt(u) and of tau0 in the variance, in the order Q, N, B, K.
 _POWER_U, _POWER_TAU = np.array([2.0, 0.0, -1.0, -2.0]), np.array([-2.0, -1.0, 0.0, 1.0])

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Index
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Array, CommonFactor, History, Quantity
@@ -239,7 +239,7 @@ def _direction(severity: Severity, weights: Mapping[str, float], ratio: float, a
     return Finding("direction", severity, {"weights": weights, "sigma_ratio": ratio, "advice": advice})
 
 
-def _degenerate(ratios: Array) -> list[NDArray[np.intp]]:
+def _degenerate(ratios: Array) -> list[Index]:
     """Indices of falling ratios in runs of nearly equal ones of one verdict each: their eigenvectors are arbitrary."""
     falls = ratios[1:] < _DEGENERATE * ratios[:-1]
     changes = (ratios[1:] >= _UNCHANGED) != (ratios[:-1] >= _UNCHANGED)

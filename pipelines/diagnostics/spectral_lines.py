@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array, Index
 from alidade.factors.chi_square import quantile
-
-Array = NDArray[np.float64]
 
 # A record is cut into so many windows of at most and at least so many samples.
 _WINDOWS, _LONGEST, _SHORTEST = 8, 1 << 16, 128
@@ -137,7 +135,7 @@ def _floor(power: Array) -> Array:
     return out
 
 
-def _merged(edges: NDArray[np.intp]) -> NDArray[np.intp]:
+def _merged(edges: Index) -> Index:
     """Ranges [start, stop) with those joined that a window's spread parts."""
     if not len(edges):
         return edges

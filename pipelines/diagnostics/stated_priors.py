@@ -14,8 +14,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Mask
 from alidade.pipelines.diagnostics.diagnose import LIMITS
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Array, Quantity, SqrtInformation
@@ -94,7 +94,7 @@ def contradictions(
     return tuple(found)
 
 
-def _each_freed(sqrt_info: SqrtInformation, inside: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+def _each_freed(sqrt_info: SqrtInformation, inside: Mask) -> tuple[Array, Array, Array, Array]:
     """Solution with each of f fixed numbers freed, scaled: H_AA^-1 H_AF (a, f), x (f,), I (f,), correlations (f, f)."""
     R, a = sqrt_info.R * sqrt_info.scales, int(inside.sum())
     rows = np.column_stack([R[:, inside], R[:, ~inside], sqrt_info.d])

@@ -16,10 +16,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from alidade.factors.array import Array, Index, Mask
 
 # A block, s, has at least so many samples.
 _BLOCK, _LEAST = 0.5, 32
@@ -81,7 +79,7 @@ def _quiet(blocks: Array) -> Mask:
     return np.asarray((scatter <= _LOUDER * floor) & still & (ratio >= _SMOOTH))
 
 
-def _not_turning(gyro: Array, spans: NDArray[np.intp]) -> Mask:
+def _not_turning(gyro: Array, spans: Index) -> Mask:
     """Mask of spans with the mean rate of a rest."""
     means = np.array([gyro[start : stop + 1].mean(axis=0) for start, stop in spans])
     rate = np.linalg.norm(means, axis=1)

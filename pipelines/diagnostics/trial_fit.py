@@ -12,8 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Mask
 from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.errors import InputError
@@ -216,7 +216,7 @@ def _normalised(residuals: Array, predicted: Array) -> Array:
     return np.asarray(z[variances < _UNPREDICTED**2])
 
 
-def _without(group: Group, out: NDArray[np.bool_]) -> Group:
+def _without(group: Group, out: Mask) -> Group:
     """A group without the measurements that are held out; processes and priors stay."""
     if not group.is_measurement:
         return group

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Mask
 from alidade.pipelines.estimation.problem import Array
 
 # Chance that outliers which are independent of each other make an interval in one family of a recording.
@@ -17,7 +17,7 @@ _WITHIN, _OUTSIDE = 0.5, (0.01, 0.4)
 _SMOOTH = 0.5
 
 
-def intervals(rejected: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def intervals(rejected: Mask) -> list[tuple[int, int]]:
     """Disturbed intervals of measurements (n,) in time order: index of the first of each, and one past the last.
 
     An interval maximises the sum of log likelihood ratios of its measurements, outliers with a share of `_WITHIN`
@@ -40,7 +40,7 @@ def intervals(rejected: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def onsets(time: Array, norms: Array, rejected: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def onsets(time: Array, norms: Array, rejected: Mask) -> Mask:
     """Which measurements (n,) lie within half an interval's duration of its smooth ends, or in it.
 
     Outliers are rejected where a disturbance exceeds the gate. That of a dipole falls with the cube of the distance: at

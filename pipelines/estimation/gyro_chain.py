@@ -9,9 +9,9 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Index, Mask
 from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, platform_errors
 from alidade.factors.preintegration import GyroPath, Increments
 from alidade.pipelines.estimation.problem import Array, ChainLayout, Factor, Parameter, Step
@@ -27,7 +27,7 @@ def state(keyframe: int) -> int:
     return int(gtsam.symbol("x", keyframe))
 
 
-def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float) -> tuple[Array, NDArray[np.intp]]:
+def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float) -> tuple[Array, Index]:
     """Times (K,) of keyframes and, (K + 1,), where the measurements of each begin; some, in gaps, have none.
 
     Measurements share one as long as they are within the same `shared` s, counted from `origin`; it is the one in their
@@ -46,7 +46,7 @@ def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float
     return time[order], np.append(0, np.cumsum(count[order]))
 
 
-def as_slice(of: NDArray[np.intp]) -> NDArray[np.intp] | slice:
+def as_slice(of: Index) -> Index | slice:
     """Indexes; consecutive ones as a slice, so that what they take of an array is no copy."""
     return slice(int(of[0]), int(of[-1]) + 1) if len(of) and (np.diff(of) == 1).all() else of
 
@@ -91,13 +91,13 @@ class GyroChain:
     """
 
     time: Array
-    starts: NDArray[np.bool_]
+    starts: Mask
     initial: Array
     gyro: GyroPath
     turns: Increments
     variance: Array
     bias: WalkingBias
-    nodes: NDArray[np.intp]
+    nodes: Index
     errors: Parameter | None = None
     platform: GyroPath | None = None
     platform_turns: Increments | None = None
@@ -109,7 +109,7 @@ class GyroChain:
     def over(
         cls,
         time: Array,
-        starts: NDArray[np.bool_],
+        starts: Mask,
         initial: Array,
         gyro: GyroPath,
         *,
@@ -173,7 +173,7 @@ class GyroChain:
         """The numbers of keyframes in the recording."""
         return range(self.first + keyframes.start, self.first + keyframes.stop)
 
-    def bias_keys(self, keyframes: Sequence[int] | NDArray[np.intp]) -> list[int]:
+    def bias_keys(self, keyframes: Sequence[int] | Index) -> list[int]:
         """Variables of the bias in force up to keyframes."""
         nodes = self.nodes[keyframes].tolist()
         keys = {n: self.bias.key(n) for n in set(nodes)}
@@ -215,7 +215,7 @@ class GyroChain:
         last = keyframes.stop == len(self.time)
         return range(first, now + 1), range(max(first - 1, 1), now + 1 if last else now)
 
-    def _increments(self, after: NDArray[np.intp]) -> list[Factor]:
+    def _increments(self, after: Index) -> list[Factor]:
         """Factors that lead to keyframes."""
         states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
         bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
@@ -269,7 +269,7 @@ class GyroChain:
         )
         return own, platform
 
-    def attitudes(self, keyframes: NDArray[np.intp], stamps: Array, at: Array, values: gtsam.Values) -> Array:
+    def attitudes(self, keyframes: Index, stamps: Array, at: Array, values: gtsam.Values) -> Array:
         """Attitudes (n, 4) at times near keyframes, where the values hold those of the keyframes.
 
         Args:

@@ -13,8 +13,8 @@ from itertools import takewhile
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Index, Mask
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.priors import pinned
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
@@ -46,7 +46,7 @@ def with_priors(problem: Problem, gaussian_priors: Sequence[GaussianPrior]) -> P
     return problem
 
 
-def about(factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values) -> NDArray[np.bool_]:
+def about(factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values) -> Mask:
     """Mask (m, n): row of a linearised prior is about a reported number of the parameters."""
     A, _ = factor.jacobian()
     inverses = {p.key: np.linalg.pinv(p.coordinates(values, p.key)[1]) for p in parameters if p.key in factor.keys()}
@@ -66,7 +66,7 @@ def about(factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values:
 
 def about_alone(
     factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values, names: Collection[str]
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Mask (m,) of rows of a linearised prior about the named numbers and no others, except fixed ones."""
     quantities = [q for p in parameters for q in p.quantities]
     among = np.array([q.name in names for q in quantities])
@@ -289,7 +289,7 @@ def conditional_root(covariance: Array, sigmas: Array) -> Array:
     return np.asarray(R[::-1, ::-1] / sigmas)
 
 
-def _rows_of(factor: gtsam.NonlinearFactor, rows: NDArray[np.intp], at: gtsam.Values) -> gtsam.CustomFactor:
+def _rows_of(factor: gtsam.NonlinearFactor, rows: Index, at: gtsam.Values) -> gtsam.CustomFactor:
     """A factor with selected rows of another; its variables are among the values."""
     keys, dims = factor.keys(), at.dims()
     ends = np.cumsum([dims[key] for key in keys])[:-1]

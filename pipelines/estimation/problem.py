@@ -13,9 +13,10 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array as Array
+from alidade.factors.array import Mask
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.advice import Motion
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
     from alidade.pipelines.estimation.camera_clock import Keyframes
 
-Array = NDArray[np.float64]
 
 # What eliminates the linear systems of the batch solver, see solvers.engines.
 EngineName = Literal["auto", "chain", "gtsam"]
@@ -421,7 +421,7 @@ class Residuals:
 
     time: Array
     whitened: Array
-    used: NDArray[np.bool_]
+    used: Mask
 
 
 @dataclass(frozen=True)
@@ -460,7 +460,7 @@ class PosteriorHistory:
     time: Array
     values: Array
     covariance: Array
-    steady: NDArray[np.bool_]
+    steady: Mask
 
     @property
     def history(self) -> History:

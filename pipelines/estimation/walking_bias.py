@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Index
 from alidade.pipelines.estimation.priors import linear_factor
 from alidade.pipelines.estimation.problem import Array, Factor, Step
 
@@ -82,7 +82,7 @@ class WalkingBias:
         """Number of bias nodes."""
         return len(self.edges) - 1
 
-    def node_at(self, time: Array) -> NDArray[np.intp]:
+    def node_at(self, time: Array) -> Index:
         """Index of the node in force at the times."""
         return np.clip(np.searchsorted(self.edges, time, side="right") - 1, 0, self.nodes - 1)
 

@@ -7,15 +7,13 @@ from dataclasses import replace
 from math import comb
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise, Source
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.noises import NOISES, NoiseSpec
 from alidade.pipelines.settings import Config
-
-Array = NDArray[np.float64]
 
 # Order of the differences that separate a sensor's white noise from its motion: motion is smooth, noise is not.
 _ORDER = 6

@@ -5,8 +5,8 @@ from __future__ import annotations
 import datetime
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.earth import magnetic_field
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.advice import Motion
@@ -15,8 +15,6 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import Topic, wanted
 from alidade.pipelines.settings import Config, first_given
-
-Array = NDArray[np.float64]
 
 # The earth's field, each component about its model: outdoors. A parked car adds 1e-6 to 5e-6, a building 5e-6.
 FIELD = ParameterSpec(

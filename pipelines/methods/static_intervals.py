@@ -13,11 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array, Index, Mask
 from alidade.pipelines.errors import InputError
-
-Array = NDArray[np.float64]
 
 # The test looks at this much time about each sample, s.
 _SPAN = 0.25
@@ -107,7 +105,7 @@ def find_static_intervals(t: Array, accel: Stream, gyro: Stream | None = None, *
     return np.asarray(t[runs[still]])
 
 
-def _quiet_runs(t: Array, streams: Sequence[Stream]) -> tuple[NDArray[np.intp], Array, Array]:
+def _quiet_runs(t: Array, streams: Sequence[Stream]) -> tuple[Index, Array, Array]:
     """First and last sample of each quiet run (P, 2), and for each stream its scatter (N,) and the floor of that.
 
     Raises InputError when the record is shorter than what is looked at.
@@ -207,7 +205,7 @@ def _scatter(values: Array, half: int) -> Array:
     return out
 
 
-def _turns_not(means: Array, forces: Array, lengths: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
+def _turns_not(means: Array, forces: Array, lengths: Index, sigma: float) -> Mask:
     """Which runs, of so many samples, have the mean rate (n, 3) that gyro bias and g-sensitivity give in most of them.
 
     Bias b and g-sensitivity G of means = b + G forces by least squares with Cauchy's weights, from the median on: a

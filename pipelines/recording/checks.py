@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 
 # A gyro that saturates above this is rare; 2000 deg/s read as rad/s is far beyond.

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.container import Channel, MessageBlock, Schema, byte_windows
 from alidade.pipelines.recording.messages import Definition, Language, Layout, Leaf, MessageError, Wire, at

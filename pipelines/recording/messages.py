@@ -17,7 +17,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 
 # How ROS 2 and ROS 1 lay a message out: ROS 1 without encapsulation and without alignment.
 Wire = Literal["cdr", "ros1"]

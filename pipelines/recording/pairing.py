@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 
 Stamps = NDArray[np.int64]
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.recording.checks import count
 
 SI = {"accel": "m/s^2", "gyro": "rad/s", "mag": "T"}

@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.recording import messages
 
 Stamps = NDArray[np.int64]

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar, final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import checks, plausibility
 from alidade.pipelines.recording.checks import LEAST_ACCEL, LEAST_GYRO, LEAST_MAG, SLOWEST_GYRO_S, SLOWEST_S

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer

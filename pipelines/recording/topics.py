@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_serializer, model_validator
 
 from alidade.factors import so3
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.recording import messages, series
 
 if TYPE_CHECKING:

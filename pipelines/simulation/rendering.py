@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from alidade.factors import so3
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array, Mask
 from alidade.pipelines.vision.camera import Camera
 
 Picture = NDArray[np.uint8]
@@ -28,7 +28,7 @@ _PIXELS = 8192
 
 
 @cache
-def tag_bits(tag_id: int) -> NDArray[np.bool_]:
+def tag_bits(tag_id: int) -> Mask:
     """The official AprilTag 36h11 picture, 10x10 cells, upright, True where white.
 
     One cell of white margin, one of black border, 6x6 bits. OpenCV's table holds the pictures turned by 180 degrees.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from alidade.factors import so3
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.parameters import ParameterSpec, quantities
 from alidade.pipelines.files import dump_yaml

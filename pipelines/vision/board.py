@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.topics import CAMERA_INFO
 

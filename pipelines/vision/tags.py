@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.parallel import allowed
 from alidade.pipelines.vision.camera import Camera

@@ -17,9 +17,9 @@ from typing import ClassVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Index
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import ROT3, Array, Model, Residuals
@@ -35,8 +35,6 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.solvers.batch import solve_batch
 from benchmarks.ahrs import ahrs_factors
-
-Index = NDArray[np.intp]
 
 # rad/s/sqrt(Hz). At rest it is 1.7e-4; in flight rotors shake the gyro (third differences of its samples: 1e-3 about x,
 # 5e-3 about y, 2e-3 about z), and with this chi-square fits.

@@ -15,7 +15,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component, Spread, Trend

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines import methods
 from alidade.pipelines.applications.fleet import require_extra, statistics
 from alidade.pipelines.applications.fleet.engine import Killed, source_version, work_off

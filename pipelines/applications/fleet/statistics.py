@@ -14,8 +14,8 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile, student
-from alidade.factors.so3 import Array
 from alidade.pipelines.diagnostics.device_changes import maximum_likelihood_sigma
 
 # Chance that anything at all is flagged among good units, over all tests of a page.

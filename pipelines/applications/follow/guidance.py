@@ -62,7 +62,9 @@ class View:
     @property
     def verdicts(self) -> dict[str, Verdict]:
         """Parameter -> verdict, of those with a required accuracy; none while there is too little."""
-        return {} if self.covariance is None else verdicts(self.quantities, self.covariance, self.findings, self.values)
+        if self.covariance is None or self.values is None:
+            return {}
+        return verdicts(self.quantities, self.covariance, self.findings, self.values)
 
     @property
     def status(self) -> str:

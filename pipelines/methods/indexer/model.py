@@ -17,9 +17,9 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Index
 from alidade.factors.earth import EARTH_RATE
 from alidade.factors.indexer import (
     ENCODER_ERRORS,
@@ -90,8 +90,8 @@ class _Model:
     parameters: tuple[Parameter, ...]
     theta_guess: Array
     bias_guess: Array
-    frames: NDArray[np.intp]  # (F,) indexes of the gyro samples whose attitude the trajectory holds
-    frame_edges: NDArray[np.intp]  # (groups + 1,) which of them come with a group
+    frames: Index  # (F,) indexes of the gyro samples whose attitude the trajectory holds
+    frame_edges: Index  # (groups + 1,) which of them come with a group
 
     @property
     def options(self) -> tuple[Option, ...]:
@@ -387,7 +387,7 @@ def guess(groups: tuple[Group, ...]) -> tuple[Array, Array]:
 _ATTITUDE_RATE = 10.0
 
 
-def frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:
+def frames(data: IndexerData, motion: AxisMotion) -> Index:
     """Gyro samples for the trajectory; none when the INS puts out no attitude."""
     if data.attitude is None:
         return np.empty(0, dtype=np.intp)
@@ -395,9 +395,7 @@ def frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:
     return np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))[::stride]
 
 
-def carrier(
-    data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], theta: Array, epsilon: float, encoder: Array
-) -> Array:
+def carrier(data: IndexerData, motion: AxisMotion, rows: Index, theta: Array, epsilon: float, encoder: Array) -> Array:
     """nRb = nRm mRt tRb at gyro samples; the encoders' errors (5,) as alidade.factors.indexer has them."""
     assert data.attitude is not None
     at = data.gyro_t[rows] - encoder[4]

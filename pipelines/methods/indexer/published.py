@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.indexer.recording import IndexerData
@@ -25,7 +26,6 @@ from alidade.pipelines.methods.indexer.windows import AxisMotion, Run, axis_moti
 from alidade.pipelines.methods.triads import numeric_jacobian
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
-Array = NDArray[np.float64]
 NAMES = ("theta_x", "theta_y", "theta_z")
 
 # The other axis stands at 0 or at half a turn within this, rad.

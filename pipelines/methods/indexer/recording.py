@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import temperature
@@ -34,9 +33,6 @@ class IndexerConfig(MethodSection):
     key: ClassVar[str] = "indexer"
 
     base_attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)  # nRbase: w, x, y, z
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from collections.abc import Collection, Mapping, Sequence
 from itertools import cycle
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Index
 from alidade.factors.gyro import symmetric
 from alidade.factors.indexer import IndexerAverageFactor, mounting
 from alidade.pipelines.diagnostics.cross_validation import Validation
@@ -201,7 +201,7 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
     return found
 
 
-def _carrier(data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], values: Mapping[str, float]) -> Array:
+def _carrier(data: IndexerData, motion: AxisMotion, rows: Index, values: Mapping[str, float]) -> Array:
     """The carrier's attitude at gyro samples, by calibrated parameters."""
     epsilon = float(several(values, EPSILON)[0])
     return carrier(data, motion, rows, several(values, THETA), epsilon, several(values, ENCODER))

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate
 from alidade.pipelines.methods import Simulator
 from alidade.pipelines.methods.indexer.parameters import NUISANCE
@@ -32,8 +32,6 @@ from alidade.pipelines.simulation.sensors import (
     sample_times,
     true_values,
 )
-
-Array = NDArray[np.float64]
 
 ARCSEC = np.deg2rad(1.0 / 3600.0)
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.vision.layout.bundle import normal_equations, shared_rows
 from alidade.pipelines.vision.layout.robust import Fit
 from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights

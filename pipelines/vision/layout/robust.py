@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.vision.layout.bundle import Additional, adjusted
 from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights, linearized
 

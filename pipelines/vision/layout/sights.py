@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.so3 import Array
+from alidade.factors.array import Array
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.pose import SQUARE, TagBody
 from alidade.pipelines.vision.tags import Detections
