@@ -25,9 +25,6 @@ Complex = NDArray[np.complex128]
 _SMALL = 1e-2
 # So many rows fit into a processor's cache with all that is made of them on the way.
 _ROWS = 8192
-# Of so few rows, calls of numpy take longer than what they do: products with tables are the fewest.
-_FEW = 100
-_IDENTITY = np.eye(3)
 
 _Function = TypeVar("_Function", bound=Callable[..., Array])
 
@@ -51,17 +48,6 @@ def _in_cache(function: _Function) -> _Function:
         return whole
 
     return cast(_Function, some_at_a_time)
-
-
-def _few(*given: Array) -> bool:
-    """Whether arrays (..., d) have few rows."""
-    return all(array.size <= _FEW * array.shape[-1] for array in given)
-
-
-def _products(a: Array, b: Array) -> Array:
-    """Products of all numbers of a (..., d) and b (..., e), (..., d e)."""
-    products = a[..., :, None] * b[..., None, :]
-    return products.reshape(*products.shape[:-2], a.shape[-1] * b.shape[-1])
 
 
 def _complex(v: Array) -> Complex:
@@ -114,13 +100,8 @@ def inverse(q: ArrayLike) -> Array:
 @_in_cache
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """aRb, bRc -> aRc."""
-    p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
-    return _products(p, q) @ _PRODUCT if _few(p, q) else _product(p, q)
-
-
-def _product(p: Array, q: Array) -> Array:
-    """(a + b j) (c + d j)."""
-    (a, b), (c, d) = _pair(p), _pair(q)
+    # (a + b j) (c + d j).
+    (a, b), (c, d) = _pair(np.asarray(p, dtype=float)), _pair(np.asarray(q, dtype=float))
     first, second = a * c, a * d
     first -= _by_conjugate(b, d)
     second += _by_conjugate(b, c)
@@ -141,8 +122,6 @@ def compose(*rotations: ArrayLike) -> Array:
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Coordinates in a of the vectors v, shape (..., 3), given in b; q is aRb."""
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
-    if _few(q, v):
-        return np.asarray((matrix(q) @ v[..., None])[..., 0])
     # v is x i + c j. Of q v q* the part by j is a^2 c + b^2 c* - 2 i a b x, the other (|a|^2 - |b|^2) x + 2 Im(a b* c).
     (a, b), x, c = _pair(q), v[..., 0], _complex(v[..., 1:])[..., 0]
     across = np.multiply(a * a, c)
@@ -186,10 +165,6 @@ def exp(phi: ArrayLike) -> Array:
     # The least angle only avoids 0 / 0.
     half = np.maximum(0.5 * np.sqrt(_square(phi)), 1e-150)
     out = np.empty((*phi.shape[:-1], 4))
-    if _few(phi):
-        out[..., 0] = np.cos(half)
-        out[..., 1:] = phi * (0.5 * np.sin(half) / half)[..., None]
-        return out
     # One tangent takes less than a sine and a cosine.
     tangent = np.tan(0.5 * half)
     share = 1.0 / (1.0 + tangent * tangent)
@@ -215,8 +190,6 @@ def log(q: ArrayLike) -> Array:
 def matrix(q: ArrayLike) -> Array:
     """Quaternions -> rotation matrices, shape (..., 3, 3)."""
     q = np.asarray(q, dtype=float)
-    if _few(q):
-        return (_products(q, q) @ _MATRIX).reshape(*q.shape[:-1], 3, 3)
     # As `rotate` has it, of the axes.
     a, b = _pair(q)
     aa, bb, ab, mixed = a * a, b * b, a * b, _by_conjugate(a, b)
@@ -232,27 +205,20 @@ def matrix(q: ArrayLike) -> Array:
 def from_matrix(r: ArrayLike) -> Array:
     """Rotation matrices, shape (..., 3, 3) -> quaternions with w >= 0."""
     r = np.asarray(r, dtype=float)
-    ways = (r.reshape(*r.shape[:-2], 9) @ _WAYS + np.eye(4).ravel()).reshape(*r.shape[:-2], 4, 4)
-    # Each is scaled by one of the components; by the largest one it loses no digits.
-    best = np.argmax(np.diagonal(ways, axis1=-2, axis2=-1), axis=-1)
-    q = normalize(np.take_along_axis(ways, best[..., None, None], axis=-2)[..., 0, :])
-    return np.where(q[..., :1] < 0.0, -q, q)
-
-
-def _ways(r: Array) -> Array:
-    """Four ways (..., 4, 4), rows, to the quaternion of a matrix, less the identity: 4 q q' - I."""
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     wx, wy, wz = (r[..., 2, 1] - r[..., 1, 2]), (r[..., 0, 2] - r[..., 2, 0]), (r[..., 1, 0] - r[..., 0, 1])
     xy, xz, yz = (r[..., 0, 1] + r[..., 1, 0]), (r[..., 0, 2] + r[..., 2, 0]), (r[..., 1, 2] + r[..., 2, 1])
-    return np.stack(
-        [
-            np.stack([xx + yy + zz, wx, wy, wz], axis=-1),
-            np.stack([wx, xx - yy - zz, xy, xz], axis=-1),
-            np.stack([wy, xy, yy - xx - zz, yz], axis=-1),
-            np.stack([wz, xz, yz, zz - xx - yy], axis=-1),
-        ],
-        axis=-2,
-    )
+    # Four ways to the quaternion, rows of 4 q q'. Each is scaled by a component; by the largest it loses no digits.
+    rows = [
+        [1.0 + xx + yy + zz, wx, wy, wz],
+        [wx, 1.0 + xx - yy - zz, xy, xz],
+        [wy, xy, 1.0 + yy - xx - zz, yz],
+        [wz, xz, yz, 1.0 + zz - xx - yy],
+    ]
+    ways = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    best = np.argmax(np.diagonal(ways, axis1=-2, axis2=-1), axis=-1)
+    q = normalize(np.take_along_axis(ways, best[..., None, None], axis=-2)[..., 0, :])
+    return np.where(q[..., :1] < 0.0, -q, q)
 
 
 @_in_cache
@@ -291,9 +257,6 @@ def right_jacobian_inverse(phi: ArrayLike) -> Array:
 
 def _polynomial(phi: Array, a: Array, b: Array) -> Array:
     """I + a hat(phi) + b hat(phi)^2, (..., 3, 3), of phi (..., 3) and a, b (...)."""
-    if _few(phi):
-        terms = (a[..., None] * phi) @ _HAT + (b[..., None] * _products(phi, phi)) @ _SQUARE
-        return np.asarray(terms.reshape(*phi.shape, 3) + _IDENTITY)
     x, y, z = phi[..., 0], phi[..., 1], phi[..., 2]
     ax, ay, az, bx, by, bz = a * x, a * y, a * z, b * x, b * y, b * z
     xx, yy, zz, xy, yz, zx = bx * x, by * y, bz * z, bx * y, by * z, bz * x
@@ -348,21 +311,3 @@ def to_gtsam(q: ArrayLike) -> gtsam.Rot3:
 
     w, x, y, z = np.asarray(q, dtype=float).tolist()
     return gtsam.Rot3(w, x, y, z)
-
-
-def _tables() -> tuple[Array, Array, Array, Array]:
-    """What products of numbers add to a quaternion product, to the matrix of q, to hat(v), and to its square.
-
-    Of the first two each row is for a product of components, in the order w, x, y, z; of the last two for a number of
-    v, or a product of two. Matrices are by rows.
-    """
-    components, axes = np.eye(4), np.eye(3)
-    product = _product(components[:, None], components)
-    turned = np.einsum("avm,mbk->abkv", product, product * np.array([1.0, -1.0, -1.0, -1.0])[:, None])
-    square = np.einsum("aim,bmj->abij", hat(axes), hat(axes))
-    return product.reshape(16, 4), turned[..., 1:, 1:].reshape(16, 9), hat(axes).reshape(3, 9), square.reshape(9, 9)
-
-
-_PRODUCT, _MATRIX, _HAT, _SQUARE = _tables()
-# What the numbers of a rotation matrix, by rows, add to the ways to its quaternion.
-_WAYS = _ways(np.eye(9).reshape(9, 3, 3)).reshape(9, 16)
