@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.gyro import PLATFORM, Derivatives, by_platform_errors, carried, needed, parted, platform_errors
+from alidade.factors.gyro import Derivatives, by_platform_errors, carried, error_blocks, needed, parted, platform_errors
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 
@@ -73,11 +73,8 @@ class VisionAttitudeFactor(Model):
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitudes, bias, mounts, the pictures' errors and those of the gyros."""
-        return ROT3, 3, ROT3, ROT3, 1 if self.elapsed is None else PICTURE, *self._error_blocks
-
-    @property
-    def _error_blocks(self) -> tuple[int, ...]:
-        return (*([self.errors] if self.errors else []), *([PLATFORM] if self.platform_errors else []))
+        picture = 1 if self.elapsed is None else PICTURE
+        return ROT3, 3, ROT3, ROT3, picture, *error_blocks(self.errors, self.platform_errors)
 
     def __call__(self, bRv: Array, bias: Array, cRb: Array, vRh: Array, picture: Array, *of_gyros: Array) -> Residuals:
         """Residual sqrt_information * Log(predicted^T measured), (n, 3)."""

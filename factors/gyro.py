@@ -85,6 +85,11 @@ def errors_block(turns: Increments) -> int:
     return SCALE if turns.driver_jacobian is None else SCALE + turns.driver_jacobian.shape[2]
 
 
+def error_blocks(own: int, platform: bool) -> tuple[int, ...]:
+    """Sizes of the blocks of a gyro's errors, if it has `own`, and of those of a platform's gyro."""
+    return (*([own] if own else []), *([PLATFORM] if platform else []))
+
+
 def parted(blocks: Sequence[Array], own: bool) -> tuple[Array | None, Array | None]:
     """A gyro's errors, if it has its own, and those of a platform's gyro, None for a perfect one, from their blocks."""
     rest = list(blocks)
@@ -172,13 +177,8 @@ class GyroIncrementFactor(Model):
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitudes, bias and, where the increments have derivatives by them, errors and those of the platform."""
-        return ROT3, ROT3, 3, *self._error_blocks
-
-    @property
-    def _error_blocks(self) -> tuple[int, ...]:
-        own = errors_block(self.turns)
         platform = self.platform_turns is not None and self.platform_turns.scale_jacobian is not None
-        return (*([own] if own else []), *([PLATFORM] if platform else []))
+        return ROT3, ROT3, 3, *error_blocks(errors_block(self.turns), platform)
 
     def __call__(self, i: Array, j: Array, bias: Array, *of_gyros: Array) -> Residuals:
         """Residual (I + S) Log(predicted_j^T j) / sigma, (n, 3)."""

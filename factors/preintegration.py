@@ -387,17 +387,10 @@ def _rate(w0: Array, a: Array, s: Array, arc: Array) -> Array:
 
 
 def running_product(q: Array) -> Array:
-    """q0, q0 q1, q0 q1 q2, ...: in blocks, vectorised over the blocks, so that the loop is as long as one block.
-
-    Few are multiplied over twice the distance each time, which are far fewer calls.
-    """
+    """q0, q0 q1, q0 q1 q2, ...: in blocks, vectorised over the blocks, so that the loop is as long as one block."""
     n = len(q)
-    if n <= 500:
-        out, distance = q, 1
-        while distance < n:
-            out = np.concatenate([out[:distance], so3.multiply(out[:-distance], out[distance:])])
-            distance *= 2
-        return so3.normalize(out)
+    if n < 2:
+        return so3.normalize(q)
     length = int(np.sqrt(n))
     blocks = -(-n // length)
     grid = so3.identity((blocks, length))

@@ -184,7 +184,7 @@ def encoder_scatter(motion: AxisMotion) -> float:
 def cut_turns(motion: AxisMotion) -> int:
     """Number of gaps during which an axis turned."""
     return sum(
-        any(run.axis != "none" and (run.stop in (start,) or run.start in (stop,)) for run in motion.runs)
+        any(run.axis != "none" and (run.stop == start or run.start == stop) for run in motion.runs)
         for start, stop in motion.gaps
     )
 
