@@ -106,7 +106,7 @@ def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
     return found
 
 
-def stated(config: Config) -> dict[str, so3.Array]:
+def stated(config: Config) -> dict[str, Array]:
     """The camera's mount and the tags' rotations as the config gives them, by their names in the formulas."""
     cube = config.section(CubeConfig)
     tags = {f"rotation_{tag}": np.array(each.rotation) for tag, each in cube.tags.items()}
