@@ -10,42 +10,37 @@ from alidade.pipelines.estimation.problem import Quantity
 
 _G = 9.80665  # standard gravity, m/s^2
 
+_DEG = math.degrees(1.0)
+# SI unit of a quantity -> unit people read, empty for a plain number, and what to multiply SI by.
+_UNITS: dict[str, tuple[str, float]] = {
+    "rad": ("deg", _DEG),
+    "rad/s": ("deg/s", _DEG),
+    "s": ("ms", 1e3),
+    "T": ("nT", 1e9),
+    "": ("ppm", 1e6),
+    "rad/s/K": ("deg/s/K", _DEG),
+    "rad/s/(m/s^2)": ("deg/s/g", _DEG * _G),
+    "m/s^2": ("m/s²", 1.0),
+    "m/s^2/K": ("m/s²/K", 1.0),
+    "T/K": ("nT/K", 1e9),
+    "s^2/m": ("µg/g²", 1e6 * _G),
+    "s^4/m^2": ("µg/g³", 1e6 * _G**2),
+    "1": ("", 1.0),
+}
 # What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
 _FINE = 2e-4
+_FINE_UNITS = {**_UNITS, "rad": ("arcsec", _DEG * 3600.0), "rad/s": ("deg/h", _DEG * 3600.0)}
 
 
 def human_unit(quantity: Quantity) -> tuple[str, float]:
     """The unit to show a quantity in, empty for a plain number, and what to multiply its SI number by."""
-    fine = quantity.require < _FINE
-    match quantity.unit:
-        case "rad":
-            return ("arcsec", math.degrees(1.0) * 3600.0) if fine else ("deg", math.degrees(1.0))
-        case "rad/s":
-            return ("deg/h", math.degrees(1.0) * 3600.0) if fine else ("deg/s", math.degrees(1.0))
-        case "s":
-            return "ms", 1e3
-        case "T":
-            return "nT", 1e9
-        case "":
-            return "ppm", 1e6
-        case "rad/s/K":
-            return "deg/s/K", math.degrees(1.0)
-        case "rad/s/(m/s^2)":
-            return "deg/s/g", math.degrees(_G)
-        case "m/s^2":
-            return "m/s²", 1.0
-        case "m/s^2/K":
-            return "m/s²/K", 1.0
-        case "T/K":
-            return "nT/K", 1e9
-        case "s^2/m":
-            return "µg/g²", 1e6 * _G
-        case "s^4/m^2":
-            return "µg/g³", 1e6 * _G**2
-        case "1":
-            return "", 1.0
-        case other:
-            return other, 1.0
+    return shown_unit(quantity.unit, quantity.require)
+
+
+def shown_unit(unit: str, require: float | None) -> tuple[str, float]:
+    """The same of a number in an SI unit of which a standard deviation of `require` is wanted; None: none is."""
+    units = _FINE_UNITS if require is not None and require < _FINE else _UNITS
+    return units.get(unit, (unit, 1.0))
 
 
 _ARW = ("deg/√h", math.degrees(60.0))

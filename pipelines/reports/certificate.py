@@ -9,7 +9,6 @@ from __future__ import annotations
 import datetime
 import json
 import logging
-import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -21,9 +20,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from alidade.factors.chi_square import student
 from alidade.pipelines.display.table import Cell, Column, Table
-from alidade.pipelines.display.units import human_unit, minute, to_digits_of
+from alidade.pipelines.display.units import minute, shown_unit, to_digits_of
 from alidade.pipelines.errors import InputError, nearest
-from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.calibration import load_known
@@ -353,7 +351,7 @@ def _summary(result: Result, rows: Sequence[Row], missing: Sequence[str]) -> Sum
 def _readable(row: Row, result: Result) -> _Readable:
     """The unit people read a row in, and what formats its SI values with as many digits as U warrants."""
     require = next((p.require for p in result.parameters if p.name == row.name), None)
-    unit, factor = human_unit(Quantity(row.name, row.unit, None, 1.0, require or math.inf))
+    unit, factor = shown_unit(row.unit, require)
     return unit, lambda value: to_digits_of(factor * value, factor * row.expanded)
 
 

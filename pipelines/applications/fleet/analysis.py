@@ -21,8 +21,8 @@ from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component, Spread, Trend
 from alidade.pipelines.applications.fleet.store import RecordingResult, UnitResult
 from alidade.pipelines.applications.fleet.tables import Cell, Row
+from alidade.pipelines.applications.sharing import DAY_S
 
-DAY = 86400.0
 _COUNTED = {"calibrated", "weak"}
 _DETERMINED = {"observable", "weak"}
 
@@ -152,7 +152,7 @@ def _population(
     if spread:
         good = ~outlying
         scatter = np.hypot(spread.tau, sigmas)
-        drift = statistics.trend(dates[good] / DAY, values[good], scatter[good])
+        drift = statistics.trend(dates[good] / DAY_S, values[good], scatter[good])
     # Steps would count as repeatability: a unit that made one counts as it was before it.
     good = ~outlying & ~after
     groups = np.unique(units, return_inverse=True)[1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,7 @@ from alidade.pipelines.applications.fleet.analysis import Population, iso
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.store import UnitResult
 from alidade.pipelines.diagnostics.device_changes import Change
-from alidade.pipelines.display.units import human_unit, to_digits_of
-from alidade.pipelines.estimation.problem import Quantity
+from alidade.pipelines.display.units import shown_unit, to_digits_of
 from alidade.pipelines.reports.joint_report import what
 
 Kind = Literal["changed", "outlying", "failed", "inconsistent", "unobservable", "weak"]
@@ -71,11 +69,6 @@ def sentence(units: Sequence[Unit]) -> str:
     return f"{len(units)} {need} attention: {named}{f' and {more} more' if more > 0 else ''}"
 
 
-def readable(p: Population) -> tuple[str, float]:
-    """The unit people read a parameter in, and by what SI is multiplied."""
-    return human_unit(Quantity(p.name, p.unit, None, 1.0, p.require or math.inf))
-
-
 def _order(finding: Finding) -> tuple[int, float]:
     return _KINDS.index(finding.kind), -abs(finding.z or 0.0)
 
@@ -85,7 +78,8 @@ def _changed(history: History, fleet: Mapping[tuple[str, str], Population]) -> l
         return f"between {_day(history.dates[after])} and {_day(history.dates[after + 1])}"
 
     def step_text(step: Change) -> str:
-        unit, factor = readable(fleet[history.method, step.name])
+        p = fleet[history.method, step.name]
+        unit, factor = shown_unit(p.unit, p.require)
         size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
         return f"{what(step)} by {size} ± {sigma} {unit} ".rstrip() + f" {between(step.after)}"
 
@@ -107,7 +101,7 @@ def _farthest(p: Population) -> list[int]:
 
 def _outlying(p: Population, i: int) -> Finding:
     assert p.spread is not None  # without one nothing is outlying
-    unit, factor = readable(p)
+    unit, factor = shown_unit(p.unit, p.require)
     off, scale = factor * (p.values[i] - p.spread.centre), factor * float(np.hypot(p.spread.tau, p.sigmas[i]))
     text = f"{p.name} is {to_digits_of(off, scale)} {unit} ".rstrip()
     return Finding("outlying", f"{text} off the fleet's centre ({_day(p.dates[i])})", float(p.z[i]))

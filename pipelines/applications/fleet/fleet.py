@@ -100,11 +100,16 @@ class Outcome:
     interrupted: bool
 
     @property
+    def verdicts(self) -> str:
+        """How many recordings ended with each status."""
+        statuses = [result["status"] for result in self.results.values()]
+        return ", ".join(f"{statuses.count(status)} {status}" for status in sorted(set(statuses)))
+
+    @property
     def summary(self) -> list[str]:
         """In a few lines: how many, with what verdicts, and what was quarantined."""
-        statuses = [result["status"] for result in self.results.values()]
-        verdicts = ", ".join(f"{statuses.count(status)} {status}" for status in sorted(set(statuses)))
-        lines = [f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run: {verdicts}"]
+        done = f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run"
+        lines = [f"{done}: {self.verdicts}"]
         aside = [name for name, result in self.results.items() if result["exit_code"] == exit_codes.KILLED]
         lines += [f"quarantined, it kills workers: {name}" for name in aside]
         return [*lines, "interrupted; the same command continues"] if self.interrupted else lines

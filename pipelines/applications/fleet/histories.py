@@ -53,34 +53,17 @@ class History:
 
 
 def packed(sqrt_info: SqrtInformation) -> str:
-    """What a recording says of its numbers, as text."""
+    """What a recording says of its numbers, as text; R and d in triangular form."""
     triangle = np.linalg.qr(np.column_stack([sqrt_info.R, sqrt_info.d])).R
     with io.BytesIO() as stream:
-        np.savez_compressed(
-            stream,
-            names=np.array(sqrt_info.names),
-            at=sqrt_info.at,
-            whole=triangle,
-            prior_R=sqrt_info.prior_R,
-            prior_d=sqrt_info.prior_d,
-            scales=sqrt_info.scales,
-        )
+        np.savez_compressed(stream, **vars(replace(sqrt_info, R=triangle[:, :-1], d=triangle[:, -1])))
         return base64.b64encode(stream.getvalue()).decode()
 
 
 def unpacked(text: str) -> SqrtInformation:
     """The other way round."""
-    with np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False) as each:
-        whole = each["whole"]
-        return SqrtInformation(
-            names=tuple(each["names"].tolist()),
-            at=each["at"],
-            R=whole[:, :-1],
-            d=whole[:, -1],
-            prior_R=each["prior_R"],
-            prior_d=each["prior_d"],
-            scales=each["scales"],
-        )
+    with np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False) as arrays:
+        return SqrtInformation(**{**arrays, "names": tuple(arrays["names"].tolist())})
 
 
 def histories(results: Mapping[str, UnitResult], asked: Mapping[str, Sequence[str]]) -> list[History]:

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.analysis import Population, iso
-from alidade.pipelines.applications.fleet.attention import Unit, readable, sentence, units_of_interest
+from alidade.pipelines.applications.fleet.attention import Unit, sentence, units_of_interest
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component
 from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot, Shape, milliseconds, thin
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
-from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
-from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.display.units import rounded, shown_unit, to_digits_of
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.report import Block, Bullets, Plots, Report, Section, Summary, Text
 
@@ -38,17 +38,15 @@ def fleet_report(outcome: Outcome, fleet: Sequence[Population], found: Sequence[
     """The report of a fleet."""
     results = outcome.results
     attention = units_of_interest(results, fleet, found)
-    statuses = [r["status"] for r in results.values()]
     dates = [r["date"] for r in results.values() if r["date"] is not None]
     units = len({r["unit"] for r in results.values()})
     first, last = ((iso(date) or "no date")[:10] for date in (min(dates, default=None), max(dates, default=None)))
-    counts = ", ".join(f"{statuses.count(status)} {status}" for status in sorted(set(statuses)))
     interrupted = " (interrupted: the same command continues)" if outcome.interrupted else ""
     heading = f"Fleet of {units} units"
     return Report(
         title=heading,
         heading=heading,
-        about=f"{len(results)} of {outcome.recordings} recordings{interrupted}, {first} to {last}: {counts}",
+        about=f"{len(results)} of {outcome.recordings} recordings{interrupted}, {first} to {last}: {outcome.verdicts}",
         summary=_attention(attention, units, bool(fleet)),
         sections=(
             Section("Units outside the control limits", _attention_blocks(attention, len(found))),
@@ -151,7 +149,7 @@ def _parameter_table(fleet: Sequence[Population]) -> Table:
 
 
 def _parameter_row(p: Population, several: bool) -> tuple[Cell | str, ...]:
-    unit, factor = readable(p)
+    unit, factor = shown_unit(p.unit, p.require)
     sigma = factor * float(np.median(p.sigmas))
     centre = limits = beyond = drift = ""
     if p.spread and p.control:
@@ -185,7 +183,7 @@ def _component(component: Component | None, factor: float) -> str:
 
 def population_plot(p: Population) -> Plot:
     """Values of a parameter over the dates, those of a unit joined, with the control limits; and their histogram."""
-    unit, factor = readable(p)
+    unit, factor = shown_unit(p.unit, p.require)
     out = Figure(unit, "date", share=0.8, x_scale="datetime")
     counts = Figure("", "recordings", share=0.2, y_shared=True)
     flagged = p.outlying | p.changed
@@ -295,8 +293,7 @@ def _accuracy_table(study: Study, solvers: Sequence[str]) -> Table:
     rows: list[Row] = []
     for solver in solvers:
         for name, (a, parameter) in study.accuracies(solver).items():
-            quantity = Quantity(name, parameter["unit"], None, 1.0, parameter["require"] or math.inf)
-            unit, factor = human_unit(quantity)
+            unit, factor = shown_unit(parameter["unit"], parameter["require"])
             bias = f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {rounded(factor * a.bias_sigma)}"
             rows.append(
                 (
