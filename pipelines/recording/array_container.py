@@ -7,8 +7,8 @@ are written into. What is read from a log or a table thus passes the same decode
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -35,76 +35,63 @@ _PICTURE_BYTES, _DETECTIONS_BYTES = 1 << 16, 1 << 10
 _SEC_NS = 1_000_000_000
 
 
-class SeriesEncoder(ABC):
+class SeriesEncoder:
     """A series as CDR messages, taken in order.
 
     Attributes:
         definition: message type.
+        t_ns: stamps (N,), Unix ns.
         log_ns: log times (N,), Unix ns: the stamps; a message stamped before its predecessor is logged with it.
         size: bytes of a message, expected ones where they vary.
-        taken: number of messages taken.
+        varies: whether they do.
     """
 
-    varies: bool
-
-    def __init__(self, definition: Definition, t_ns: NDArray[np.int64], size: int) -> None:
-        self.definition, self.t_ns, self.size = definition, t_ns, size
+    def __init__(
+        self, definition: Definition, t_ns: NDArray[np.int64], size: int, encode: Callable[[slice], Any], varies: bool
+    ) -> None:
+        self.definition, self.t_ns, self.size, self.varies = definition, t_ns, size, varies
         self.log_ns = np.maximum.accumulate(t_ns)
-        self.taken = 0
+        self._encode, self._taken = encode, 0
 
     def take(self, count: int) -> Any:
         """The next messages: rows of bytes (count, size), or a list of bytes if their sizes vary."""
-        which = slice(self.taken, self.taken + count)
-        self.taken = which.stop
+        which = slice(self._taken, self._taken + count)
+        self._taken = which.stop
         return self._encode(which)
 
     def block(self, channel: int, count: int) -> MessageBlock:
         """Encode the next `count` messages as one block of a channel."""
-        log_ns, rows = self.log_ns[self.taken : self.taken + count], self.take(count)
+        log_ns, rows = self.log_ns[self._taken : self._taken + count], self.take(count)
         if self.varies:
             return MessageBlock.pack(channel, rows, log_ns)
         return MessageBlock(channel, rows.ravel(), self.size * np.arange(count), np.full(count, self.size), log_ns)
 
-    @abstractmethod
-    def _encode(self, which: slice) -> Any: ...
 
+def _uniform(
+    definition: Definition, t_ns: NDArray[np.int64], first: object, columns: Mapping[str, Array]
+) -> SeriesEncoder:
+    """Of messages that differ in nothing but numbers."""
+    data = definition.encode(first)
+    layout = definition.layout(data)
+    assert layout is not None
+    sec, nanosec = layout.run("header.stamp.sec"), layout.run("header.stamp.nanosec")
+    runs = [(layout.run(path), values) for path, values in columns.items()]
 
-class _UniformEncoder(SeriesEncoder):
-    """Messages that differ in nothing but numbers."""
-
-    varies = False
-
-    def __init__(
-        self, definition: Definition, t_ns: NDArray[np.int64], first: object, columns: Mapping[str, Array]
-    ) -> None:
-        data = definition.encode(first)
-        layout = definition.layout(data)
-        assert layout is not None
-        super().__init__(definition, t_ns, len(data))
-        self._first = np.frombuffer(data, np.uint8)
-        self._columns = [(layout.run(path), values) for path, values in columns.items()]
-        self._sec, self._nanosec = layout.run("header.stamp.sec"), layout.run("header.stamp.nanosec")
-
-    def _encode(self, which: slice) -> NDArray[np.uint8]:
-        rows = np.empty((which.stop - which.start, self.size), np.uint8)
-        rows[:] = self._first
-        self._sec.of(rows)[:, 0], self._nanosec.of(rows)[:, 0] = np.divmod(self.t_ns[which], _SEC_NS)
-        for run, values in self._columns:
+    def encode(which: slice) -> NDArray[np.uint8]:
+        rows = np.tile(np.frombuffer(data, np.uint8), (which.stop - which.start, 1))
+        sec.of(rows)[:, 0], nanosec.of(rows)[:, 0] = np.divmod(t_ns[which], _SEC_NS)
+        for run, values in runs:
             run.of(rows)[:] = values[which]
         return rows
 
+    return SeriesEncoder(definition, t_ns, len(data), encode, varies=False)
 
-class _VaryingEncoder(SeriesEncoder):
-    """Messages of any size, encoded one by one by rosbags."""
 
-    varies = True
-
-    def __init__(self, definition: Definition, t_ns: NDArray[np.int64], encoded: Iterator[bytes], size: int) -> None:
-        super().__init__(definition, t_ns, size)
-        self._encoded = encoded
-
-    def _encode(self, which: slice) -> list[bytes]:
-        return [next(self._encoded) for _ in range(which.start, which.stop)]
+def _varying(definition: Definition, t_ns: NDArray[np.int64], encoded: Iterator[bytes], size: int) -> SeriesEncoder:
+    """Of messages of any size, encoded one by one by rosbags."""
+    return SeriesEncoder(
+        definition, t_ns, size, lambda which: list(islice(encoded, which.stop - which.start)), varies=True
+    )
 
 
 def encode_series(topic: series.Topic) -> SeriesEncoder:
@@ -117,22 +104,22 @@ def encode_series(topic: series.Topic) -> SeriesEncoder:
             recorded_order = np.argsort(column.order) if column.order else slice(None)
             columns[column.path] = values[:, recorded_order]
         first = definition.new(topic.TYPE, header=_header(definition, 0, topic.frame_id))
-        return _UniformEncoder(definition, topic.t_ns, first, columns)
+        return _uniform(definition, topic.t_ns, first, columns)
     if isinstance(topic, series.JointSeries):
         definition = known(messages.JOINT_STATE)
         header = _header(definition, 0, topic.frame_id)
         zeros = np.zeros(len(topic.names))
         first = definition.new(messages.JOINT_STATE, header=header, name=list(topic.names), position=zeros)
-        return _UniformEncoder(definition, topic.t_ns, first, {"position": topic.position})
+        return _uniform(definition, topic.t_ns, first, {"position": topic.position})
     if isinstance(topic, series.CameraInfo):
         definition = known(messages.CAMERA_INFO)
         t_ns = np.array([topic.t_ns], dtype=np.int64)
-        return _VaryingEncoder(definition, t_ns, iter([_camera_info(definition, topic)]), _PICTURE_BYTES)
+        return _varying(definition, t_ns, iter([_camera_info(definition, topic)]), _PICTURE_BYTES)
     if isinstance(topic, series.ImageSeries):
         definition = known(messages.COMPRESSED_IMAGE)
-        return _VaryingEncoder(definition, topic.t_ns, _images(definition, topic), _PICTURE_BYTES)
+        return _varying(definition, topic.t_ns, _images(definition, topic), _PICTURE_BYTES)
     definition = known(messages.TAG_DETECTIONS)
-    return _VaryingEncoder(definition, topic.t_ns, _detections(definition, topic), _DETECTIONS_BYTES)
+    return _varying(definition, topic.t_ns, _detections(definition, topic), _DETECTIONS_BYTES)
 
 
 class ArrayContainer(Container):

@@ -54,7 +54,7 @@ from alidade.pipelines.reports.results_table import (
     result_cards,
     result_table,
 )
-from alidade.pipelines.reports.sentences import Limit, limits
+from alidade.pipelines.reports.sentences import limits
 from alidade.pipelines.reports.sketch import enlarged, rotation_text, sketch_with
 from alidade.pipelines.reports.snippets import c_code, python_code
 
@@ -528,16 +528,11 @@ def _error_budget(c: Calibration) -> tuple[Block, ...]:
     table = Table(
         "", caption, ("parameter", Column("shares of its variance", "prose")), rows, "budget", "lines columns"
     )
-    advice = tuple(f"{limit.sentence}." for limit in _least_accurate(c, found))
+    # Of what misses its requirement; where nothing does, of the one nearest to it.
+    required = [limit for limit in found if limit.name in ratios]
+    short = [limit for limit in required if ratios[limit.name] > 1.0] or required[:1]
+    advice = tuple(f"{limit.sentence}." for limit in short)
     return (table, Card((Bullets(advice),))) if advice else (table,)
-
-
-def _least_accurate(c: Calibration, found: Sequence[Limit]) -> list[Limit]:
-    """Those of parameters less accurate than required; where all meet it, of the one nearest to it."""
-    ratios = {p.name: p.sigma / p.require for p in c.parameters.values() if p.require}
-    known = [limit for limit in found if limit.name in ratios]
-    short = [limit for limit in known if ratios[limit.name] > 1.0]
-    return short or sorted(known, key=lambda limit: -ratios[limit.name])[:1]
 
 
 def _fixed_inputs(c: Calibration) -> tuple[Block, ...]:
