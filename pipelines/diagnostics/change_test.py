@@ -12,7 +12,8 @@ changed: such priors are widened to what was found before anything is compared.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -58,16 +59,19 @@ class Stability:
         statistic: its size as a standard normal number, by the cube root of chi-square over its degrees of freedom.
         level: p-value, anywhere in the recording.
         time_s: when, s.
-        departures: parameter -> estimate until then less the final one, in the sigmas of that difference; largest
-            first.
-        differences: parameter -> final estimate less that until then, and the sigma of that, SI; the largest ones.
+        differences: parameter -> final estimate less that until then, and the sigma of that, SI; the largest over its
+            sigma first.
     """
 
     statistic: float
     level: float
     time_s: float
-    departures: dict[str, float]
-    differences: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    differences: Mapping[str, tuple[float, float]]
+
+    @property
+    def departures(self) -> dict[str, float]:
+        """Parameter -> estimate until then less the final one, in the sigmas of that difference; largest first."""
+        return {name: -size / max(sigma, 1e-300) for name, (size, sigma) in self.differences.items()}
 
     @property
     def changed(self) -> bool:
@@ -93,7 +97,7 @@ def change_finding(
     """
     steps = _significant({name: (part.step, part.step_sigma) for name, part in parts.items()}, ratio)
     if not steps:
-        steps = _significant(found.differences, ratio)
+        steps = _significant(dict(islice(found.differences.items(), _MAX_NAMED)), ratio)
     if not steps and (parts or found.differences):
         return None
     required = {q.name: q.require for q in quantities}
@@ -107,8 +111,12 @@ def change_finding(
 def _significant(steps: Mapping[str, tuple[float, float]], ratio: float) -> dict[str, tuple[float, float]]:
     """Steps beyond `_STEP` of their sigmas times the ratio, with these; the most significant first."""
     wide = {name: (size, ratio * sigma) for name, (size, sigma) in steps.items()}
-    beyond = {name: step for name, step in wide.items() if abs(step[0]) > _STEP * step[1]}
-    return dict(sorted(beyond.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
+    return _by_size({name: step for name, step in wide.items() if abs(step[0]) > _STEP * step[1]})
+
+
+def _by_size(steps: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Steps with their sigmas, the largest over its sigma first."""
+    return dict(sorted(steps.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
 
 
 def step_stability(step: StepEstimate, duration: float) -> Stability:
@@ -117,9 +125,8 @@ def step_stability(step: StepEstimate, duration: float) -> Stability:
 
     times = max(duration, _EVERY_S) / _EVERY_S
     size = float(_as_normal(np.array([step.statistic]), np.array([_TURNS]))[0])
-    departures = {name: -value / max(sigma, 1e-300) for name, (value, sigma) in step.steps.items()}
-    ordered = dict(sorted(departures.items(), key=lambda item: -abs(item[1])))
-    return Stability(size, min(float(chdtrc(_TURNS, step.statistic)) * times, 1.0), step.time_s, ordered, step.steps)
+    level = min(float(chdtrc(_TURNS, step.statistic)) * times, 1.0)
+    return Stability(size, level, step.time_s, _by_size(step.steps))
 
 
 def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Sequence[Quantity]) -> Finding | None:
@@ -228,8 +235,8 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
         return None
     # Information about other numbers is as much the noise of its states, which moves the estimate without being
     # chance as the covariances have it.
-    sqrt_info = [q.determined(sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True)]
-    kept = np.flatnonzero(posterior_history.steady & sqrt_info)
+    determined = [q.determined(sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True)]
+    kept = np.flatnonzero(posterior_history.steady & determined)
     late = posterior_history.time >= _long_enough(estimate, len(kept))
     if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
@@ -246,11 +253,10 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     worst = int(np.argmax(sizes))
     beyond = _exceeded(P, whitening, ranks, float(sizes[worst]))
     sigmas = np.sqrt(np.maximum(np.diag(P[worst] - P[-1]), 1e-12 * np.diag(P[worst])))
-    by_size = np.argsort(-np.abs(difference[worst] / sigmas))
-    departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
-    largest = [(quantities[kept[j]].name, -float(difference[worst, j]), float(sigmas[j])) for j in by_size[:_MAX_NAMED]]
-    differences = {name: (size, sigma) for name, size, sigma in largest}
-    return Stability(float(sizes[worst]), beyond, float(time[worst]), departures, differences)
+    names = [quantities[k].name for k in kept.tolist()]
+    differences = zip((-difference[worst]).tolist(), sigmas.tolist(), strict=True)
+    found = _by_size(dict(zip(names, differences, strict=True)))
+    return Stability(float(sizes[worst]), beyond, float(time[worst]), found)
 
 
 def _long_enough(estimate: Estimate, numbers: int) -> float:
@@ -294,8 +300,8 @@ def _whitening(P: Array, last: Array) -> Array:
     root = np.linalg.cholesky(P + 1e-12 * np.diag(np.diag(P)))
     scaled = np.linalg.solve(root, np.linalg.solve(root, P - last).T)
     eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
-    sqrt_info = eigenvalues > _LEAST
-    return np.asarray((vectors[:, sqrt_info] / np.sqrt(eigenvalues[sqrt_info])).T @ np.linalg.inv(root))
+    informed = eigenvalues > _LEAST
+    return np.asarray((vectors[:, informed] / np.sqrt(eigenvalues[informed])).T @ np.linalg.inv(root))
 
 
 def _as_normal(square: Array, dof: Array) -> Array:

@@ -3,9 +3,8 @@
 A step of one of the device's numbers between two dates is another unknown of the joint system: added to the number in
 all recordings after it. Its estimate from the joint residuals and its sigma are those of least squares with that
 unknown (a score test, exact for a linear system). The largest of all is compared with its distribution without a change
-over the
-whole history: drawn, since steps at neighbouring dates are nearly the same question. A step that is more than that is
-taken into the system, and the next one looked for.
+over the whole history: drawn, since steps at neighbouring dates are nearly the same question. A step that is more than
+that is taken into the system, and the next one looked for.
 
 A walk makes the steps at all dates random, with variances rate^2 times the days between. In units in which the noise of
 the recordings is white they are then independent, and the rate is that of the largest likelihood of what they leave
@@ -34,7 +33,7 @@ LEVEL, _JOINTLY = 0.05, 0.2
 _DRAWN, _MOST_TESTS, _FEW = 4000, 1500, 40
 _AT_ONCE = 200
 # A step of a number is asked for where its sigma is less than this of the prior's.
-_TOLD = 1.0
+_DETERMINED = 1.0
 _MOST_STEPS = 20
 # A 95 % bound is where minus twice the log likelihood is larger by this: chi-square with one degree of freedom.
 _BOUND = 3.84
@@ -140,11 +139,11 @@ def changes(
     questions = [(name, k, after) for after in range(len(joined.parts) - 1) for name, k in steady]
     columns = _columns(joined, questions)
     left, residual = _without(A * joined.scales, columns, b)
-    sqrt_info = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _TOLD
-    questions = [question for question, yes in zip(questions, sqrt_info, strict=True) if yes]
+    determined = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _DETERMINED
+    questions = [question for question, yes in zip(questions, determined, strict=True) if yes]
     if not questions:
         return Changes(level)
-    columns, left = columns[:, sqrt_info], left[:, sqrt_info]
+    columns, left = columns[:, determined], left[:, determined]
     grown = np.array([inflations.get(name, 1.0) for name, _, _ in questions])
     steps, limit = _steps(questions, left, residual, grown), _limit(left, level)
     return Changes(
@@ -341,14 +340,10 @@ def check_calibration(
     """
     by_name = {q.name: q for q in quantities}
     known = known.of(sqrt_info.names)
-    rates = dict.fromkeys([*known.names, *_of_device(sqrt_info)], 0.0)
+    # The numbers whose priors are set apart.
+    of_device = np.array(sqrt_info.names)[(sqrt_info.prior_R != 0.0).any(axis=0)].tolist()
+    rates = dict.fromkeys([*known.names, *of_device], 0.0)
     before = sqrt_information_of(known, [by_name[name].prior_scale for name in known.names])
     joined = join([before, sqrt_info], rates, [0.0, 1.0])
     asked = {name for name in known.names if by_name[name].judged}
     return CalibrationCheck(changes(joined, [0.0, 1.0], inflations, asked), by_name)
-
-
-def _of_device(sqrt_info: SqrtInformation) -> Collection[str]:
-    """The numbers whose priors are set apart."""
-    about = (sqrt_info.prior_R != 0.0).any(axis=0)
-    return [name for name, yes in zip(sqrt_info.names, about, strict=True) if yes]

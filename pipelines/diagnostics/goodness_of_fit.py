@@ -78,11 +78,6 @@ class InnovationTest:
         bound = NormalDist().inv_cdf(1.0 - _TAIL) / float(np.sqrt(n * rows))
         return cls(lags, bound, square / n, fit.low / n, fit.high / n, rows)
 
-    @property
-    def white(self) -> bool:
-        """Whether all autocorrelations lie within the bound."""
-        return max(map(abs, self.autocorrelation)) <= self.bound
-
 
 @dataclass(frozen=True)
 class SolverDifference:

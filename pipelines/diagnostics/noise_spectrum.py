@@ -31,7 +31,7 @@ _N = NOISES.index("N")
 _PER_OCTAVE = 16
 # A noise is part of the model when twice the logarithm of the likelihood rises by more than this without bound, and is
 # determined when its square is so many of its sigmas from zero.
-_SHOWS, _TOLD = 10.0, 3.0
+_INCLUDED, _DETERMINED = 10.0, 3.0
 # 95 % of chi-square of one degree of freedom on one side.
 _BELOW = 2.706
 _CONFIDENCE = 0.95
@@ -194,7 +194,7 @@ def _select(bins: _Bins, candidates: Sequence[str]) -> tuple[Array, Mask]:
             trial = _maximise(bins, wider)
             trials.append((_likelihood(bins, trial), i, trial))
         likelihood, i, trial = max(trials, key=lambda t: t[0])
-        if likelihood - best < _SHOWS:
+        if likelihood - best < _INCLUDED:
             break
         model[i] = True
         left.remove(i)
@@ -259,7 +259,7 @@ def _sigmas(bins: _Bins, squares: Array, model: Mask) -> Array:
 
 def _coefficient(i: int, bins: _Bins, squares: Array, model: Mask, samples: int, interval_s: float) -> Coefficient:
     sigma = _sigmas(bins, squares, model)[i]
-    if model[i] and squares[i] >= _TOLD * sigma:
+    if model[i] and squares[i] >= _DETERMINED * sigma:
         low, high = interval(_CONFIDENCE, float(2.0 * (squares[i] / sigma) ** 2))
         root = float(np.sqrt(squares[i]))
         return Coefficient(NOISES[i], root, float(0.5 * sigma) / root, root * low**0.5, root * high**0.5)
@@ -306,7 +306,7 @@ def _needed(
         basis = _variances(middle, interval_s)
         count = numbers * mine * (1.0 - 2.0 ** (-1.0 / _PER_OCTAVE))
         ideal = _Bins(middle, basis @ there, count, basis)
-        if square >= _TOLD * _sigmas(ideal, there, with_it)[i]:
+        if square >= _DETERMINED * _sigmas(ideal, there, with_it)[i]:
             return length
         length *= 2.0**0.25
     return None

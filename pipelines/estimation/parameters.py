@@ -25,7 +25,7 @@ from alidade.pipelines.settings import Config, check_names
 # What is left free has a prior so many times the one in force.
 _FREE = 10.0
 # A sigma of more than this part of its prior's says nothing, one of less than that determines it.
-_UNTOLD = 0.98
+_UNINFORMED = 0.98
 
 # What the names of numbers of one kind differ by.
 _NUMBERS = re.compile(r"(_p?[xyzenu]{1,2})?(_sin|_cos)?$")
@@ -270,7 +270,7 @@ def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: flo
         inflation: by what sigma is larger because noise is coloured.
     """
     prior, white = quantity.prior_sigma or 0.0, sigma / inflation
-    if white > _UNTOLD * prior or prior == 0.0:
+    if white > _UNINFORMED * prior or prior == 0.0:
         return None
     elsewhere = sigma**2 - (white**2 / prior) ** 2
     return (value - quantity.prior_mean) / math.sqrt((prior - white**2 / prior) ** 2 + elsewhere)

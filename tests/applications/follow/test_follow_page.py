@@ -87,7 +87,7 @@ def test_it_says_what_to_do_until_enough_is_there_and_comes_back_by_itself(tmp_p
         with LivePage(print, port=port, name="s.mcap") as page:
             page.show(_view(3.0, 1e-4))
             tab.wait(f"!({LOST}) && {WORDS} === 'You may stop'")
-            moved = replace(_view(4.0, 1e-4), change=Stability(7.0, 0.0, 31.0, {"delta_px": -8.0}))
+            moved = replace(_view(4.0, 1e-4), change=Stability(7.0, 0.0, 31.0, {"delta_px": (8e-3, 1e-3)}))
             page.show(moved)
             tab.wait(f"{WORDS} === 'Look what moved, and begin anew'")
             assert "00:00:31 UTC" in tab.value("document.getElementById('alarms').textContent")
