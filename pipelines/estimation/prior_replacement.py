@@ -46,33 +46,27 @@ def with_priors(problem: Problem, gaussian_priors: Sequence[GaussianPrior]) -> P
     return problem
 
 
-def about(factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values) -> Mask:
-    """Mask (m, n): row of a linearised prior is about a reported number of the parameters."""
-    A, _ = factor.jacobian()
-    inverses = {p.key: np.linalg.pinv(p.coordinates(values, p.key)[1]) for p in parameters if p.key in factor.keys()}
-    columns, start = {}, 0
-    for key in factor.keys():
-        stop = start + len(inverses[key])
-        columns[key] = slice(start, stop)
-        start = stop
-    parts = [
-        np.abs(A[:, columns[p.key]] @ inverses[p.key]) if p.key in columns else np.zeros((len(A), len(p.quantities)))
-        for p in parameters
-    ]
-    # In units of the priors: angles, rates and seconds stand side by side.
-    size = np.hstack(parts) * [q.prior_scale for p in parameters for q in p.quantities]
-    return np.asarray(size > _ROUNDING * size.max(axis=1, keepdims=True, initial=0.0))
-
-
-def about_alone(
+def _about_alone(
     factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values, names: Collection[str]
 ) -> Mask:
     """Mask (m,) of rows of a linearised prior about the named numbers and no others, except fixed ones."""
-    quantities = [q for p in parameters for q in p.quantities]
+    A, _ = factor.jacobian()
+    blocks = dict(zip(factor.keys(), _by_key(A, factor.keys(), values), strict=True))
+    own = [p for p in parameters if p.key in blocks]
+    quantities = [q for p in own for q in p.quantities]
+    by_numbers = [blocks[p.key] @ np.linalg.pinv(p.coordinates(values, p.key)[1]) for p in own]
+    # In units of the priors: angles, rates and seconds stand side by side.
+    size = np.abs(np.hstack(by_numbers)) * [q.prior_scale for q in quantities]
+    about = size > _ROUNDING * size.max(axis=1, keepdims=True, initial=0.0)
     among = np.array([q.name in names for q in quantities])
     others = np.array([q.name not in names and q.prior_sigma != 0.0 for q in quantities])
-    rows = about(factor, parameters, values)
-    return np.asarray((rows & among).any(axis=1) & ~(rows & others).any(axis=1))
+    return np.asarray((about & among).any(axis=1) & ~(about & others).any(axis=1))
+
+
+def _by_key(A: Array, keys: Sequence[int], values: gtsam.Values) -> list[Array]:
+    """A Jacobian's columns for each of its variables."""
+    dims = values.dims()
+    return np.split(A, np.cumsum([dims[key] for key in keys])[:-1], axis=1)
 
 
 def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier = tuple) -> Problem:
@@ -208,7 +202,7 @@ class _PriorFactors:
 
     def _rest(self, prior: Factor, values: gtsam.Values) -> list[Factor]:
         """Factors of the part of a prior that is not replaced."""
-        kept = ~about_alone(prior.factor.linearize(values), self.parameters, values, self.replaced)
+        kept = ~_about_alone(prior.factor.linearize(values), self.parameters, values, self.replaced)
         if kept.all():
             return [prior]
         return [Factor("prior", _rows_of(prior.factor, np.flatnonzero(kept), values))] if kept.any() else []
@@ -291,13 +285,12 @@ def conditional_root(covariance: Array, sigmas: Array) -> Array:
 
 def _rows_of(factor: gtsam.NonlinearFactor, rows: Index, at: gtsam.Values) -> gtsam.CustomFactor:
     """A factor with selected rows of another; its variables are among the values."""
-    keys, dims = factor.keys(), at.dims()
-    ends = np.cumsum([dims[key] for key in keys])[:-1]
+    keys = factor.keys()
 
     def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         A, b = factor.linearize(values).jacobian()
         if jacobians is not None:
-            for i, block in enumerate(np.split(A[rows], ends, axis=1)):
+            for i, block in enumerate(_by_key(A[rows], keys, at)):
                 jacobians[i] = block
         return np.asarray(-b[rows])
 

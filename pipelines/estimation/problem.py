@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+import gtsam
 import numpy as np
 
 from alidade.factors import so3
@@ -24,8 +25,6 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.gaussian_prior import GaussianPrior
 
 if TYPE_CHECKING:
-    import gtsam
-
     from alidade.pipelines.estimation.camera_clock import Keyframes
 
 
@@ -40,7 +39,7 @@ CHUNK = 20
 Findings = Mapping[str, Sequence[Mapping[str, object]]]
 
 # Reported numbers (n,) of one variable and their Jacobian (n, d) with respect to its tangent.
-Coordinates = Callable[["gtsam.Values", int], tuple[Array, Array]]
+Coordinates = Callable[[gtsam.Values, int], tuple[Array, Array]]
 
 
 def vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
@@ -245,12 +244,6 @@ class Factor:
         return self.factor.linearize(values) if self.bound is None else self.bound.linearized(values)
 
 
-def _no_values() -> gtsam.Values:
-    import gtsam
-
-    return gtsam.Values()
-
-
 @dataclass(frozen=True)
 class Step:
     """Addition to the graph at one moment. A method builds it by adding to its collections, then leaves it alone.
@@ -268,7 +261,7 @@ class Step:
     """
 
     time: float
-    initial: gtsam.Values = field(default_factory=_no_values)
+    initial: gtsam.Values = field(default_factory=gtsam.Values)
     factors: list[Factor] = field(default_factory=list)
     predict: Callable[[gtsam.Values], gtsam.Values] | None = None
     timestamps: dict[int, float] = field(default_factory=dict)
@@ -384,8 +377,6 @@ class Problem:
 
     def graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """The problem as gtsam has it, for its own optimizers, Marginals and ISAM2: factors and first values."""
-        import gtsam
-
         graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for step in self.steps(CHUNK):
             initial.insert(step.initial)
