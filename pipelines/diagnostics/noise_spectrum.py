@@ -213,39 +213,30 @@ def _maximise(bins: _Bins, model: Mask, fixed: tuple[int, float] | None = None) 
 
     Fisher scoring in the logarithms, which keeps variances positive; a noise that is not there goes to nearly zero.
     """
-    basis = bins.basis[:, model]
-    rest = np.zeros(len(bins.hz)) if fixed is None else fixed[1] * bins.basis[:, fixed[0]]
-    weight = np.sqrt(bins.count)
+    basis, weight, squares = bins.basis[:, model], np.sqrt(bins.count), np.zeros(4)
     # To begin with each explains its part of the power where it is strongest.
-    theta = (weight * bins.power) @ basis / (weight @ basis**2) / basis.shape[1]
-
-    def value(t: Array) -> float:
-        s = basis @ t + rest
-        return -float(bins.count @ (np.log(s) + bins.power / s))
-
-    now, damping = value(theta), 1e-6
+    squares[model] = (weight * bins.power) @ basis / (weight @ basis**2) / basis.shape[1]
+    if fixed is not None:
+        squares[fixed[0]] = fixed[1]
+    now, damping = _likelihood(bins, squares), 1e-6
     for _ in range(200):
-        variance = basis @ theta + rest
-        relative = basis * theta / variance[:, None]
+        variance = bins.basis @ squares
+        relative = basis * squares[model] / variance[:, None]
         gradient = relative.T @ (bins.count * (bins.power / variance - 1.0))
         information = relative.T @ (bins.count[:, None] * relative)
         information[np.diag_indices_from(information)] += damping * np.diag(information) + 1e-12
-        step = np.clip(np.linalg.solve(information, gradient), -3.0, 3.0)
-        trial = theta * np.exp(step)
-        new = value(trial)
+        trial = squares.copy()
+        trial[model] *= np.exp(np.clip(np.linalg.solve(information, gradient), -3.0, 3.0))
+        new = _likelihood(bins, trial)
         if new < now:
             damping = max(10.0 * damping, 1e-3)
             if damping > 1e6:
                 break
             continue
-        gained, theta, now, damping = new - now, trial, new, 0.1 * damping
+        gained, squares, now, damping = new - now, trial, new, 0.1 * damping
         if gained < 1e-7:
             break
-    out = np.zeros(4)
-    out[model] = theta
-    if fixed is not None:
-        out[fixed[0]] = fixed[1]
-    return out
+    return squares
 
 
 def _sigmas(bins: _Bins, squares: Array, model: Mask) -> Array:

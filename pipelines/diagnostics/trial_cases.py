@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.fault_models import FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.trial_fit import Build, score_trial, solve_trial
 from alidade.pipelines.settings import Config
@@ -45,12 +46,16 @@ def data_faults(model: FaultModel, data: Any, config: Config, role: str = "usual
             yield TrialCase(fault.label, *corrected)
 
 
+def _readings(model: FaultModel, data: Any) -> Iterator[tuple[str, str, Sequence[str], Array]]:
+    """Field, sensor, columns and readings of the sensors whose axes may be wrong, as far as they are there."""
+    for name, (sensor, columns) in model.signs.items():
+        if (values := getattr(data, name)) is not None:
+            yield name, sensor, columns, values
+
+
 def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Every choice of opposite signs of a sensor's axes."""
-    for name, (sensor, columns) in model.signs.items():
-        values = getattr(data, name)
-        if values is None:
-            continue
+    for name, sensor, columns, values in _readings(model, data):
         for signs in product((1.0, -1.0), repeat=len(columns)):
             wrong = [column for column, sign in zip(columns, signs, strict=True) if sign < 0.0]
             if wrong:
@@ -62,9 +67,8 @@ def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[Tri
 
 def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Axes of a sensor in another order: two of them swapped, or turned by a right angle about the third."""
-    for name, (sensor, columns) in model.signs.items():
-        values = getattr(data, name)
-        if values is None or len(columns) < 3:
+    for name, sensor, columns, values in _readings(model, data):
+        if len(columns) < 3:
             continue
         for i, j in combinations(range(3), 2):
             swapped = np.eye(3)
@@ -83,9 +87,8 @@ def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialC
 
 def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Rates in degrees a second, or turned into radians twice."""
-    for name, (sensor, _) in model.signs.items():
-        values = getattr(data, name)
-        if values is not None and "gyro" in name:
+    for name, sensor, _, values in _readings(model, data):
+        if "gyro" in name:
             for label, changed in {
                 f"the {sensor} is in deg/s, not rad/s": np.deg2rad(values),
                 f"the {sensor} was turned from deg/s to rad/s twice": np.rad2deg(values),

@@ -262,34 +262,32 @@ def _band(use: Use, line: Line, posterior: Posterior) -> Band:
     def linear(applied: Applied) -> tuple[Array, Array]:
         return _linearised(lambda t: _components(line.error(applied, Truth(posterior.names, t)), use.signed), posterior)
 
+    def size(error: Array) -> Array:
+        return np.asarray(error[:, 0] if use.signed else np.linalg.norm(error, axis=-1))
+
+    def bound(mean: Array, S: Array) -> Array:
+        return np.asarray(Z95 * np.sqrt(S[:, 0, 0])) if use.signed else _length_bound(mean, S)
+
     (mean, J), (mean0, J0), (mean_w, J_w) = (linear(a) for a in (posterior.applied, posterior.nominal, posterior.whole))
     noise = 0.0 if line.noise is None else line.noise[:, None, None] * np.eye(mean.shape[-1])
     covariances = (posterior.P, np.diag(np.diag(posterior.P)), np.diag(posterior.require**2))
     S, alone, allowed = (J @ each @ np.swapaxes(J, -1, -2) for each in covariances)
     S0, S_w = (each @ posterior.P @ np.swapaxes(each, -1, -2) for each in (J0, J_w))
-    length = np.linalg.norm(mean0, axis=-1)
-    along = mean0 / np.maximum(length, 1e-300)[:, None]
-    spread = Z95 * np.sqrt(np.einsum("ui,uij,uj->u", along, S0, along))
+    along = mean0 / np.maximum(np.linalg.norm(mean0, axis=-1), 1e-300)[:, None]
+    before, spread = size(mean0), Z95 * np.sqrt(np.einsum("ui,uij,uj->u", along, S0, along))
     actual = None
     if posterior.truth is not None:
         actual = _components(line.error(posterior.applied, Truth(posterior.names, posterior.truth)), use.signed)
-    if use.signed:
-        flat = None if actual is None else actual[:, 0]
-        half, half_alone, half_allowed, half_w = (
-            Z95 * np.sqrt(each[:, 0, 0]) for each in (S + noise, alone, allowed, S_w)
-        )
-        bounds = mean0[:, 0] - spread, mean0[:, 0] + spread
-        numbers = None if use.coefficients is None else _coefficients(use.coefficients, line, posterior)
-        return Band(mean0[:, 0], bounds, mean[:, 0], half, half_allowed, half_alone, half_w, flat, numbers)
     return Band(
-        length,
-        (np.maximum(length - spread, 0.0), length + spread),
-        np.linalg.norm(mean, axis=-1),
-        _length_bound(mean, S + noise),
-        _length_bound(np.zeros_like(mean), allowed),
-        _length_bound(mean, alone + noise),
-        _length_bound(mean_w, S_w + noise),
-        None if actual is None else np.linalg.norm(actual, axis=-1),
+        before=before,
+        before_bounds=(np.maximum(before - spread, -np.inf if use.signed else 0.0), before + spread),
+        after=size(mean),
+        bound=bound(mean, S + noise),
+        allowed=bound(np.zeros_like(mean), allowed),
+        uncorrelated=bound(mean, alone + noise),
+        whole=bound(mean_w, S_w + noise),
+        actual=None if actual is None else size(actual),
+        coefficients=None if use.coefficients is None else _coefficients(use.coefficients, line, posterior),
     )
 
 
