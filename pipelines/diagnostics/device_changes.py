@@ -316,8 +316,7 @@ class CalibrationCheck:
     @property
     def steps(self) -> Sequence[Change]:
         """Change of every parameter; changes found are given with all others found."""
-        found = {step.name: step for step in self.changes.found}
-        return [found.get(step.name, step) for step in self.changes.steps]
+        return self.changes.judged
 
     @property
     def matters(self) -> bool:
