@@ -91,14 +91,8 @@ def test_the_incremental_solver_finds_them_too() -> None:
     assert_as_right(solve_batch(as_it_is), solve_incremental(wrong))
 
 
-# Of one of ten cubes accel_k12 moves by .503 sigmas: whether a camera moves is told by the noise of corners as stated.
-MOVED_BY_STATED = pytest.mark.xfail(
-    strict=True, reason="pictures before a camera that moves are chosen by stated noise"
-)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [pytest.param(name, marks=[MOVED_BY_STATED] * (name == "cube")) for name in CASES])
+@pytest.mark.parametrize("method", CASES)
 def test_every_noise_stated_wrong(method: str) -> None:
     for seed in range(10):
         factor = (1.0 / 3.0, 0.5, 2.0, 3.0)[seed % 4]

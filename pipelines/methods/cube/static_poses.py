@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +12,7 @@ from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.cube.recording import (
     CubeConfig,
     CubeData,
@@ -149,7 +150,7 @@ def _seen_tags(
     from alidade.pipelines.vision.pose import TagBody
 
     assert data.sightings is not None
-    body = TagBody.from_board(config.section(CubeConfig))
+    body, sigma = TagBody.from_board(config.section(CubeConfig)), _corner_sigma(data.sightings, span, config)
     # The rates' median over the static intervals is the bias, near enough for what a pose is expected to be.
     path = GyroPath(data.imu_t, nominal(data.gyro, config.section(CubeConfig).raw.gyro), np.median(gyro, axis=0))
     found: list[SeenTags | None] = []
@@ -160,39 +161,59 @@ def _seen_tags(
         expected = None
         if last is not None:
             expected = so3.multiply(last[1], path.increments(np.array([last[0]]), np.array([start])).wxyz[0])
-        tags, t = _tags_in(data, config, start, stop)
+        tags, t = _tags_in(data.sightings, sigma, config, start, stop)
         if len(tags.ids) > 1:
             several.append(tags)
         seen = _seen_in(tags, t, data, body, expected, wrong, dropped)
         found.append(seen)
         if seen is not None:
             last = float(stop), seen.pose.cRb
-    _check_camera(data, config, body, several, bool(wrong), found)
+    _check_camera(data, sigma, body, several, bool(wrong), found)
     _check_rigid(wrong, found)
     if not any(found):
         reasons = ", ".join(f"{reason} ({n})" for reason, n in dropped.items()) or "no tag in sight"
         raise InputError(f"no tag of the cube is seen well in any of {len(span)} static poses: {reasons}")
-    return tuple(found)
+    if config.noise.corner_px is None and data.sightings.covariance is not None:
+        return tuple(found)
+    # Poses are found by the measured noise, measurements are weighted by the stated one, whose level is estimated.
+    return tuple(
+        seen and replace(seen, covariance=(_stated_px(config) / sigma) ** 2 * seen.covariance) for seen in found
+    )
 
 
-def _tags_in(data: CubeData, config: Config, start: float, stop: float) -> tuple[Detections, Array]:
+def _corner_sigma(seen: Sightings, span: Array, config: Config) -> float:
+    """Sigma of a corner in one picture, px per axis, measured between neighbouring pictures of the static poses (P, 2).
+
+    Second differences: a camera that moves evenly does not show in them. As stated where no tag is in three pictures.
+    """
+    pose = np.searchsorted(span[:, 0], seen.t[seen.frame], side="right") - 1
+    rows = np.flatnonzero((pose >= 0) & (seen.t[seen.frame] <= span[pose, 1]))
+    rows = rows[np.lexsort((seen.frame[rows], seen.ids[rows]))]
+    alike = (seen.ids[rows[2:]] == seen.ids[rows[:-2]]) & (pose[rows[2:]] == pose[rows[:-2]])
+    return robust_sigma(np.diff(seen.corners[rows], n=2, axis=0)[alike]) / np.sqrt(6.0) or _stated_px(config)
+
+
+def _stated_px(config: Config) -> float:
+    """Sigma of a corner in one picture, px per axis, as the config or nobody states it."""
+    return first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)
+
+
+def _tags_in(seen: Sightings, sigma: float, config: Config, start: float, stop: float) -> tuple[Detections, Array]:
     """The tags in the pictures taken from start to stop, their corners averaged, and the stamps of these pictures.
 
     Where the corners move, as before a camera that does, all tags are averaged over the same pictures.
     """
     from alidade.pipelines.vision.tags import Detections
 
-    seen = data.sightings
-    assert seen is not None
     rows = np.flatnonzero((seen.t[seen.frame] >= start) & (seen.t[seen.frame] <= stop))
     if not len(rows):
         return Detections(seen.ids[rows], np.empty((0, 4, 2)), np.empty((0, 4, 2, 2))), np.empty(0)
     ids = np.unique(seen.ids[rows])
     moved = [np.median(_away(seen.corners[rows[seen.ids[rows] == tag]])) for tag in ids]
-    if max(moved) > _MOVED * _corner_px(config):
+    if max(moved) > _MOVED * sigma:
         rows = _in_common(seen, rows)
         ids = np.unique(seen.ids[rows])
-    averages = [_mean_corners(data, config, rows[seen.ids[rows] == tag]) for tag in ids]
+    averages = [_mean_corners(seen, sigma, config, rows[seen.ids[rows] == tag]) for tag in ids]
     corners, covariance = (np.array(column) for column in zip(*averages, strict=True))
     return Detections(ids, corners, covariance), seen.t[np.unique(seen.frame[rows])]
 
@@ -243,30 +264,22 @@ def _seen_in(
     return SeenTags(tags.ids[keep], tags.corners[keep], tags.covariance[keep], t, pose)
 
 
-def _mean_corners(data: CubeData, config: Config, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+def _mean_corners(seen: Sightings, sigma: float, config: Config, rows: NDArray[np.intp]) -> tuple[Array, Array]:
     """Mean (4, 2) px of one tag's corners over its pictures, and the mean's covariance (4, 2, 2) px^2."""
-    seen = data.sightings
-    assert seen is not None
     corners = seen.corners[rows]
     if config.noise.corner_px is None and seen.covariance is not None:
         covariance = seen.covariance[rows].mean(axis=0)
     else:
-        covariance = np.tile(_corner_px(config) ** 2 * np.eye(2), (4, 1, 1))
+        covariance = np.tile(sigma**2 * np.eye(2), (4, 1, 1))
     away = _away(corners)
-    sigma = float(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max()))
     good = away <= _FAR * max(sigma, float(np.median(away)))
     bias = 0.0 if seen.covariance is None else _CORNER_BIAS
     return corners[good].mean(axis=0), covariance / int(good.sum()) + bias**2 * np.eye(2)
 
 
-def _corner_px(config: Config) -> float:
-    """Sigma of a corner in one picture, px per axis, as the config or nobody states it."""
-    return first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)
-
-
 def _check_camera(
     data: CubeData,
-    config: Config,
+    sigma: float,
     body: TagBody,
     several: list[Detections],
     disagree: bool,
@@ -277,7 +290,6 @@ def _check_camera(
 
     assert data.camera is not None
     errors = [seen.pose.rms_px for seen in found if seen is not None and len(seen.ids) > 1]
-    sigma = _corner_px(config)
     if errors and not disagree and np.median(errors) <= 2.0 * sigma:
         return
     fault = camera_fault(data.camera, body, several, sigma)
