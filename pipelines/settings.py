@@ -232,6 +232,7 @@ class TagsSheet(Sheet):
     """Of tags on a body, as a drawing says where they are."""
 
     position: SigmaOrZero | None = None  # m, each way, against the tag with the lowest id
+    rotation: SigmaOrZero | None = None  # rad, about each axis, of every tag
 
 
 class Sensors(Section):
@@ -252,10 +253,10 @@ class Sensors(Section):
 
 
 def _ideal(kind: type[Sensors], value: object) -> object:
-    """`ideal` written out: all figures 0, but for the field, which is no sensor."""
+    """`ideal` written out: all figures 0, but for the field and how tags are turned, which are no sensors."""
     if value == "ideal":
-        sheets = {name: type(sheet).model_fields for name, sheet in kind() if name != "field"}
-        return {name: dict.fromkeys(figures, 0.0) for name, figures in sheets.items()}
+        sheets = {name: type(sheet).model_fields.keys() for name, sheet in kind() if name != "field"}
+        return {name: dict.fromkeys(figures - {"rotation"}, 0.0) for name, figures in sheets.items()}
     if isinstance(value, str):
         raise ValueError(f"must be data sheets by sensor, or ideal, not {value!r}")
     return value

@@ -175,7 +175,7 @@ def test_a_data_sheet_that_a_method_has_no_use_for_is_refused() -> None:
     """It would be ignored in silence; `ideal` and figures of 0 say nothing and are taken everywhere."""
     simulated = alidade.simulate("cube", {"poses": 6}, seed=1)
     stated = alidade.Config.model_validate({"sensors": {"clock": {"skew": 1e-4}}})
-    with pytest.raises(alidade.InputError, match=r"method cube has no use for it; it uses sensors\.gyro, "):
+    with pytest.raises(alidade.InputError, match=r"cube has no use for it; it uses sensors\.tags, sensors\.gyro, "):
         alidade.open(simulated, config=stated).problem()
     for nothing in ("ideal", {"clock": {"skew": 0.0}}):
         alidade.open(simulated, config=alidade.Config.model_validate({"sensors": nothing})).problem()

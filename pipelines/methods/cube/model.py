@@ -91,7 +91,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         InputError: there is no static pose, the position is unknown, the date is outside the field model, or no tag of
             the cube is seen well though there is a camera.
     """
-    model, layout = prepare(data, config), layout_prior(config)
+    model = prepare(data, config)
     graph = Problem(
         method="cube",
         parameters=model.parameters.all,
@@ -105,7 +105,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=ChainLayout(states="xdepR" if model.reference.moves else "xdep"),
     )
-    return graph if layout is None or data.camera is None else with_priors(graph, [layout])
+    return graph if data.camera is None else with_priors(graph, [layout_prior(config)])
 
 
 def _premises(model: Model) -> tuple[str, ...]:

@@ -51,11 +51,13 @@ MOUNT = ParameterSpec(
     require=1e-2,
     rotation="correction of BRC",
 )
+# Glued along a line: 0.2 mm at either end of a tag of 0.1 m.
 TAG = ParameterSpec(
     "tag_{}",
     "rad",
     3e-3,
     "Tag {first} rotation about {last}, correction of the config.",
+    "tags.rotation",
     axes=("*_x", "*_y", "*_z"),
     require=1e-2,
 )
@@ -234,7 +236,7 @@ def cube_parameters(
     if camera:
         rotations.append(Parameter(MOUNT_KEY, nuisance(MOUNT, not reference), rotation_vector_coordinates))
         for tag in tags:
-            own = nuisance(of_tag(TAG, tag), tag == tags[0])
+            own = nuisance(_given(of_tag(TAG, tag), config), tag == tags[0])
             rotations.append(Parameter(tag_key(tag), own, rotation_vector_coordinates))
         tilt = [q if reference else replace(q, prior_sigma=0.0) for q in quantities(TILT, config)]
         said = Parameter(SAID_KEY, (*tilt, *nuisance(HEADING, not reference)))
@@ -261,9 +263,9 @@ def cube_parameters(
 def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Array]]:
     """The field, and its prior mean (3,) and the square root (3, 3) of its covariance; the config's priors win."""
     mean, root = known_field(config, model)
-    about = replace(FIELD, prior=stated(config, FIELD), data_sheet="")
     plain = tuple(
-        replace(q, prior_mean=float(m), nuisance=True) for q, m in zip(quantities(about, config), mean, strict=True)
+        replace(q, prior_mean=float(m), nuisance=True)
+        for q, m in zip(quantities(_given(FIELD, config), config), mean, strict=True)
     )
     if config.priors.keys().isdisjoint(FIELD.names):
         plain = tuple(
@@ -272,6 +274,11 @@ def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Array]
     else:
         root = np.diag(prior_sigmas(Parameter(FIELD_KEY, plain)))
     return Parameter(FIELD_KEY, with_factor("mag", plain, config, _GAIN[1])), (mean, root)
+
+
+def _given(spec: ParameterSpec, config: Config) -> ParameterSpec:
+    """A spec with the prior of its data sheet, of what is no sensor error."""
+    return replace(spec, prior=stated(config, spec), data_sheet="")
 
 
 def _place(tag: int, fixed: bool, config: Config) -> Parameter:

@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors import so3
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.parameters import stated
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.gaussian_prior import GaussianPrior
+from alidade.pipelines.methods.cube.parameters import PLACE, TAG
 from alidade.pipelines.methods.cube.recording import TAG_DETECTIONS, CubeConfig, CubeData, RefinedCamera, Sightings
 from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.recording.checks import clean, count
@@ -157,20 +160,34 @@ _NUMBERS = ("x", "y", "z", "px", "py", "pz")
 CAMERA_NUMBERS = ("camera_focal", "camera_centre_x", "camera_centre_y")
 
 
-def layout_prior(config: Config) -> GaussianPrior | None:
-    """Prior of tags and camera by the layout's covariance, except numbers with a prior of their own."""
+def layout_prior(config: Config) -> GaussianPrior:
+    """Prior of tags and camera by the covariance of their layout or drawing, but for numbers with a prior of their own.
+
+    The tag with the lowest id is exact.
+    """
     cube = config.section(CubeConfig)
-    if cube.covariance is None:
-        return None
+    layout, others = cube.covariance, sorted(cube.tags)[1:]
+    tags, covariance = (others, _drawing_covariance(config)) if layout is None else (layout.tags, layout.matrix)
+    source = "that of tags on a drawing" if layout is None else "the covariance of the tags' layout"
+    of_camera = CAMERA_NUMBERS if layout is not None and layout.camera else ()
     elsewhere = {*config.priors, *(name for gaussian_prior in config.gaussian_priors for name in gaussian_prior.names)}
-    of_camera = CAMERA_NUMBERS if cube.covariance.camera else ()
-    names = (*(f"tag_{tag}_{number}" for tag in cube.covariance.tags for number in _NUMBERS), *of_camera)
-    known = {*(f"tag_{tag}_{number}" for tag in _known_tags(cube) for number in _NUMBERS), *of_camera}
-    whole = GaussianPrior(names, np.zeros(len(names)), cube.covariance.matrix, "the covariance of the tags' layout")
-    return whole.of(known - elsewhere)
+    names = (*(f"tag_{tag}_{number}" for tag in tags for number in _NUMBERS), *of_camera)
+    known = {*(f"tag_{tag}_{number}" for tag in others for number in _NUMBERS), *of_camera}
+    return GaussianPrior(names, np.zeros(len(names)), covariance, source).of(known - elsewhere)
 
 
-def _known_tags(cube: CubeConfig) -> list[int]:
-    """Tags on the cube that the layout's covariance is of; the lowest id is exact."""
-    tags = () if cube.covariance is None else cube.covariance.tags
-    return [tag for tag in tags if tag in cube.tags and tag != min(cube.tags)]
+def _drawing_covariance(config: Config) -> Array:
+    """Covariance (6 n, 6 n) of rotations (rad) and positions (m) of a drawing's n tags, all but that of the lowest id.
+
+    Each tag is turned by a vector of its own. That of the lowest id, w, whose pose defines the body, turns the others
+    against it by -R^T w and moves them by r x w, with their attitude R and place r against it; none where places are
+    exact.
+    """
+    from alidade.pipelines.vision.pose import TagBody
+
+    body = TagBody.from_board(config.section(CubeConfig))
+    turned, moved = so3.matrix(so3.inverse(body.bRt[1:])), so3.hat(body.position[1:] - body.position[0])
+    common = np.concatenate([-turned, moved], axis=1).reshape(-1, 3)
+    rotation, position = stated(config, TAG), stated(config, PLACE)
+    own = np.tile(np.repeat([rotation, position], 3), len(body.ids) - 1)
+    return np.asarray(np.diag(own**2) + (rotation**2 * common @ common.T if position else 0.0))
