@@ -27,8 +27,9 @@ class GyroRotationFactor(Model):
     in the unit of raw: their mean adds to c). Of a gyro that feels specific force also G by rows (9, rad/s per m/s^2)
     and the accelerometer's triad (12): raw = A w + c + d + G f, with the f of that accelerometer, its curvature left
     out. Where the temperature is known also s (3, in the unit of raw per K), and that of an accelerometer that drifts
-    too (3): s dT adds to c. Samples are mean rates centred on their stamps, integrated as
-    alidade.factors.preintegration does: the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
+    too (3): s dT adds to c. Of a gyro with a dead band, last, what it subtracts from the size of its readings (1, in
+    the unit of raw). Samples are mean rates centred on their stamps, integrated as alidade.factors.preintegration does:
+    the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
 
     Attributes:
         time: (n,) ends of the turns, s.
@@ -39,6 +40,7 @@ class GyroRotationFactor(Model):
         accel: n times (N, 3), the accelerometer's readings at the stamps; None: the gyro does not feel force.
         temperature: n times (N,) dT, K above the temperature at which the offset is c; None: unknown.
         drifts: whether the accelerometer has a slope over temperature too.
+        beyond: n times (N, 3), -1 or 1 where a reading is beyond the dead band, 0 within; None: there is none.
     """
 
     time: Array
@@ -49,16 +51,17 @@ class GyroRotationFactor(Model):
     accel: list[Array] | None = None
     temperature: list[Array] | None = None
     drifts: bool = False
+    beyond: list[Array] | None = None
     shapes: ClassVar = {"sigma": ()}
     rows: int = 3
-    stacked: ClassVar = ("time", "stamps", "raw", "sigma", "accel", "temperature")
+    stacked: ClassVar = ("time", "stamps", "raw", "sigma", "accel", "temperature", "beyond")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitudes, triad, wandered offsets and, where there are such, G with the accelerometer's triad and slope."""
+        """Attitudes, triad, wandered offsets; where there are such G with the accelerometer's triad, slopes, band."""
         of_force = [] if self.accel is None else [9, 12]
         slopes = [] if self.temperature is None else [3, 3] if self.drifts else [3]
-        return (ROT3, ROT3, 12, 3, 3, *of_force, *slopes)
+        return (ROT3, ROT3, 12, 3, 3, *of_force, *slopes, *([] if self.beyond is None else [1]))
 
     def __call__(
         self, nRb_i: Array, nRb_j: Array, triads: Array, wandered_i: Array, wandered_j: Array, *terms: Array
@@ -66,8 +69,10 @@ class GyroRotationFactor(Model):
         """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
         offsets = np.concatenate([triads[:, :9], triads[:, 9:] + 0.5 * (wandered_i + wandered_j)], axis=1)
         felt, slopes = ((), terms) if self.accel is None else (terms[:2], terms[2:])
-        raw, accel, temperature = self._joined
+        raw, accel, temperature, beyond = self._joined
         samples = self._samples
+        if beyond is not None:
+            raw, slopes = raw + beyond * slopes[-1][samples.turn], slopes[:-1]
         if temperature is not None:
             raw = raw - temperature[:, None] * slopes[0][samples.turn]
         if temperature is not None and accel is not None and self.drifts:
@@ -83,6 +88,7 @@ class GyroRotationFactor(Model):
             left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
             right = so3.right_jacobian_inverse(error) * weight[:, None, None]
             by = [*turns.derivatives(), *(() if temperature is None else turns.by_slopes(temperature)[: len(slopes)])]
+            by += [] if beyond is None else [turns.by_size(beyond)]
             by = [left @ each for each in by]
             by_offset = by[0][..., 9:]
             ends = left @ so3.matrix(so3.inverse(dR)), right
@@ -95,10 +101,11 @@ class GyroRotationFactor(Model):
         return Samples.of(self.stamps)
 
     @cached_property
-    def _joined(self) -> tuple[Array, Array | None, Array | None]:
-        """Readings of gyro and accelerometer and the temperature, concatenated over all turns."""
-        accel, temperature = (None if each is None else np.concatenate(each) for each in (self.accel, self.temperature))
-        return np.concatenate(self.raw), accel, temperature
+    def _joined(self) -> tuple[Array, Array | None, Array | None, Array | None]:
+        """Readings of gyro and accelerometer, temperature and sides of the dead band, concatenated over all turns."""
+        others = (self.accel, self.temperature, self.beyond)
+        accel, temperature, beyond = (None if each is None else np.concatenate(each) for each in others)
+        return np.concatenate(self.raw), accel, temperature, beyond
 
 
 @dataclass(frozen=True)
@@ -214,6 +221,11 @@ class Turns:
         if self.G is None or self.accel_K is None:
             return (-by_rate @ self.K,)
         return -by_rate @ self.K, by_rate @ self.K @ self.G @ self.accel_K
+
+    def by_size(self, signs: Array) -> Array:
+        """Derivative (n, 3, 1) of the rotations by what is added to the readings with these signs (N, 3)."""
+        by_rate = self.samples.products(self._by_rate, self.samples.points(signs))
+        return np.einsum("naij,nij->na", by_rate, self.K)[..., None]
 
     @cached_property
     def _arcs(self) -> Array:

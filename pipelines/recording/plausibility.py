@@ -39,10 +39,11 @@ HELD = ": repeats the reading before, used once"
 _MAX_NUMBER = 1e100
 # A topic holds readings where more than this share of the rows repeats the row before; least number of rows tested.
 _HELD, _MIN_HELD = 0.4, 100
-# A dead band has at least this share of the samples at its value, and beside it a gap of more than so many steps.
-_DEAD, _GAP = 0.05, 5.0
-# Share of the steps between neighbouring values that are the device's: where readings are dense.
-_DENSE = 0.1
+# A dead band has at least so many samples at its value, and so many times those at both values next to it: without one
+# noise of half a step makes it twice them.
+_LEAST_WITHIN, _ALONE = 20, 10.0
+# Readings pass through a dead band in less than this, s, as fast as so many samples before and after.
+_PASSING_S, _ASIDE = 0.25, 5
 
 
 def implausible(kind: str, values: Array) -> str:
@@ -173,19 +174,38 @@ def measured_once(topic: str, values: Array, dropped: dict[str, int]) -> NDArray
     return np.flatnonzero(~repeats)
 
 
-def dead_band(values: Array) -> Array:
-    """Half width (N, k) of the dead band that each of some readings (N, k) lies in; 0 of those in none.
+def dead_band(t: Array, values: Array) -> tuple[float, Array]:
+    """Half width of a device's dead band, 0 without one; on which side of it each of its readings (N, k) is.
 
-    Within a dead band a device reports one value. That is the value of many samples, and the gap to the next ones on
-    either side is far larger than the device's step.
+    Within a dead band a device reports one value. That is the value of far more samples of an axis than the values next
+    to it. The half width is half of what readings change by while they pass through, on average. Beyond it a device
+    reports the rate or what is left of it: sides are -1 and 1 there, 0 within and without a dead band.
+
+    Args:
+        t: (N,) s.
+        values: in any unit.
     """
-    return np.stack([_dead_band(column) for column in values.T], axis=1)
+    found = [value for column in values.T if (value := _one_value(column)) is not None]
+    side = np.sign(values - np.median(found)) if found else np.zeros_like(values)
+    passed = np.concatenate([_passed(t, *columns) for columns in zip(values.T, side.T, strict=True)])
+    return 0.5 * float(passed.mean()) if len(passed) else 0.0, side
 
 
-def _dead_band(values: Array) -> Array:
+def _one_value(values: Array) -> float | None:
+    """The value that readings (N,) have within a dead band, None if there is none."""
     found, counts = np.unique(values, return_counts=True)
-    most, steps = int(np.argmax(counts)), np.diff(found)
-    width = 0.0
-    if 0 < most < len(steps) and counts[most] > _DEAD * len(values):
-        width = float(steps[most - 1 : most + 1].min())
-    return np.where(values == found[most], width if width > _GAP * np.quantile(steps, _DENSE) else 0.0, 0.0)
+    within, beside = counts[1:-1], counts[:-2] + counts[2:]
+    alone = np.flatnonzero((within >= _LEAST_WITHIN) & (within > _ALONE * beside))
+    return float(found[1 + alone[np.argmax(within[alone])]]) if len(alone) else None
+
+
+def _passed(t: Array, values: Array, side: Array) -> Array:
+    """What readings change by each time that they pass through the one value from one side to the other."""
+    beyond = np.flatnonzero(side)
+    beyond = beyond[(beyond >= _ASIDE) & (beyond < len(t) - _ASIDE)]
+    first, last = beyond[:-1], beyond[1:]
+    passing = (side[first] != side[last]) & (t[last] - t[first] < _PASSING_S)
+    first, last = first[passing], last[passing]
+    change = values[last + _ASIDE] - values[last] + values[first] - values[first - _ASIDE]
+    slope = np.abs(change) / (t[last + _ASIDE] - t[last] + t[first] - t[first - _ASIDE])
+    return np.asarray(slope * (t[last] - t[first]) * (last - first - 1) / (last - first))

@@ -104,7 +104,9 @@ def test_static_models_are_what_they_say() -> None:
     np.testing.assert_allclose(bent(nRb, triads, terms, slope)[0], 0, atol=1e-12)
 
 
-def _turns(rows: np.ndarray, angle: float, feels: bool = False, warm: bool = False) -> GyroRotationFactor:
+def _turns(
+    rows: np.ndarray, angle: float, feels: bool = False, warm: bool = False, banded: bool = False
+) -> GyroRotationFactor:
     """Turns of different length and number of samples, at rates and forces that change direction."""
     stamps, raw, accel = [], [], []
     for i in rows:
@@ -114,23 +116,29 @@ def _turns(rows: np.ndarray, angle: float, feels: bool = False, warm: bool = Fal
         raw.append(angle * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
         accel.append(9.8 * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
     felt, temperature = accel if feels else None, [TEMPERATURE[i] + t**2 for i, t in zip(rows, stamps, strict=True)]
+    beyond = [np.sign(each) * (np.abs(each) > 0.3 * angle) for each in raw] if banded else None
     return GyroRotationFactor(
-        TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), felt, temperature if warm else None, warm and feels
+        TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), felt, temperature if warm else None, warm and feels, beyond
     )
 
 
-@pytest.mark.parametrize(("feels", "warm"), [(False, False), (True, False), (False, True), (True, True)])
+@pytest.mark.parametrize(
+    ("feels", "warm", "banded"),
+    [(False,) * 3, (True, False, False), (False, True, False), (True, True, False), (False, False, True), (True,) * 3],
+)
 @pytest.mark.parametrize("angle", [2.0, 1e-6], ids=["turning", "at rest"])
 @pytest.mark.parametrize("miss", [1.0, 1e-7, 3.0], ids=["far off", "agreeing", "near half a turn"])
-def test_turn_jacobians(angle: float, miss: float, feels: bool, warm: bool) -> None:
+def test_turn_jacobians(angle: float, miss: float, feels: bool, warm: bool, banded: bool) -> None:
     rng = _rng(2)
-    model = _turns(np.arange(N), angle, feels, warm)
+    model = _turns(np.arange(N), angle, feels, warm, banded)
     start, triads = _rotations(rng), _triads(rng, 0.05)
     others = list(0.01 * rng.normal(size=(2, N, 3)))
     if feels:
         others += [1e-2 * rng.normal(size=(N, 9)), _triads(rng, 0.05)]
     if warm:
         others += [1e-2 * rng.normal(size=(N, 3)), *([0.1 * rng.normal(size=(N, 3))] if feels else [])]
+    if banded:
+        others += [1e-2 * rng.normal(size=(N, 1))]
     # Attitudes at the end that miss the prediction by `miss` rad.
     error = model(start, so3.identity(N), triads, *others)[0] * _sigma(np.arange(N))[:, None]
     predicted = so3.inverse(so3.exp(error))
@@ -139,7 +147,7 @@ def test_turn_jacobians(angle: float, miss: float, feels: bool, warm: bool) -> N
     blocks = [start, so3.multiply(predicted, so3.exp(delta)), triads, *others]
     tolerance = 2e-5 if miss > 2.0 else 2e-6
     assert_jacobians(model, blocks, rtol=tolerance)
-    assert_rows_are_independent(lambda rows: _turns(rows, angle, feels, warm), blocks)
+    assert_rows_are_independent(lambda rows: _turns(rows, angle, feels, warm, banded), blocks)
 
 
 def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
@@ -164,6 +172,9 @@ def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
     drifted = [raw + force @ G.T + np.outer(temperature, slopes[0])], [accel + np.outer(temperature, slopes[1])]
     warm = GyroRotationFactor(t[-1:], [t], drifted[0], EARTH, np.ones(1), drifted[1], [temperature], drifts=True)
     np.testing.assert_allclose(warm(iRb0, nRb1, triad(K, b)[None], *wandered, *of_force, *slopes)[0], 0.0, atol=1e-12)
+    short, beyond = np.array([[0.05]]), [np.sign(raw)]
+    banded = GyroRotationFactor(t[-1:], [t], [raw - 0.05 * np.sign(raw)], EARTH, np.ones(1), beyond=beyond)
+    np.testing.assert_allclose(banded(iRb0, nRb1, triad(K, b)[None], *wandered, short)[0], 0.0, atol=1e-12)
 
 
 def _tags(rows: np.ndarray, blocks: list[Array] | None) -> TagAttitudeFactor:

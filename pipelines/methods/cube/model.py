@@ -37,6 +37,7 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.cube.guidance import advice
 from alidade.pipelines.methods.cube.parameters import (
     CURVATURE_KEY,
+    DEAD_BAND_KEY,
     FIELD_KEY,
     LENS_KEY,
     MOUNT_KEY,
@@ -76,8 +77,9 @@ _NO_FIELD = (
     "and longitude_deg in the config, or record /reference/fix."
 )
 _DEAD_BAND = (
-    "The gyro has a dead band: within {:.2g} deg/s it reads one value. Its offset is known from the turns alone; "
-    "switch the dead band off in the device and record again."
+    "The gyro has a dead band: at small rates it reads one value. Its offset is known from the turns alone, and "
+    "gyro_dead_band is what it subtracts from larger rates: add it to the size of readings before K, or switch the "
+    "dead band off in the device and record again."
 )
 # Sigmas of priors as good as none, m on the cube's place in the camera and rad on an attitude that no gyro leads to:
 # these only make the new variables of a step determined without its measurements.
@@ -110,10 +112,9 @@ def problem(data: CubeData, config: Config) -> Problem:
 
 def _premises(model: Model) -> tuple[str, ...]:
     """Sentences about what the recording lacks."""
-    band = float(np.rad2deg(model.dead_band.max()))
     lacking = {
         _NO_FIELD: model.poses.mag is not None and model.field is None,
-        _DEAD_BAND.format(band): band > 0.0,
+        _DEAD_BAND: model.parameters.dead_band is not None,
     }
     return tuple(sentence for sentence, lacks in lacking.items() if lacks)
 
@@ -176,6 +177,8 @@ def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values)
     samples, deviation = model.samples(k), current.atVector(deviation_key(k - 1))
     own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), deviation)
     gyro, accel = samples.gyro, samples.accel
+    if model.parameters.dead_band is not None:
+        gyro = gyro + samples.beyond * current.atVector(DEAD_BAND_KEY)
     if samples.temperature_rise is not None:
         slopes = model.parameters.slopes
         drifts = {name: np.outer(samples.temperature_rise, current.atVector(SLOPE_KEYS[name])) for name in slopes}
@@ -199,12 +202,14 @@ _LONGEST_GAP = 0.1
 class Turning:
     """A turn's samples: stamps (N,), s, and gyro and accelerometer (N, 3) in nominal units.
 
-    temperature_rise (N,), K: temperature above the recording's first; None where nobody measures it.
+    beyond (N, 3): side of the gyro's dead band, 0 within or without one. temperature_rise (N,), K: temperature above
+    the recording's first; None where nobody measures it.
     """
 
     t: Array
     gyro: Array
     accel: Array
+    beyond: Array
     temperature_rise: Array | None
 
     @property
@@ -225,7 +230,8 @@ class Model:
     gravity: float  # m/s^2
     earth_rate: Array  # (3,) rad/s in n, as far as the heading is known
     unknown_rate: float  # rad/s per axis, what of the earth rate that leaves out
-    dead_band: Array  # (N, 3) rad/s, half width of the gyro's that a sample lies in
+    dead_band: float  # rad/s, half width of the gyro's, 0 without one
+    beyond: Array  # (N, 3) the side of it that a sample is on, 0 within or without one
     field: Array | None  # (3,) T in n, by the model
     density: tuple[float, ...]  # of gyro, accelerometer and magnetometer
     deviation: GaussMarkovDeviation
@@ -240,15 +246,23 @@ class Model:
         raw = self.config.section(CubeConfig).raw
         gyro, accel = nominal(self.data.gyro[rows], raw.gyro), nominal(self.data.accel[rows], raw.accel)
         t, warming = self.data.imu_t[rows], self.data.temperature
-        return Turning(t, gyro, accel, None if warming is None else warming.above(warming.first, t))
+        return Turning(t, gyro, accel, self.beyond[rows], None if warming is None else warming.above(warming.first, t))
 
-    def rate_error(self, start: float, stop: float) -> float:
-        """Sigma of the mean rate from one moment to another beyond noise, rad/s per axis.
+    @property
+    def rest_error(self) -> float:
+        """Sigma of a mean rate at rest beyond noise, rad/s per axis.
+
+        That of the earth rate left out, and of an offset within the dead band, uniform and the same in all poses.
+        """
+        return float(np.hypot(self.unknown_rate, self.dead_band * np.sqrt(len(self.poses) / 3.0)))
+
+    def turn_error(self, samples: Turning) -> float:
+        """Sigma of the mean rate over a turn beyond noise, rad/s per axis.
 
         That of the earth rate left out, and of rates within the gyro's dead band, uniform in it.
         """
-        dead = self.dead_band[turn(self.data, start, stop)].mean(axis=0).max() / np.sqrt(3.0)
-        return float(np.hypot(self.unknown_rate, dead))
+        within = float((samples.beyond == 0.0).mean(axis=0).max())
+        return float(np.hypot(self.unknown_rate, self.dead_band * within / np.sqrt(3.0)))
 
     def temperature_rise(self, sensor: str, k: int) -> Array | None:
         """Mean temperature in pose k above the first, (1,) K; None where a sensor's offset ignores it."""
@@ -273,6 +287,7 @@ def prepare(data: CubeData, config: Config) -> Model:
     heading_known = field is not None or data.reference_t is not None
     earth = earth_rate(data.latitude)
     bias = np.median(poses.gyro, axis=0)
+    half_width, beyond = dead_band(data.imu_t, nominal(data.gyro, config.section(CubeConfig).raw.gyro))
     reference = cube_reference(data, config, poses, field)
     return Model(
         data=data,
@@ -285,11 +300,13 @@ def prepare(data: CubeData, config: Config) -> Model:
             reference=data.reference_t is not None,
             field=field,
             thermometer=data.temperature is not None,
+            dead_band=bool(beyond.any()),
         ),
         gravity=float(gravity(data.latitude, data.height)),
         earth_rate=earth * np.array([1.0, 1.0, 1.0] if heading_known else [0.0, 0.0, 1.0]),
         unknown_rate=0.0 if heading_known else float(np.hypot(*earth[:2]) * np.sqrt(0.5)),
-        dead_band=dead_band(nominal(data.gyro, config.section(CubeConfig).raw.gyro)),
+        dead_band=half_width,
+        beyond=beyond,
         field=field,
         density=tuple(known[name].used if name in known else 0.0 for name in DENSITIES),
         deviation=GaussMarkovDeviation.over(poses, known["gyro_bias_walk"].used),
@@ -382,7 +399,7 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
     slopes = {name: [] if temperature_rises[name] is None else [key] for name, key in SLOPE_KEYS.items()}
     accel_sigma = accel_density / np.sqrt(duration)
     accel = AccelFactor(time, poses.accel[row], accel_sigma, model.gravity, curved, temperature_rises["accel"])
-    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.rate_error(*poses.span[k]) ** 2)
+    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.rest_error**2)
     gravity = model.gravity if feels else None
     gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, gravity, temperature_rises["gyro"])
     terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
@@ -457,17 +474,20 @@ def turn_factor(model: Model, k: int) -> Factor:
     samples, feels = model.samples(k), model.parameters.sensitivity is not None
     t = samples.t
     duration = float(t[-1] - t[0])
-    sigma = np.sqrt([model.density[0] ** 2 * duration + (model.rate_error(t[0], t[-1]) * duration) ** 2])
+    sigma = np.sqrt([model.density[0] ** 2 * duration + (model.turn_error(samples) * duration) ** 2])
     accel = [samples.accel] if feels else None
     slopes = model.parameters.slopes
     # What an accelerometer drifts by alone is nothing beside a gyro that does not.
     drifting = [name for name in ("gyro", *(["accel"] if feels else [])) if name in slopes and "gyro" in slopes]
     temperature_rise = None if samples.temperature_rise is None or not drifting else [samples.temperature_rise]
-    drifts = "accel" in drifting
-    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, temperature_rise, drifts)
+    drifts, banded = "accel" in drifting, model.parameters.dead_band is not None
+    beyond = [samples.beyond] if banded else None
+    rotation = GyroRotationFactor(
+        t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, temperature_rise, drifts, beyond
+    )
     of_force = [SENSITIVITY_KEY, TRIAD_KEYS["accel"]] if feels else []
     gyro = TRIAD_KEYS["gyro"]
-    slope = [SLOPE_KEYS[name] for name in drifting]
+    slope = [*(SLOPE_KEYS[name] for name in drifting), *([DEAD_BAND_KEY] if banded else [])]
     ends = pose_key(k - 1), pose_key(k)
     measured = rotation.on(*ends, gyro, deviation_key(k - 1), deviation_key(k), *of_force, *slope)
     angle = float(np.sum(np.linalg.norm(samples.gyro[1:], axis=1) * np.diff(t)))

@@ -32,7 +32,9 @@ from alidade.pipelines.methods.triads import MAG_SHAPE, TRIADS, triad_names, tri
 from alidade.pipelines.settings import Config
 
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
-MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY, LENS_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQL")
+MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY, LENS_KEY, DEAD_BAND_KEY = (
+    int(gtsam.symbol(c, 0)) for c in "CHFSQLD"
+)
 # Sensor -> variable of its slope over temperature.
 SLOPE_KEYS: dict[str, int] = {"gyro": int(gtsam.symbol("K", 0)), "accel": int(gtsam.symbol("J", 0))}
 
@@ -88,13 +90,15 @@ TILT = ParameterSpec(
     axes="en",
     per_recording=True,
 )
+# Of a gyro with a dead band, half a degree a second.
+DEAD_BAND = scalar("gyro_dead_band", "rad/s", 1e-2, "Dead band that the gyro subtracts from its rates.")
 # Errors of CameraInfo.
 FOCAL = scalar("camera_focal", "", 5e-3, "Relative correction of the focal length.", "camera.focal")
 CENTRE = ParameterSpec(
     "camera_centre", "px", 3.0, "Correction of the image centre along {axis}.", "camera.centre", axes="xy"
 )
 NUISANCE = (SENSITIVITY, SQUARE, CUBE, TILT, FOCAL, CENTRE, *TEMPERATURE.values())
-PARAMETERS = (*chain.from_iterable(TRIAD_SPECS.values()), MOUNT, TAG, HEADING, *NUISANCE, PLACE, FIELD)
+PARAMETERS = (*chain.from_iterable(TRIAD_SPECS.values()), MOUNT, TAG, HEADING, *NUISANCE, DEAD_BAND, PLACE, FIELD)
 
 # Without a camera these are zero by definition of the body frame.
 _FRAME = ("accel_k21", "accel_k31", "accel_k32")
@@ -131,6 +135,7 @@ class Parameters:
         curvature: square and cube terms of the accelerometer, None where it has none.
         slopes: sensor -> what its offset does with its temperature, where that is known.
         lens: what the camera's focal length and centre are off by, None where they are exact.
+        dead_band: what the gyro subtracts from its rates, None where it has no dead band.
     """
 
     triads: Mapping[str, Parameter]
@@ -144,6 +149,7 @@ class Parameters:
     curvature: Parameter | None
     slopes: Mapping[str, Parameter]
     lens: Parameter | None = None
+    dead_band: Parameter | None = None
 
     @property
     def all(self) -> tuple[Parameter, ...]:
@@ -154,7 +160,7 @@ class Parameters:
     @property
     def assumed(self) -> tuple[Parameter | None, ...]:
         """Assumptions alone."""
-        return (self.sensitivity, self.curvature, self.lens, *self.slopes.values())
+        return (self.sensitivity, self.curvature, self.lens, *self.slopes.values(), self.dead_band)
 
     @property
     def zeros(self) -> tuple[Parameter, ...]:
@@ -192,7 +198,12 @@ def first_priors(parameters: Parameters) -> list[Factor]:
 
 
 def cube_parameters(
-    config: Config, camera: bool, reference: bool, field: Array | None, thermometer: bool = False
+    config: Config,
+    camera: bool,
+    reference: bool,
+    field: Array | None,
+    thermometer: bool = False,
+    dead_band: bool = False,
 ) -> Parameters:
     """The parameters of a recording, with the config's priors and requirements.
 
@@ -202,6 +213,7 @@ def cube_parameters(
         reference: whether the camera's attitude is measured; without, mount and heading mean nothing and are fixed.
         field: (3,) T, the field model in n; None without a magnetometer.
         thermometer: whether the temperature of gyro and accelerometer is measured.
+        dead_band: whether the gyro has one.
 
     Raises:
         InputError: the config names a parameter that the method does not know, or states noise.gyro_scale.
@@ -257,6 +269,7 @@ def cube_parameters(
         curvature=parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
         lens=parameter(LENS_KEY, (FOCAL, CENTRE), config) if camera else None,
         slopes=_slopes(config) if thermometer else {},
+        dead_band=Parameter(DEAD_BAND_KEY, nuisance(DEAD_BAND)) if dead_band else None,
     )
 
 

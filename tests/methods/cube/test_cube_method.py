@@ -207,19 +207,34 @@ def test_rests_of_a_second_are_found(rest_s: float) -> None:
     assert max(abs(z) for z in _sigmas_off(estimate, truth).values()) < 4.0
 
 
+@pytest.mark.parametrize("bias", [2e-3, pytest.param(1e-2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("subtracted", [0.0, np.deg2rad(0.3)])
 @pytest.mark.parametrize("resolution", [0.0, np.deg2rad(1.0 / 131.0)])
-def test_rests_within_a_dead_band_do_not_measure_the_offset(resolution: float) -> None:
-    """Within 0.3 deg/s the gyro reads zero, also of a device that counts; its offset is known from the turns alone."""
+def test_rests_within_a_dead_band_do_not_measure_the_offset(resolution: float, subtracted: float, bias: float) -> None:
+    """Within 0.3 deg/s the gyro reads zero, also of a device that counts; beyond, the rate or what is left of it.
+
+    Its offset is known from the turns alone. Unnoticed, what is subtracted puts gyro_k 90 sigmas off, 1.7 times what is
+    required.
+    """
     options = {"camera": None, "reference": None, "magnetometer": None}
-    data, truth, config = _simulated(1, errors=Errors(gyro_bias=2e-3), **options)
-    stepped = np.round(data.gyro / resolution) * resolution if resolution else data.gyro
-    dead = replace(data, gyro=np.where(np.abs(stepped) < np.deg2rad(0.3), 0.0, stepped))
-    built, estimate, _ = _solved(dead, config)
-    assert "The gyro has a dead band: within 0.3" in " ".join(built.premises)
-    assert max(_sigmas_off(estimate, truth).values()) < 4.0
+    data, truth, config = _simulated(1, errors=Errors(gyro_bias=bias), **options)
+    within = np.abs(data.gyro) < np.deg2rad(0.3)
+    left = np.where(within, 0.0, data.gyro - subtracted * np.sign(data.gyro))
+    stepped = np.round(left / resolution) * resolution if resolution else left
+    built, estimate, _ = _solved(replace(data, gyro=stepped), config)
+    assert "The gyro has a dead band" in " ".join(built.premises)
+    assert max(_sigmas_off(estimate, truth | {"gyro_dead_band": subtracted}).values()) < 4.0
     sigmas = dict(zip(estimate.names, estimate.sigmas, strict=True))
-    assert 2e-4 < sigmas["gyro_b1"] < 2e-3
-    assert not problem(replace(data, gyro=stepped), config).premises
+    assert sigmas["gyro_b1"] > 2e-4
+
+
+@pytest.mark.parametrize("resolution", [0.0, np.deg2rad(1.0 / 131.0)])
+def test_a_gyro_that_counts_has_no_dead_band(resolution: float) -> None:
+    data, _, config = _simulated(1, camera=None, reference=None, magnetometer=None)
+    stepped = np.round(data.gyro / resolution) * resolution if resolution else data.gyro
+    built = problem(replace(data, gyro=stepped), config)
+    assert not built.premises
+    assert "gyro_dead_band" not in {q.name for q in built.quantities}
 
 
 @pytest.mark.parametrize(("length", "cut"), [(2.0, 0.475), (3.7, 0.575), (8.0, 0.575)])
