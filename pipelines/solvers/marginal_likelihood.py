@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from alidade.factors.chi_square import gate
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
-from alidade.pipelines.estimation.problem import Problem, Residuals
+from alidade.pipelines.estimation.problem import Residuals
 from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import certain_ratio, sigma_ratio
@@ -51,14 +51,12 @@ _MOST_STEPS, _LONGEST_STEP, _SETTLED = 12, 1.5, 0.05
 _HALVINGS, _FINE = 6, 1e-3
 # s, within which errors may be correlated however they are.
 SANDWICH_BLOCK_S = 5.0
-# Linearisations, of which the first ones widen; levels have settled whose logarithms move by less.
-_MOST_ROUNDS, _WIDENING_ROUNDS, _STEADY = 8, 2, 0.02
+# Linearisations before the first solution, solutions at most; levels have settled whose logarithms move by less.
+_ROUNDS, _MOST_SOLUTIONS, _STEADY = 2, 6, 0.05
 # Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`.
 _ABOVE = 2.0
 # By which another maximum has to lower -2 log L: what one more noise does by chance once in a thousand.
 _CLEARLY = 10.8
-# Of the gate, where measurements that are widened lie at most.
-_INSIDE = 0.9
 # Random right sides that estimate traces: a quarter of a level's own sigma.
 _SIGNS = 24
 # Innovations are predicted from so many keyframes before at least, in pieces of so many.
@@ -766,7 +764,7 @@ def _queue(state: Index, n: int) -> tuple[Index, Index, Index]:
 
 @dataclass(frozen=True, eq=False)
 class LikelihoodMaximum:
-    """Values and levels of the largest marginal likelihood.
+    """Values and levels of the largest marginal likelihood, or near it.
 
     Attributes:
         values: of all variables.
@@ -780,39 +778,34 @@ class LikelihoodMaximum:
     widening: Mapping[int, Array]
     outliers: Outliers
 
+    @classmethod
+    def near(cls, values: Values, levels: Sequence[Level], outliers: Outliers) -> LikelihoodMaximum:
+        """A start, nothing widened."""
+        return cls(values, tuple(levels), {}, outliers)
+
 
 def maximise_likelihood(
-    linearization: Linearization,
-    values: Values,
-    levels: Sequence[Level],
-    outliers: Outliers,
-    rounds: int = _MOST_ROUNDS,
+    linearization: Linearization, start: LikelihoodMaximum, rounds: int = _ROUNDS, from_above: bool = False
 ) -> LikelihoodMaximum:
     """Levels and values in turn: levels at a linearisation, a Gauss-Newton step with them, and again.
 
+    Nodes of a bias stay where they are.
+
     Args:
         linearization: of the factors, with the noise stated.
-        values: to begin with, near the solution.
-        levels: to begin with.
-        outliers: group -> (n,) which measurements are rejected.
+        start: values near the solution, levels, what is widened and rejected.
         rounds: linearisations.
+        from_above: whether another maximum is looked for, see `_from_above`.
     """
-    wide: dict[int, Array] = {}
-    found = tuple(levels)
     _, _, nodes, c, _ = linearization.layout.sizes
-    for number in range(rounds):
-        if deadline.passed():
-            break
-        chain = LinearChain.of(linearization, values)
-        before, found = found, estimate_levels(chain, found, wide, outliers, number < _WIDENING_ROUNDS).levels
-        if number < _WIDENING_ROUNDS:
-            wide, outliers = widened(chain, found, outliers)
-        states, shared = step(chain, found, wide, outliers)
-        values = linearization.layout.retract(values, Tangent(states, np.zeros((nodes, c)), shared))
-        changed = max((abs(np.log(a.scale / b.scale)) for a, b in zip(found, before, strict=True)), default=0.0)
-        if number >= _WIDENING_ROUNDS and changed < _STEADY:
-            break
-    return LikelihoodMaximum(values, found, wide, outliers)
+    for _ in range(rounds):
+        chain = LinearChain.of(linearization, start.values)
+        levels = estimate_levels(chain, start.levels, start.widening, start.outliers, from_above).levels
+        wide, outliers = widened(chain, levels, start.outliers)
+        states, shared = step(chain, levels, wide, outliers)
+        values = linearization.layout.retract(start.values, Tangent(states, np.zeros((nodes, c)), shared))
+        start = LikelihoodMaximum(values, levels, wide, outliers)
+    return start
 
 
 def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...] | None:
@@ -842,24 +835,14 @@ def rejected(engine: Linearization, values: Values) -> dict[int, NDArray[np.bool
     }
 
 
-def solution_at(
-    linearization: Linearization, problem: Problem, found: LikelihoodMaximum, config: LevenbergConfig
-) -> Solution:
-    """The solution near a maximum: outliers are rejected, all other measurements wide enough to count."""
-    weighted, groups = apply_levels(linearization, found.levels), []
-    for i, group in enumerate(weighted.groups):
-        if not group.is_measurement:
-            groups.append(group)
-            continue
-        weights = group.all_weights
+def _solution_at(linearization: Linearization, found: LikelihoodMaximum, config: LevenbergConfig) -> Solution:
+    """The solution near a maximum: outliers are left out, all else counts as wide as it is."""
+    groups = []
+    for i, group in enumerate(apply_levels(linearization, found.levels).groups):
         if i in found.widening:
-            weights = weights / found.widening[i][:, None]
-        if problem.loss is not None:
-            norms = np.linalg.norm(weights * group.evaluate(found.values)[0], axis=1)
-            by = np.maximum(norms / (_INSIDE * problem.loss.gate), 1.0)
-            weights = weights / np.where(found.outliers.get(i, np.zeros(len(by), bool)), 1.0, by)[:, None]
-        groups.append(replace(group, weights=weights))
-    return minimize(weighted.with_groups(groups).under(problem.loss), found.values, config)
+            group = replace(group, weights=group.all_weights / found.widening[i][:, None])
+        groups.append(group.counting(~found.outliers[i]) if i in found.outliers else group)
+    return minimize(linearization.with_groups(groups), found.values, config)
 
 
 def solve_likelihood(
@@ -874,21 +857,25 @@ def solve_likelihood(
         config: of the last minimisation.
     """
     problem, engine = compiled.problem, compiled.engine
-    values = solution.values
-    outliers: Outliers = rejected(solution.engine, values)
+    found = LikelihoodMaximum.near(solution.values, levels, rejected(solution.engine, solution.values))
     if problem.finer is not None:
-        first = maximise_likelihood(engine, values, levels, outliers, rounds=1)
-        values, levels, outliers = first.values, first.levels, first.outliers
-        finer = problem.finer(levels)
+        found = maximise_likelihood(engine, found, rounds=1, from_above=True)
+        finer = problem.finer(found.levels)
         if finer is not None:
-            known = compiled
-            compiled = Compiled.of(finer, "chain")
-            problem, engine = finer, compiled.engine
-            late = _times(known.engine.groups, outliers)
+            known, compiled = compiled, Compiled.of(finer, "chain")
+            engine = compiled.engine
+            late = _times(known.engine.groups, found.outliers)
             outliers = {i: np.isin(g.model.time, late) for i, g in enumerate(engine.groups) if g.is_measurement}
-            values = _with_parameters(compiled, known, values)
-    found = maximise_likelihood(engine, values, levels, outliers)
-    return compiled, solution_at(engine, problem, found, config), found.levels
+            found = LikelihoodMaximum.near(_with_parameters(compiled, known, found.values), found.levels, outliers)
+    for number in range(_MOST_SOLUTIONS):
+        before = found.levels
+        found = maximise_likelihood(engine, found, 1 if number else _ROUNDS, from_above=not number)
+        solution = _solution_at(engine, found, config)
+        found = replace(found, values=solution.values)
+        changed = max((abs(np.log(a.scale / b.scale)) for a, b in zip(found.levels, before, strict=True)), default=0.0)
+        if deadline.passed() or (number and changed < _STEADY):
+            break
+    return compiled, solution, found.levels
 
 
 def _times(groups: Sequence[Any], outliers: Outliers) -> Array:

@@ -34,6 +34,7 @@ from alidade.pipelines.solvers.levenberg import Solution
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import (
     NO_SAY,
+    LikelihoodMaximum,
     LinearChain,
     Outliers,
     Rows,
@@ -57,8 +58,6 @@ _GLITCH_S = 2.0
 _BLOCK = 1000
 # Fall of chi-square below which no candidate is solved again: 20 are needed for a change in a minute.
 NOTHING = 12.0
-# Linearisations with a step.
-_ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,7 +335,7 @@ def _maximised(
     engine: Linearization, values: Values, levels: Sequence[Level], outliers: Outliers, transient: Outliers
 ) -> _Fit:
     """Noise levels and values of the largest likelihood, from initial ones."""
-    best = maximise_likelihood(engine, values, levels, outliers, _ROUNDS)
+    best = maximise_likelihood(engine, LikelihoodMaximum.near(values, levels, outliers))
     return _Fit.of(engine, best.values, best.levels, transient)
 
 
