@@ -104,14 +104,14 @@ def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iter
 
     Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
     """
-    P, sigma, x = estimate.covariance, estimate.sigmas, estimate.values
+    P, sigma, x, sensitivities = estimate.covariance, estimate.sigmas, estimate.values, estimate.sensitivities
     nuisance = [j for j, q in enumerate(quantities) if (q.assumed or q.tight) and sigma[j] > 0.0]
     z = {j: prior_z_score(quantities[j], x[j], sigma[j], estimate.inflations[j]) or 0.0 for j in nuisance}
     left = sorted((j for j in nuisance if abs(z[j]) > LIMITS.prior_z), key=lambda j: -abs(z[j]))
     while left:
         j, worst = left[0], quantities[left[0]]
         same = [k for k in nuisance if k != j and abs(P[j, k]) > LIMITS.inseparable * sigma[j] * sigma[k]]
-        shift = P[:, j] / P[j, j] * (x[j] - worst.prior_mean)
+        shift = sensitivities[:, j] * (x[j] - worst.prior_mean)
         effect = {q.name: float(shift[i]) for i, q in enumerate(quantities) if q.required and shift[i]}
         material = any(abs(effect.get(q.name, 0.0)) >= LIMITS.material * q.require for q in quantities if q.required)
         severe = material and sigma[j] < LIMITS.determined * worst.scale

@@ -638,6 +638,22 @@ class Estimate:
         return self.solver == "incremental" and not self.concluded
 
     @property
+    def sensitivities(self) -> Array:
+        """Shift (n, n) of each number, a row, per unit by which another, a column, is shifted; 0 for fixed ones.
+
+        Of the covariance without slow errors: these widen each number by itself.
+        """
+        widened = slow_widening(self.sandwich, len(self.values))
+        P = self.covariance / np.outer(widened, widened)
+        variances = np.diag(P)
+        return P / np.where(variances > 0.0, variances, np.inf)
+
+    @property
     def inflations(self) -> Array:
         """Inflation (n,), ones where `inflation` is None."""
         return np.ones(len(self.values)) if self.inflation is None else self.inflation
+
+
+def slow_widening(sandwich: Array | None, n: int) -> Array:
+    """Factor (n,) of sigmas for slow errors, given ratios of sandwich to nominal sigma; None: not looked for."""
+    return np.ones(n) if sandwich is None else np.where(sandwich > SLOW_ERROR, sandwich, 1.0)

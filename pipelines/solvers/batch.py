@@ -21,7 +21,6 @@ import numpy as np
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
-    SLOW_ERROR,
     Array,
     EngineName,
     Estimate,
@@ -29,6 +28,7 @@ from alidade.pipelines.estimation.problem import (
     Problem,
     Residuals,
     SqrtInformation,
+    slow_widening,
 )
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
@@ -233,7 +233,7 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
         innovations = innovations_of(compiled, solved.levels, solved.solution) if budget else innovations
         steps = largest_steps(compiled, solved.levels, solved.solution)
-        widened = np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
+        widened = slow_widening(sandwich, len(names))
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
     history = posterior_history(compiled, posterior)
     residuals = residuals_by_family(engine, values)

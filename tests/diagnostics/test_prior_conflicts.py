@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,14 @@ def test_conflict_counts_where_determined_and_material(correlation: float, sigma
     assert found.severity == severity
     shift = correlation * 1e-3 / sigma * value
     assert found.evidence["effect"]["angle"] == pytest.approx(shift)
+
+
+def test_slow_errors_of_a_nuisance_parameter_leave_its_effect_as_it_is() -> None:
+    """The sandwich widens each number by itself: eight times the sigma of a clock once hid what its skew does."""
+    plain, widened = estimate([0.0, 0.08], [1e-3, 1e-3], 0.5), np.array([1.0, 4.0])
+    slow = replace(plain, covariance=plain.covariance * np.outer(widened, widened), sandwich=widened)
+    (found,) = conflicts(slow, [REQUIRED, assumption("b")])
+    assert found.evidence["effect"]["angle"] == pytest.approx(0.04)
 
 
 def test_a_calibrated_parameter_far_from_its_prior_is_a_note() -> None:
