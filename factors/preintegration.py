@@ -102,6 +102,7 @@ class GyroPath:
         self._driving = np.empty((len(self.t), 0)) if drivers is None else np.asarray(drivers, dtype=float)
         if self._driving.ndim != 2 or len(self._driving) != len(self.read):
             raise ValueError(f"needs drivers for each rate; got {self._driving.shape} and {self.read.shape}")
+        self._density = density
         self._unseen = _unseen_variance(self.t, self.read, density)
         self.interval = float(np.median(np.diff(self.t)))
         self._last = (len(self.t) - 2) // _BLOCK
@@ -110,6 +111,10 @@ class GyroPath:
         self._starts = [so3.identity(1)]
         for number in range(self._last + 1):
             self._starts.append(self._block(number).attitude[-1:].copy())
+
+    def with_rate(self, rate: Array) -> GyroPath:
+        """The same stream with other rates (N, 3), rad/s."""
+        return GyroPath(self.t, rate, self.bias_hat, self._driving, self._density)
 
     def _block(self, number: int) -> _Block:
         """The integrated block of sample intervals with this number."""

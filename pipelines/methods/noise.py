@@ -123,11 +123,29 @@ def at_least_at_rest(level: Level, time: Array, gyro: Array, force: Array | None
     """
     if not level.noise.estimated:
         return level
-    spans = stretches_at_rest(time, [gyro] if force is None else [gyro, force], gyro)
-    pieces = [gyro[(time >= begin) & (time <= end)] for begin, end in spans]
+    pieces = [gyro[rest] for rest in _rests(time, gyro, force)]
     interval = float(np.median(np.diff(time)))
     found = min((_rest_density(pieces, max(1, round(mean / interval)), interval) for mean in _REST_MEANS), default=0.0)
     return replace(level, noise=replace(level.noise, least=found / level.noise.stated))
+
+
+def mean_at_rest(time: Array, gyro: Array, force: Array | None) -> Array:
+    """The rates (n, 3) of a gyro, those at rest by their mean over the interval at rest.
+
+    What a sensor turns within milliseconds at rest is not what its noise says. The same array of a recording without
+    rest; arguments as `at_least_at_rest` has them.
+    """
+    out = gyro
+    for rest in _rests(time, gyro, force):
+        out = gyro.copy() if out is gyro else out
+        out[rest] = gyro[rest].mean(axis=0)
+    return out
+
+
+def _rests(time: Array, gyro: Array, force: Array | None) -> list[slice]:
+    """Samples of each interval at rest."""
+    spans = stretches_at_rest(time, [gyro] if force is None else [gyro, force], gyro)
+    return [slice(*np.searchsorted(time, span) + [0, 1]) for span in spans]
 
 
 def _rest_density(pieces: Sequence[Array], count: int, interval: float) -> float:

@@ -104,6 +104,21 @@ class Solved:
     second: Minimum | None = None
 
     @property
+    def converged(self) -> bool:
+        """Whether the values are a minimum, over all directions or over all but weak ones, which are at their priors.
+
+        Along these the cost is what noise makes it: a minimum there is none of the recording's.
+        """
+        constrained = self.posterior.converged and self.posterior.directions.weak.shape[1] > 0
+        return self.solution.converged or (constrained and not deadline.passed())
+
+    @property
+    def message(self) -> str:
+        """How the solution converged, or why not."""
+        at_priors = self.converged and not self.solution.converged
+        return "converged with weak directions at their priors" if at_priors else self.solution.message
+
+    @property
     def engine(self) -> Linearization:
         """The engine of the graph, with the weights of the solution, without what is rejected."""
         return self.posterior.at.engine
@@ -246,8 +261,8 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
         sandwich=sandwich,
         steps=steps,
         colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in correlations.items()},
-        converged=solved.solution.converged,
-        message=solved.solution.message,
+        converged=solved.converged,
+        message=solved.message,
         residuals=residuals,
         innovations=innovations,
         chi_square=chi_square(leverages(engine, found.system, found.factorization, values)),

@@ -47,3 +47,16 @@ def test_batch_names_the_motion_that_is_missing(make: Callable[[int], Problem], 
     # Nothing is made up: what is not known is within what the prior allows.
     prior = np.array([q.scale for q in problem.quantities])
     assert (np.abs(estimate.values) < 2.5 * prior).all()
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+def test_vision_better_than_the_gyro_tells_no_time_offset_at_rest(seed: int) -> None:
+    """Gyro noise turns what is seen by the time offset: 320 pictures of 50 urad once gave it to 2 ms."""
+    noise = HEAD.noise.model_copy(update={"vision_attitude": 5e-5})
+    clean = HEAD.model_copy(update={"duration_s": 8.0, "vision_rate_hz": 40.0, "noise": noise})
+    problem = head.problem(simulate_head(clean, seed)[0], load_config(head_config(clean).encode()))
+    estimate = solve_batch(problem)
+    assert estimate.converged, estimate.message
+    offset = estimate.names.index("time_offset")
+    assert estimate.sigmas[offset] == pytest.approx(problem.quantities[offset].scale, rel=1e-3)
+    assert judge(problem.quantities, estimate.covariance, None, problem.advice).status == "unobservable"

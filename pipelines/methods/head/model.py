@@ -34,7 +34,7 @@ from alidade.pipelines.methods.head.initial_values import guess, guess_picture_c
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import at_gyro_rate
-from alidade.pipelines.methods.noise import at_least_at_rest, estimated, sampled, stated, typical
+from alidade.pipelines.methods.noise import at_least_at_rest, estimated, mean_at_rest, sampled, stated, typical
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
@@ -62,6 +62,7 @@ class _Model:
     """The recording prepared for the graph: what every step needs."""
 
     chain: GyroChain  # bRv at the keyframes
+    carriers: tuple[GyroPath, GyroPath | None]  # of the helmet and the platform, without the noise at rest
     pictures: NDArray[np.intp]  # (K + 1,) those of keyframe k are from pictures[k] to pictures[k + 1]
     stamps: Array  # (frames,)
     taken: Array  # (frames,) s, about when
@@ -236,6 +237,7 @@ def _prepare(
     )
     return _Model(
         chain=chain,
+        carriers=(_carrier(gyro, data.head_force), None if platform is None else _carrier(platform, None)),
         pictures=pictures,
         stamps=stamps,
         taken=taken,
@@ -251,6 +253,15 @@ def _prepare(
         reference=reference,
         noises=noises,
     )
+
+
+def _carrier(gyro: GyroPath, force: Array | None) -> GyroPath:
+    """The gyro that carries attitudes from keyframes to pictures, its rates at rest by their mean.
+
+    The time offset turns what is seen by the rate: at rest by noise, which tells nothing of it but seems to.
+    """
+    rate = mean_at_rest(gyro.t, gyro.read, force)
+    return gyro if rate is gyro.read else gyro.with_rate(rate)
 
 
 def _between(gyro: GyroPath, platform: GyroPath | None, taken: Array, bRv: Array, at: Array) -> Array:
@@ -349,8 +360,7 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
         model.stamps[rows],
         model.measured[rows],
         model.sqrt_information[rows],
-        chain.gyro,
-        chain.platform,
+        *model.carriers,
         errors=0 if p.gyro is None else len(p.gyro.quantities),
         platform_errors=p.platform is not None,
         anchor=chain.time[of],
