@@ -191,6 +191,10 @@ class GyroPath:
         before, slope = self._line(i, _drivers)
         return np.asarray(before + slope * s)
 
+    def unseen(self, start: Array, stop: Array) -> Array:
+        """`Increments.unseen` (n,) over windows, rad^2 per axis."""
+        return np.abs(np.interp(stop, *self._unseen) - np.interp(start, *self._unseen))
+
     def increments(self, start: ArrayLike, stop: ArrayLike, scale: bool = False) -> Increments:
         """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
 
@@ -232,7 +236,7 @@ class GyroPath:
             wxyz=so3.multiply(so3.inverse(q0), q1),
             bias_jacobian=to_end @ ((c1 - c0) + (p1 - p0)),
             rate=_rate(w0[n:], a[n:], s[n:], arc[n:]),
-            unseen=np.abs(np.interp(stop, *self._unseen) - np.interp(start, *self._unseen)),
+            unseen=self.unseen(start, stop),
         )
         if not scale:
             return turned

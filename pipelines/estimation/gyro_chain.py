@@ -80,7 +80,8 @@ class GyroChain:
         initial: (K, 4) first guess of the attitudes.
         gyro: integrated with the first guess of the bias taken off.
         turns: (K - 1,) increments from keyframe to keyframe.
-        variance: (K - 1,) of each, rad^2 per axis.
+        variance: (K - 1,) of each, rad^2 per axis, what the sensors do not see in gaps included.
+        unseen: (K - 1,) part of it that is no noise: what the sensors may have turned in gaps of their records.
         bias: its nodes over the keyframes.
         nodes: (K,) whole numbers: the node in force up to each keyframe.
         errors: of the gyro, as alidade.factors.gyro has them; None: perfect.
@@ -96,6 +97,7 @@ class GyroChain:
     gyro: GyroPath
     turns: Increments
     variance: Array
+    unseen: Array
     bias: WalkingBias
     nodes: Index
     errors: Parameter | None = None
@@ -148,6 +150,7 @@ class GyroChain:
             gyro=gyro,
             turns=turns,
             variance=(density**2 + other_density**2) * turns.duration + unseen,
+            unseen=unseen,
             bias=bias,
             nodes=bias.node_at(middles),
             errors=errors,
@@ -224,8 +227,8 @@ class GyroChain:
             self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform, self.share
         )
         turned = np.linalg.norm(so3.log(turns.wxyz), axis=1)
-        beside = turned / np.sqrt(turns.duration * variance)
-        return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys), beside)]
+        beside, fixed = turned / np.sqrt(turns.duration * variance), self.unseen[after - 1] / variance
+        return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys), beside, fixed)]
 
     def predict(
         self, keyframes: range, seen: Callable[[int, gtsam.Values], Array], current: gtsam.Values

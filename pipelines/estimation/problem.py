@@ -202,6 +202,7 @@ class Factor:
             solver gates its innovation, reports plot its residuals.
         process: the vectorised factor behind it when it is none.
         beside: (n,) what a unit of the noise beside its own adds to the whitened residuals, see Noise.beside.
+        fixed: (n,) part of the variance by which it is whitened that is no noise, and that no level scales.
     """
 
     family: str
@@ -209,6 +210,7 @@ class Factor:
     measurement: BoundModel | None = None
     process: BoundModel | None = None
     beside: Array | None = None
+    fixed: Array | None = None
 
     @classmethod
     def of(cls, family: str, measurement: BoundModel, beside: Array | None = None) -> Factor:
@@ -216,9 +218,11 @@ class Factor:
         return cls(family, measurement=measurement, beside=beside)
 
     @classmethod
-    def process_of(cls, family: str, process: BoundModel, beside: Array | None = None) -> Factor:
+    def process_of(
+        cls, family: str, process: BoundModel, beside: Array | None = None, fixed: Array | None = None
+    ) -> Factor:
         """A factor that joins variables and is never an outlier."""
-        return cls(family, process=process, beside=beside)
+        return cls(family, process=process, beside=beside, fixed=fixed)
 
     @property
     def factor(self) -> gtsam.NonlinearFactor:

@@ -85,6 +85,7 @@ class Group:
         factors: (n,) position of the factor of each in the problem's factors.
         is_measurement: whether they may be outliers, and not processes or priors.
         beside: (n,) what a unit of the noise beside their own adds to whitened residuals, or None.
+        fixed: (n,) part of the variance by which they are whitened that no level scales, or None.
         gather: for each block its kind and the rows (n or 1,) of its variables in that kind's array.
         at: for each block the positions (n or 1,) of its variables in the layout.
         target: "state": rows about one keyframe; "pair": rows that join it to the one before; "walk": rows about nodes
@@ -104,6 +105,7 @@ class Group:
     factors: Index
     is_measurement: bool
     beside: Array | None
+    fixed: Array | None
     gather: list[tuple[Block, Index]]
     at: list[Index]
     target: str
@@ -200,6 +202,7 @@ class Group:
             weights=None if self.weights is None else self.weights[some],
             factors=self.factors[some],
             beside=None if self.beside is None else self.beside[some],
+            fixed=None if self.fixed is None else self.fixed[some],
             gather=[(block, own(rows)) for block, rows in self.gather],
             at=[own(each) for each in self.at],
             place=self.place[some],
@@ -255,7 +258,9 @@ class Linearization:
         for i, factor in enumerate(factors):
             v = factor.bound or _native(factor, layout)
             key = stacking_key(v.model), layout.roles(v.columns), factor.family, factor.measurement is None
-            kinds.setdefault((*key, v.loss is None, factor.beside is None), []).append((i, factor, v))
+            kinds.setdefault((*key, v.loss is None, factor.beside is None, factor.fixed is None), []).append(
+                (i, factor, v)
+            )
         drafts = [_Draft.of(kind, layout, chain) for kind in kinds.values()]
         piece = _pieces(drafts, layout) if chain else np.zeros(layout.sizes[0], dtype=np.intp)
         used = np.zeros((2, layout.sizes[0]), dtype=np.intp)
@@ -463,11 +468,6 @@ class _Draft:
             shapes = [(length, model.rows) for length in lengths]
             known = [np.ones(s) if e.weights is None else e.weights for (*_, e), s in zip(kind, shapes, strict=True)]
             weights = np.concatenate(known)
-        beside = None
-        if first.beside is not None:
-            beside = np.concatenate(
-                [np.broadcast_to(np.asarray(f.beside), length) for (_, f, _), length in zip(kind, lengths, strict=True)]
-            )
         frames = [np.broadcast_to(layout.keyframe[each], n) for each in at if (layout.keyframe[each] >= 0).any()]
         # At keyframes the first node, given by one key for all measurements, is the bias as a whole.
         whole = [
@@ -494,7 +494,8 @@ class _Draft:
             weights=weights,
             factors=np.repeat([i for i, *_ in kind], lengths),
             is_measurement=first.measurement is not None,
-            beside=beside,
+            beside=_joined([f.beside for _, f, _ in kind], lengths),
+            fixed=_joined([f.fixed for _, f, _ in kind], lengths),
             gather=[(layout.blocks[layout.block[each[0]]], layout.row[each]) for each in at],
             at=at,
             target="",
@@ -565,6 +566,12 @@ def _positions(columns: Sequence[int | list[int]], lengths: Sequence[int], layou
         at = layout.at([int(column) for column in columns if isinstance(column, int)])
         return at[:1] if (at == at[0]).all() else np.repeat(at, lengths)
     return _single(layout.at(np.concatenate([np.asarray(column, dtype=np.intp) for column in columns])))
+
+
+def _joined(parts: Sequence[Array | None], lengths: Sequence[int]) -> Array | None:
+    """Numbers (n,) of the measurements of all factors; None where no factor has any."""
+    each = [np.broadcast_to(p, length) for p, length in zip(parts, lengths, strict=True) if p is not None]
+    return np.concatenate(each) if each else None
 
 
 def _below(place: Index, rows: int, used: Index) -> Index:

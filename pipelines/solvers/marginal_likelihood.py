@@ -77,6 +77,7 @@ class Rows:
         states: the states (n,) that they are about, none, one or two, and Jacobians (n, m, d).
         shared: (n, m, p).
         beside: (n,) what a unit of the noise beside their own adds, or None.
+        fixed: (n,) part of the stated variance that no level scales, or None.
         is_measurement: whether they may be outliers.
     """
 
@@ -87,13 +88,14 @@ class Rows:
     states: tuple[tuple[Index, Array], ...]
     shared: Array
     beside: Array | None
+    fixed: Array | None
     is_measurement: bool
 
     def of(self, kept: NDArray[np.bool_], renumbered: Index) -> Rows:
         """Selected rows, their states renumbered."""
         states = tuple((renumbered[i[kept]], J[kept]) for i, J in self.states)
-        beside = None if self.beside is None else self.beside[kept]
-        parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside)
+        beside, fixed = (None if each is None else each[kept] for each in (self.beside, self.fixed))
+        parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside, fixed)
         return Rows(self.family, self.group, *parts, self.is_measurement)
 
 
@@ -153,6 +155,7 @@ class LinearChain:
                     states,
                     whole[..., begin:-1],
                     group.beside,
+                    group.fixed,
                     group.is_measurement,
                 )
             )
@@ -653,12 +656,18 @@ def _present(chain: LinearChain, level: Level) -> bool:
     )
 
 
-def _variance(rows: Rows, levels: Sequence[Level]) -> Array:
-    """Variance (n,) of rows over the stated one."""
-    out = np.ones(len(rows.time))
+def _own(rows: Rows, levels: Sequence[Level]) -> Array:
+    """What their own noise makes of the variance (n,) of rows, over the stated one."""
+    out = np.ones(len(rows.time)) if rows.fixed is None else 1.0 - rows.fixed
     for level in levels:
         if rows.family in level.noise.families and not level.noise.beside:
             out *= level.scale**2
+    return out
+
+
+def _variance(rows: Rows, levels: Sequence[Level]) -> Array:
+    """Variance (n,) of rows over the stated one."""
+    out = _own(rows, levels) + (0.0 if rows.fixed is None else rows.fixed)
     for level in levels:
         if rows.family in level.noise.families and level.noise.beside and rows.beside is not None:
             out += (level.used * rows.beside) ** 2
@@ -680,15 +689,9 @@ def _parts(chain: LinearChain, levels: Sequence[Level], which: int) -> list[Arra
         if rows.family not in level.noise.families or (level.noise.beside and rows.beside is None):
             out.append(np.zeros(len(rows.time)))
             continue
-        beside = own = np.zeros(len(rows.time))
-        for other in levels:
-            if other.noise.beside and rows.family in other.noise.families and rows.beside is not None:
-                part = (other.used * rows.beside) ** 2
-                beside = beside + part
-                if other is level:
-                    own = part
-        if not level.noise.beside:
-            own = _variance(rows, levels) - beside
+        own = _own(rows, levels)
+        if level.noise.beside and rows.beside is not None:
+            own = (level.used * rows.beside) ** 2
         out.append(own / _variance(rows, levels))
     return out
 

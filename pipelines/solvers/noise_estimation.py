@@ -117,23 +117,25 @@ def apply_levels(engine: Linearization, levels: Sequence[Level]) -> Linearizatio
 
 def _at_levels(group: Group, levels: Sequence[Level]) -> Group:
     own = [level for level in levels if group.family in level.noise.families]
-    return replace(group, weights=level_weights(group.all_weights, own, group.beside)) if own else group
+    return replace(group, weights=level_weights(group.all_weights, own, group.beside, group.fixed)) if own else group
 
 
-def level_weights(weights: Array, levels: Iterable[Level], beside: Array | None) -> Array:
+def level_weights(weights: Array, levels: Iterable[Level], beside: Array | None, fixed: Array | None = None) -> Array:
     """Weights (n, m) of measurements with their noise at these levels, over what they were whitened by.
 
     Args:
         weights: (n, m) beside the levels.
         levels: of their noises.
         beside: (n,) what a unit of an additional noise adds to the whitened residuals.
+        fixed: (n,) part of the variance that no level scales.
     """
-    weights = weights.copy()
+    weights, share = weights.copy(), np.zeros(len(weights)) if fixed is None else fixed
     for level in levels:
         if level.noise.beside:
             weights = (weights**-2.0 + _additional(beside, level.used)) ** -0.5
         else:
-            weights[:, _rows(level.noise, weights.shape[1])] /= level.scale
+            by = np.sqrt(share + (1.0 - share) * level.scale**2)
+            weights[:, _rows(level.noise, weights.shape[1])] /= by[:, None]
     return weights
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import cast
 
 import gtsam
@@ -267,8 +268,9 @@ def _weighed(factor: Factor, levels: Sequence[Level]) -> Factor:
     bound = factor.bound
     if bound is not None:
         stated = np.ones((len(bound.model.time), bound.model.rows)) if bound.weights is None else bound.weights
-        of = Factor.process_of if factor.measurement is None else Factor.of
-        return of(factor.family, bound.weighed(level_weights(stated, own, factor.beside)), factor.beside)
+        weighed = bound.weighed(level_weights(stated, own, factor.beside, factor.fixed))
+        is_process = factor.measurement is None
+        return replace(factor, process=weighed) if is_process else replace(factor, measurement=weighed)
     native = cast(gtsam.NoiseModelFactor, factor.factor)
     for level in own:
         noise = cast(gtsam.noiseModel.Gaussian, native.noiseModel())

@@ -14,7 +14,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.methods.head.recording import HeadData
-from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.linearization import Linearization
@@ -159,3 +159,32 @@ def test_white_noise_and_noise_that_grows_with_the_rate_are_told_apart(density: 
     larger = int(np.argmax(true))
     assert found[larger] == pytest.approx(true[larger], rel=0.25)
     assert found[1 - larger] < 0.2 * found[larger]
+
+
+@cache
+def levels_with(gap_s: float, pictures_too: bool) -> dict[str, float]:
+    """Levels found of a recording without samples for a while, and without pictures then."""
+    noise = HeadNoise(gyro_density=2e-4, vision_attitude=1e-3)
+    data, _ = simulate_head(SCENARIO.model_copy(update={"platform": None, "noise": noise}), 3)
+    gyro, vision = (np.abs(t - 15.0) >= 0.5 * gap_s for t in (data.head_t, data.vision_t))
+    vision |= not pictures_too
+    left = replace(
+        data,
+        head_t=data.head_t[gyro],
+        head_gyro=data.head_gyro[gyro],
+        head_force=None,
+        gyro_density=None,
+        vision_t=data.vision_t[vision],
+        vision_wxyz=data.vision_wxyz[vision],
+        vision_cov=None,
+    )
+    estimate = solve_batch(methods.method("head").problem(left, load_config(None)))
+    return {level.noise.name: level.used for level in estimate.levels}
+
+
+@pytest.mark.parametrize("pictures_too", [False, True])
+def test_what_turns_in_a_gap_is_no_noise(pictures_too: bool) -> None:
+    """A second without samples once left the gyro a tenth of its density, and pictures in it 6 % more noise."""
+    whole, gap = levels_with(0.0, False), levels_with(1.0, pictures_too)
+    assert gap["gyro_density"] == pytest.approx(whole["gyro_density"], rel=0.15)
+    assert gap["vision_attitude"] == pytest.approx(whole["vision_attitude"], rel=0.02)

@@ -356,10 +356,13 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     if len(rows) == 0:
         return []
     chain, p = model.chain, model.parameters
+    # Carried through a gap of the gyro's record a picture says less of its keyframe.
+    information, unseen = model.sqrt_information[rows], chain.gyro.unseen(chain.time[of], model.taken[rows])
+    less = 1.0 / np.sqrt(1.0 + unseen * np.square(information).sum(axis=(1, 2)) / 3.0)
     seen = VisionAttitudeFactor(
         model.stamps[rows],
         model.measured[rows],
-        model.sqrt_information[rows],
+        information * less[:, None, None],
         *model.carriers,
         errors=0 if p.gyro is None else len(p.gyro.quantities),
         platform_errors=p.platform is not None,
