@@ -80,7 +80,7 @@ def solve_robust(engine: Linearization, values: Values, loss: TruncatedLoss | No
     iterations += more + final.iterations
     for softness in config.softness:
         lost = zip(truncated.groups, final.engine.groups, strict=True)
-        if not any(before.loss is not None and after.loss is None for before, after in lost):
+        if deadline.passed() or not any(before.loss is not None and after.loss is None for before, after in lost):
             break
         again = solve_truncated(engine, _hardened(engine, values, softness, loss, config), loss, config)
         iterations += again.iterations
@@ -99,7 +99,7 @@ def _hardened(
     few = replace(config.minimizer, max_iterations=config.rough_iterations, corrections=0)
     values = minimize(_soft(engine.under(None), softness), values, few).values
     few = replace(few, max_iterations=config.hardening_iterations)
-    while softness > 1.0:
+    while softness > 1.0 and not deadline.passed():
         relaxed = _soft(engine.under(replace(loss, mu=config.hardening_mu)), softness)
         values = minimize(relaxed, values, few).values
         softness /= config.mu_step
