@@ -12,6 +12,7 @@ import pytest
 
 import alidade
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.indexer import base_from_platform, mounting
 from alidade.factors.los import LosDirectionFactor
 from alidade.pipelines.config import load_config
@@ -21,8 +22,6 @@ from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.reports.calibration import calibration_yaml
 from alidade.pipelines.settings import Config
 from tests.support.formulas import CASES
-
-Array = so3.Array
 
 
 class Rotation:
