@@ -7,7 +7,7 @@ from rich.console import Console
 
 from alidade.pipelines import progress
 from alidade.pipelines.parallel import processes
-from alidade.pipelines.vision import parallel
+from alidade.pipelines.vision import tags
 from benchmarks.detection import cube_picture
 
 
@@ -32,13 +32,13 @@ def test_quiet_is_silent_on_a_terminal_and_the_others_are_not(
 def test_tags_by_several_processes_are_those_by_one_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     import cv2
 
-    monkeypatch.setattr(parallel, "_MANY", 3)
+    monkeypatch.setattr(tags, "_MANY", 3)
     camera, picture = cube_picture()
     encoded = cv2.imencode(".png", picture)[1].tobytes()
     images = [(k, encoded if k % 4 else b"broken") for k in range(8)]
-    alone = list(parallel.detections(images, camera=camera))
+    alone = list(tags.detections(images, camera=camera))
     with processes(2):
-        together = list(parallel.detections(iter(images), camera=camera))
+        together = list(tags.detections(iter(images), camera=camera))
     assert [t for t, _ in together] == [t for t, _ in alone] == list(range(8))
     for (_, a), (_, b) in zip(together, alone, strict=True):
         assert (a is None) == (b is None)
