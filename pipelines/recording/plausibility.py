@@ -66,8 +66,13 @@ def implausible(kind: str, values: Array) -> str:
     low, high = _PLAUSIBLE[kind]
     if low <= norm <= high:
         return ""
-    likely = next((unit for unit, (a, b) in _LIKELY[kind].items() if a <= norm < b), None)
+    likely = likely_unit(kind, norm)
     return f"{problem}{f'; is it in {likely}?' if likely else ''}"
+
+
+def likely_unit(kind: str, norm: float) -> str:
+    """The unit other than SI in which an accelerometer or a magnetometer has a median norm; empty where none has it."""
+    return next((unit for unit, (low, high) in _LIKELY[kind].items() if low <= norm < high), "")
 
 
 def lacks_gravity(norms: Array) -> bool:

@@ -204,8 +204,8 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     percent = "%"
     if plain and max(abs(row.value) + row.sigma for row in scale) < 100.0 * _PPM:
         scale, percent = [row.times(1e4) for row in scale], "ppm"
-    raw = unit.partition("/")[2]
-    bias_unit, factor = ("counts", 1.0) if raw == "count" else _BIAS_UNITS[sensor]
+    in_counts = unit.endswith("/count")
+    bias_unit, factor = ("counts", 1.0) if in_counts else _BIAS_UNITS[sensor]
     groups = [
         ResultGroup("Scale error about mean" if relative else "Scale error", percent, tuple(scale)),
         ResultGroup("Non-orthogonality", "deg", tuple(row.times(_DEG) for row in rows[3:6])),
@@ -215,17 +215,17 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     if symmetric:
         groups[2] = ResultGroup("Misalignment", "", (), "0 by definition: it defines the body's axes")
     if common is not None and not unit.startswith("1/"):
-        groups.insert(0, _overall(rows[12], common, raw))
+        groups.insert(0, _overall(rows[12], common, in_counts))
     return ResultCard(SENSORS[sensor].capitalize(), tuple(groups))
 
 
-def _overall(row: ResultRow, common: DerivedNumber, raw: str) -> ResultGroup:
+def _overall(row: ResultRow, common: DerivedNumber, in_counts: bool) -> ResultGroup:
     """The mean scale, whose error all axes have in common; of counts per µT."""
     require = None if common.require is None else common.require * row.value
     by_strength = common.verdict != "observable" or row.sigma <= (require or np.inf)
     row = replace(row, require=require, verdict=common.verdict if by_strength else row.verdict)
-    if raw:
-        return ResultGroup("Mean scale", f"{raw}s/µT", (row.times(1e-6),))
+    if in_counts:
+        return ResultGroup("Mean scale", "counts/µT", (row.times(1e-6),))
     return ResultGroup("Mean scale error", "%", (replace(row, value=row.value - 1.0).times(100.0),))
 
 

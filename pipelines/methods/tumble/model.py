@@ -17,7 +17,7 @@ from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_o
 from alidade.pipelines.display.sphere_map import described
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import ROUGHLY, Noise
-from alidade.pipelines.estimation.parameters import ParameterSpec, parameter
+from alidade.pipelines.estimation.parameters import SENSORS, ParameterSpec, parameter
 from alidade.pipelines.estimation.parameters import stated as sheet
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
@@ -30,6 +30,7 @@ from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, NO_RATE, TumbleData
 from alidade.pipelines.methods.tumble.ring import ring
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
+from alidade.pipelines.recording.plausibility import SI, likely_unit
 from alidade.pipelines.settings import Config
 
 # Plausible norms of readings with their offset, SI; others are counts.
@@ -234,6 +235,7 @@ def prepare(data: TumbleData, config: Config) -> Model:
                 "No position, so that the field's strength is unknown and called 1: K and b give the field in units of "
                 "it; state latitude_deg and longitude_deg, or field.strength, in the config for T."
             )
+    premises += [note for sensor in sensors if not sensor.is_si and (note := _maybe_a_unit(sensor))]
     gyro, more = _gyro(data, sensors)
     premises += more
     if gyro is None and more and len(sensors) > 1 and _is_upright(replace(data, gyro=None), rests):
@@ -264,6 +266,18 @@ def prepare(data: TumbleData, config: Config) -> Model:
         tuple(premises),
         data.dropped,
         None if modelled is None else modelled[0],
+    )
+
+
+def _maybe_a_unit(sensor: Sensor) -> str:
+    """Note on readings that count as counts, but whose size is that of a unit; empty on others."""
+    size = float(np.median(np.linalg.norm(sensor.raw, axis=1)))
+    unit, kind = likely_unit(sensor.name, size), {"accel": "accel", "mag": "field"}[sensor.name]
+    if not unit or "counts" in unit:
+        return ""
+    return (
+        f"{SENSORS[sensor.name].capitalize()}: a norm of {size:.3g} is none in {SI[sensor.name]}, so it is read as "
+        f"counts; if it is in {unit}, state `units: {{{kind}: {unit}}}` beside its `columns`, or convert it."
     )
 
 

@@ -42,6 +42,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import Recording, open_recording
+from alidade.pipelines.reports.results_table import result_cards
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.simulation.sensors import Warming
@@ -260,6 +261,20 @@ def _counted(rests: int, seed: int) -> tuple[float, int]:
     rows = [i for i, name in enumerate(estimate.names) if name in own]
     error = estimate.values[rows] - np.array([own[estimate.names[i]] for i in rows])
     return float(error @ np.linalg.solve(estimate.covariance[np.ix_(rows, rows)], error)), len(rows)
+
+
+def test_bias_of_readings_in_counts_is_shown_in_counts() -> None:
+    """A bias in g printed as mg/9.8, before: the unit m/s^2/count has two slashes."""
+    simulated = _simulated(replace_scenario(RESTING, magnetometer=None), 1)
+    assert simulated.data.accel is not None
+    in_g = replace(simulated, data=replace(simulated.data, accel=simulated.data.accel / 9.80665, accel_density=None))
+    calibration = Session.of(TUMBLE, in_g).calibrate()
+    (card,) = result_cards(calibration)
+    bias = card.groups[-1]
+    K, b = triad_of("accel", calibration.values)
+    assert bias.unit == "counts"
+    assert [row.value for row in bias.rows] == pytest.approx((-np.linalg.solve(K, b)).tolist())
+    assert any("if it is in g, state `units: {accel: g}`" in note for note in calibration.notes)
 
 
 @pytest.mark.parametrize("rests", [10, 12])
