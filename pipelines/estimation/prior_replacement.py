@@ -83,7 +83,7 @@ def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier
     if not replaced:
         return problem
     replacements = {
-        name: replace(own[name], prior_mean=float(mean), prior_sigma=float(sigma))
+        name: replace(own[name], prior_mean=float(mean), prior_sigma=float(sigma), sheet="")
         for name, mean, sigma in zip(known.names, known.mean, known.sigmas, strict=True)
         if name in replaced
     }

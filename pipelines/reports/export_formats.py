@@ -91,7 +91,7 @@ def ros_parameters(saved: SavedCalibration, names: Collection[str]) -> str:
         stem, _, axis = name.rpartition("_")
         triple = [f"{stem}_{each}" for each in "xyz"]
         if axis in "xyz" and all(each in saved.parameters for each in triple):
-            content.setdefault(stem, [saved.parameters[each].in_formulas for each in triple])
+            content.setdefault(stem, [saved.parameters[each].in_formulas if each in names else 0.0 for each in triple])
         else:
             content[name] = saved.parameters[name].in_formulas
     lines = ["/**:", "  ros__parameters:", "    alidade:"]

@@ -19,6 +19,7 @@ import numpy as np
 
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.device_changes import Changes
+from alidade.pipelines.diagnostics.diagnose import LIMITS
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest, SolverDifference
 from alidade.pipelines.diagnostics.observability import (
     DerivedNumber,
@@ -346,13 +347,16 @@ class Calibration(SensorValues):
 
     @property
     def applied(self) -> list[str]:
-        """The parameters, of the assumptions those that the recording determines."""
-        sigmas = {name: parameter.sigma for name, parameter in self.parameters.items()}
-        return [
-            q.name
-            for q in self.problem.quantities
-            if q.group is None or (q.name in sigmas and q.determined(sigmas[q.name]))
-        ]
+        """The parameters, without nuisance parameters of which the recording says no more than their prior mean, 0."""
+        given = self.parameters
+        return [q.name for q in self.problem.quantities if q.group is None or self._says(q, given.get(q.name))]
+
+    @staticmethod
+    def _says(q: Quantity, found: ParameterResult | None) -> bool:
+        """Whether a nuisance parameter is known to be something else than 0: by recording, conflict or prior."""
+        if found is None:
+            return False
+        return q.prior_mean != 0.0 or q.determined(found.sigma) or abs(found.pull or 0.0) > LIMITS.prior_z
 
     @cached_property
     def applied_values(self) -> dict[str, float]:
@@ -361,9 +365,8 @@ class Calibration(SensorValues):
         A nuisance parameter that the recording does not determine is left out, but what was estimated jointly with it
         is not: without a g-sensitivity the best bias is the one that has its effect in it.
         """
-        quantities, applied = self.quantities, set(self.applied)
-        left_out = {name: quantities[name].prior_mean for name in self.values if name not in applied}
-        best = self.values
+        applied, best = set(self.applied), self.values
+        left_out = dict.fromkeys((name for name in best if name not in applied), 0.0)
         if np.isfinite(self.covariance).all():
             joint = GaussianPrior(tuple(best), self.estimate.values, self.covariance).given(left_out)
             best = dict(zip(joint.names, joint.mean.tolist(), strict=True))

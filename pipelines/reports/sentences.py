@@ -114,7 +114,9 @@ def short_verdict(
             return sentence(first, quantities), _WALK
         what = [" ".join(cause(f, quantities) or ()) for f in findings if f.kind in _CAUSES and f is not first][:1]
         probable = f" {what[0]}." if what and first.kind not in _CAUSES else ""
-        return sentence(first, quantities), f"Do not use the values before the cause is found.{probable}"
+        sheets = _sheets([f for f in findings if f.severity > Severity.NOTE], quantities)
+        action = f"Do not use the values before the cause is found.{probable} {sheets}"
+        return sentence(first, quantities), action.rstrip()
     if state == "calibrated":
         closest = f"; the closest is {worst.name}, at {100.0 * worst.ratio:.2g} % of the requirement" if worst else ""
         text = (
@@ -185,6 +187,23 @@ def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[
         yield from (sentence(finding, quantities) for finding in each[: None if kind == "remark" else _MAX_NAMED])
         if kind != "remark" and len(each) > _MAX_NAMED:
             yield f"{len(each) - _MAX_NAMED} more of this kind are in result.json."
+        if sheets := _sheets(each, quantities):
+            yield sheets
+
+
+def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
+    """The `sensors` section that allows for what contradicts its data sheet; empty where nothing does."""
+    figures: dict[str, dict[str, float]] = {}
+    for e in (finding.evidence for finding in findings if finding.kind == "prior_conflict"):
+        sensor, _, figure = quantities[e["parameter"]].sheet.partition(".")
+        if sensor:
+            known = figures.setdefault(sensor, {})
+            known[figure] = max(known.get(figure, 0.0), abs(e["value"] - quantities[e["parameter"]].prior_mean))
+    sections = (
+        f"{sensor}: {{{', '.join(f'{figure}: {size:.1g}' for figure, size in known.items())}}}"
+        for sensor, known in figures.items()
+    )
+    return f"If the device is so, state it: `sensors: {{{', '.join(sections)}}}`." if figures else ""
 
 
 def _direction(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:

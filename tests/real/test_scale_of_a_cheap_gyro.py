@@ -34,6 +34,8 @@ def test_the_scale_is_named_first(recording: Path, tmp_path: Path) -> None:
     assert conflicts[0]["parameter"] == "gyro_scale_x"
     assert abs(conflicts[0]["z"]) > 10.0
     assert 0.2 < np.rad2deg(abs(conflicts[0]["effect"]["helmet_mount_y"])) < 0.4
+    # What is said to be contradicted is applied: without it the rates of turns are off by 7 %.
+    assert {"gyro_scale_x", "gyro_scale_y"} <= set(found.applied)
 
 
 def test_with_its_true_data_sheet_the_mount_is_right(recording: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,16 @@ from alidade.factors.array import Array
 from alidade.factors.indexer import base_from_platform, mounting
 from alidade.factors.los import LosDirectionFactor
 from alidade.pipelines.config import load_config
+from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Parameter, Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
-from alidade.pipelines.reports.calibration import calibration_yaml
+from alidade.pipelines.reports import sentences
+from alidade.pipelines.reports.calibration import calibration_yaml, saved
+from alidade.pipelines.reports.export_formats import ros_parameters
 from alidade.pipelines.settings import Config
+from tests.support.builders import make_calibration
 from tests.support.formulas import CASES
 
 
@@ -219,3 +225,25 @@ def test_time_of_a_picture_has_the_clock_drift(name: str) -> None:
     own = [each for each in method(name).report.formulas(values, Config()) if each.name == "time"]
     found = apply(own, values | {"first_stamp": 5.0}, {"stamp": np.array([5.0, 605.0])})
     np.testing.assert_allclose(found["time"], [5.02, 605.02 - 0.06], atol=1e-12)
+
+
+def test_a_departure_that_is_significant_is_applied_though_its_sigma_is_nearly_that_of_its_prior() -> None:
+    """A gyro's scale 8 prior sigmas off was left out of the rate, since its sigma was 85 % of its prior's."""
+    values, sigmas = np.array([0.0786, 0.0399, 0.001]), np.array([8.5e-3, 3.7e-3, 9e-3])
+    names = tuple(f"gyro_scale_{axis}" for axis in "xyz")
+    scales = [Quantity(n, "", 0.01, 0.01, np.inf, group="assumption", sheet="gyro.scale") for n in names]
+    made = make_calibration()
+    estimate = replace(
+        made.estimate, names=names, values=values, covariance=np.diag(sigmas**2), inflation=None, sandwich=None
+    )
+    problem = replace(made.problem, parameters=(Parameter(9, tuple(scales)),))
+    calibration = replace(made, problem=problem, estimate=estimate)
+    assert calibration.applied == list(names[:2])
+    assert "[[1 + gyro_scale_x, 0, 0], [0, 1 + gyro_scale_y, 0], [0, 0, 1 + 0]]" in calibration.formulas[2].text
+    # The same numbers in the snippet of a node, with 0 for what is left out.
+    assert "gyro_scale: [0.0786, 0.0399, 0.0]" in ros_parameters(saved(calibration), calibration.applied)
+    # A prior other than 0, as of an earlier calibration, is applied whatever the recording adds.
+    known = replace(problem, parameters=(Parameter(9, tuple(replace(q, prior_mean=0.002) for q in scales)),))
+    assert replace(calibration, problem=known).applied == list(names)
+    (note,) = (note for note in sentences.notes(diagnose(estimate, scales), calibration.quantities) if "state" in note)
+    assert note == "If the device is so, state it: `sensors: {gyro: {scale: 0.08}}`"
