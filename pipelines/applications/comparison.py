@@ -32,6 +32,7 @@ class Comparison:
         halves: parameter -> estimates of both halves of the recording, each solved by itself; empty where not tested.
         predicted: family -> size of the errors of held-out measurements, sigmas.
         stopped: a sentence about what the time limit stopped.
+        unsolved: "first", "second" of the halves that have no solution.
         tested: whether the halves were solved.
     """
 
@@ -39,6 +40,7 @@ class Comparison:
     halves: Mapping[str, SplitHalf] = field(default_factory=dict)
     predicted: Mapping[str, float] = field(default_factory=dict)
     stopped: str = ""
+    unsolved: tuple[str, ...] = ()
     tested: bool = False
 
     def of(self, solver: str) -> Calibration | None:
@@ -49,6 +51,8 @@ class Comparison:
         """The largest difference of a solver from batch, in the solver's sigmas; None where they cannot be compared."""
         other, batch = self.of(solver), self.of("batch")
         if other is None or batch is None or other.estimate.names != batch.estimate.names:
+            return None
+        if not (other.estimate.converged and batch.estimate.converged):
             return None
         return solver_difference(other.estimate, batch.estimate)
 

@@ -353,16 +353,16 @@ class Session:
         dense = problem.at_gyro_rate(estimate.attitudes, problem.numbers(estimate))
         return replace(estimate, attitudes=dense), [_carried(estimate.attitudes, dense)]
 
-    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float], str]:
-        """Parameters of either half of the recording, held-out residuals by family, and what the time limit stopped."""
+    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float], str, tuple[str, ...]]:
+        """Parameters of both halves, held-out residuals by family, what the time limit stopped, halves not solved."""
         with self.usual_time():
-            halves, predicted = {}, {}
+            halves, unsolved, predicted = dict[str, SplitHalf](), tuple[str, ...](), dict[str, float]()
             if not deadline.passed(_HALVES):
-                halves = split_halves(self.method.graph, self.method.faults, self.data, self.config)
+                halves, unsolved = split_halves(self.method.graph, self.method.faults, self.data, self.config)
                 deadline.passed(_HALVES)
             if not deadline.passed(_HELD_OUT):
                 predicted = held_out_residuals(self.problem())
-            return halves, predicted, deadline.stopped()
+            return halves, predicted, deadline.stopped(), unsolved
 
     def _findings(
         self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None

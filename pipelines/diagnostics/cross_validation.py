@@ -42,10 +42,17 @@ class SplitHalf:
         return self.step / self.step_sigma
 
 
-def split_halves(build: Build, faults: FaultModel, data: Any, config: Config) -> dict[str, SplitHalf]:
-    """Solve either half of a recording by itself, see `solve_segments`."""
+# A quantity with its value and sigma.
+_Number = tuple[Quantity, float, float]
+
+
+def split_halves(
+    build: Build, faults: FaultModel, data: Any, config: Config
+) -> tuple[dict[str, SplitHalf], tuple[str, ...]]:
+    """Solve either half of a recording by itself, see `solve_segments`; also "first", "second" of those not solved."""
     start, stop = faults.span(data)
-    return solve_segments(build, faults, data, config, 0.5 * (start + stop))
+    parts = _solved_parts(build, faults, data, config, 0.5 * (start + stop))
+    return _in_both(*parts), tuple(name for name, part in zip(("first", "second"), parts, strict=True) if not part)
 
 
 def solve_segments(
@@ -64,9 +71,18 @@ def solve_segments(
         levels: noise levels of the whole recording, which both parts have; those of other noises are estimated anew.
     """
     build = partial(_at_levels, build, {level.noise.name: level for level in levels})
+    return _in_both(*_solved_parts(build, faults, data, config, middle))
+
+
+def _solved_parts(
+    build: Build, faults: FaultModel, data: Any, config: Config, middle: float
+) -> list[dict[str, _Number]]:
     start, stop = faults.span(data)
     parts = [partial(_solved, build, faults, data, config, *part) for part in ((start, middle), (middle, stop + 1.0))]
-    first, second = parallel.done(parts, "either side", max_concurrent(faults.times(data)))
+    return parallel.done(parts, "either side", max_concurrent(faults.times(data)))
+
+
+def _in_both(first: Mapping[str, _Number], second: Mapping[str, _Number]) -> dict[str, SplitHalf]:
     both = {name: (first[name], second[name]) for name in first if name in second}
     return {
         name: SplitHalf(value, sigma, other, other_sigma)
@@ -86,16 +102,12 @@ def _at_levels(build: Build, levels: Mapping[str, Level], data: Any, config: Con
     return replace(problem, noises=noises)
 
 
-# A quantity with its value and sigma.
-_Number = tuple[Quantity, float, float]
-
-
 def _solved(
     build: Build, faults: FaultModel, data: Any, config: Config, start: float, stop: float
 ) -> dict[str, _Number]:
     """The numbers of [start, stop), s, of a recording by itself; none when it has no solution."""
     found = solve_trial(build, faults.segment(data, start, stop), config, f"{start:.0f} to {stop:.0f} s")
-    if found is None:
+    if found is None or not found.estimate.converged:
         return {}
     numbers = zip(found.quantities, found.estimate.values.tolist(), found.estimate.sigmas.tolist(), strict=True)
     return {number[0].name: number for number in numbers}

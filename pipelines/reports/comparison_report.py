@@ -187,6 +187,10 @@ def _halves_agree(comparison: Comparison) -> Iterator[str]:
         )
     elif comparison.tested and comparison.stopped:
         yield "The time limit ended the test of the halves."
+    elif comparison.unsolved:
+        one = len(comparison.unsolved) == 1
+        which = f"The {comparison.unsolved[0]} half" if one else "Neither half"
+        yield f"{which} {'does not determine' if one else 'determines'} the calibration by itself: it has no solution."
     elif comparison.tested:
         yield "Neither half determines a parameter by itself."
 

@@ -92,7 +92,7 @@ def test_compare_splits_the_recording_that_it_read(
     """Halves were once read anew, without --auto-topics, --strict and --prior."""
     opened: list[Session] = []
 
-    def cross_validate(self: Session) -> tuple[dict[str, SplitHalf], dict[str, float], str]:
+    def cross_validate(self: Session) -> tuple[dict[str, SplitHalf], dict[str, float], str, tuple[str, ...]]:
         opened.append(self)
         return real(self)
 

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.pipelines.applications.comparison import Comparison
-from alidade.pipelines.diagnostics.cross_validation import SplitHalf
+from alidade.pipelines.diagnostics import cross_validation
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf, split_halves
+from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.trial_fit import TrialFit
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.comparison_report import comparison_report, write_compare
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plots import common_plots
 from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import Config
 from tests.support.browser import drawn, needs_browser
-from tests.support.builders import make_calibration
+from tests.support.builders import make_calibration, make_problem
 from tests.support.pages import Page
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """Data of a method of one stream."""
+
+    t: Array
 
 
 def page_of(calibrations: list[Calibration], halves: dict[str, SplitHalf], predicted: dict[str, float]) -> str:
@@ -52,6 +64,21 @@ def test_answer_is_no_where_incremental_is_more_than_a_sigma_from_batch_or_halve
     assert Comparison((batch, same), {"time_offset": wide}, tested=True).answer == "no"
     assert Comparison((batch, same), tested=True).answer == "cannot say"
     assert Comparison((batch,)).answer == "cannot say"
+
+
+def test_a_half_without_a_solution_is_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its values at the end of the iterations were "106.8 sigma" from those of the other half."""
+    solution = TrialFit.of(make_problem(), make_calibration().estimate)
+    assert solution is not None
+    lost = replace(solution, estimate=replace(solution.estimate, converged=False))
+    trials = {"0 to 5 s": solution, "5 to 11 s": lost}
+    monkeypatch.setattr(cross_validation, "solve_trial", lambda *given: trials[given[-1]])
+    faults = FaultModel(streams={"t": ()}, signs={})
+    halves, unsolved = split_halves(lambda *_: make_problem(), faults, Stamps(np.linspace(0.0, 10.0, 5)), Config())
+    assert (halves, unsolved) == ({}, ("second",))
+    summary = comparison_report(Comparison(tuple(solvers()), {}, unsolved=unsolved, tested=True)).summary
+    assert summary is not None
+    assert "The second half does not determine the calibration by itself: it has no solution." in summary.text
 
 
 def test_truth_halves_and_held_out_measurements_are_told() -> None:
