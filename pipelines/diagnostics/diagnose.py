@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
-from alidade.pipelines.diagnostics.observability import Advise, weak_directions
+from alidade.pipelines.diagnostics.observability import Advise, verdict, weak_directions
 from alidade.pipelines.estimation.disturbances import intervals
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
@@ -45,6 +45,8 @@ class Thresholds:
 
 
 LIMITS = Thresholds()
+# Share of the parameters from which on a recording is said not to determine them.
+_MOST = 0.5
 # A data-sheet figure with at least this share of a variance is worth stating better; the largest ones are reported.
 _MIN_SHARE, _MAX_REPORTED = 0.2, 3
 
@@ -68,7 +70,7 @@ def diagnose(
         contradictions: findings of `diagnostics.stated_priors`.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone
-    failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": estimate.message})
+    failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": _failure(estimate, quantities)})
     if not estimate.converged and not published:
         return by_severity([*hypotheses, failure, *rejections(estimate)])
     # What data with a fault determine says nothing of what they would without it.
@@ -84,6 +86,18 @@ def diagnose(
     if not published:
         found += [*_far_from_prior(estimate, quantities), *_ambiguity(estimate, quantities)]
     return by_severity(found)
+
+
+def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
+    """Why there is no solution: what the solver said, and before it that most parameters are not determined."""
+    found = [verdict(q, sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True) if q.judged]
+    open_ones, free = found.count("unobservable"), len(found) - found.count("fixed")
+    if estimate.converged or open_ones <= _MOST * free:
+        return estimate.message
+    return (
+        f"the recording is too short, or has too little motion, for {open_ones} of {free} parameters "
+        f"({estimate.message})"
+    )
 
 
 def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:

@@ -102,8 +102,18 @@ def verdicts(
 
 
 def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
-    """A verdict on a number of a solution with these findings: of one that rejects many none is `observable`."""
+    """A verdict on a number of a solution with these findings: of one that rejects many none is `observable`.
+
+    Where there is no solution nothing is determined.
+    """
+    if found != "fixed" and has_no_solution(findings):
+        return "unobservable"
     return "weak" if found == "observable" and rejects_many(findings) else found
+
+
+def has_no_solution(findings: Sequence[Finding]) -> bool:
+    """Whether a solver whose values are to be used found none."""
+    return any(each.kind == "not_converged" and each.severity > Severity.NOTE for each in findings)
 
 
 class DerivedNumber(NamedTuple):

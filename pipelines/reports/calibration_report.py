@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
+from alidade.pipelines.diagnostics.observability import has_no_solution
 from alidade.pipelines.diagnostics.use import UseBands
 from alidade.pipelines.display.figure import Dash, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
@@ -161,6 +162,8 @@ def _named(card: ResultCard, group: ResultGroup, row: ResultRow) -> sentences.Wo
 
 def _badges(c: Calibration) -> tuple[Badge, ...]:
     """What matters beside the verdict: inflation, rejections, noise, priors, change, misfit, error if simulated."""
+    if has_no_solution(c.findings):
+        return ()
     found = []
     inflation = max((p.inflation for p in c.parameters.values()), default=1.0)
     if inflation > _NOTABLE_INFLATION:
@@ -189,12 +192,20 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
             Badge("fit as expected" if fits else "misfit", "good" if fits else "warn", "99.9 % interval of chi-square")
         )
     if c.stability is not None:
-        changed = c.stability.changed
-        found.append(Badge("changed during the recording" if changed else "stable", "bad" if changed else "good"))
+        found.append(_stability_badge(c.stability.changed, c.findings))
     errors = [abs(e.error_sigmas) for e in truth_errors(c).values() if e.error_sigmas is not None]
     if errors:
         found.append(Badge(f"simulated: largest error {max(errors):.1f} σ of {len(errors)}", "fixed"))
     return tuple(found)
+
+
+def _stability_badge(changed: bool, findings: Sequence[Finding]) -> Badge:
+    if changed:
+        return Badge("changed during the recording", "bad", "parameters differ before and after")
+    moved = next((finding.kind for finding in findings if finding.kind in sentences.MOVES), "")
+    if moved:
+        return Badge("vision jumped" if moved == "jump" else "small change", "warn", "see the findings")
+    return Badge("stable", "good", "no significant change during the recording")
 
 
 def _tile(found: UseBands) -> Tile:

@@ -26,6 +26,7 @@ from alidade.pipelines.diagnostics.observability import (
     TimeToAccuracy,
     Verdict,
     derived,
+    has_no_solution,
     time_to_accuracy,
     verdicts,
 )
@@ -155,10 +156,10 @@ class Calibration(SensorValues):
 
     @cached_property
     def uses(self) -> tuple[UseBands, ...]:
-        """What the calibration is used for, with the error before and after it and the 95 % band."""
+        """What the calibration is used for, with the error before and after it and the 95 % band; none unsolved."""
         from alidade.pipelines.reports.uses import uses_of
 
-        return uses_of(self)
+        return () if has_no_solution(self.findings) else uses_of(self)
 
     def plot(self, name: str | None = None) -> Page:
         """The figures of the report, which a notebook shows: all, those of a use, or the plot with a title.

@@ -34,6 +34,10 @@ _APPLY = (
     "Apply calibration.yaml; later, `alidade validate RECORDING --calibration calibration.yaml` says "
     "whether it still holds."
 )
+# Kinds of findings on accuracy, which a count of what misses it sums up, and on what did not stay as it was.
+_ON_ACCURACY = ("direction", "dominant_prior", "recording")
+MOVES = ("change", "jump", "device_change")
+_MOVED = "What to do: see what moved at that time; if it may have been the mount, record again."
 _WALK = "Calibrate the recordings after the last change together, or let the parameter walk: `share` in the config."
 _OF_GYRO = "unit, signs and order of the gyro's axes, and that it belongs to the rest"
 _CHECK = {
@@ -126,7 +130,12 @@ def short_verdict(
     directions = sum(f.kind == "direction" and f.severity == Severity.UNOBSERVABLE for f in findings)
     if state == "weak" or not directions:
         where = f", worst {worst.name}: ± {worst.sigma} {worst.unit} where {worst.require} is required" if worst else ""
-        return f"{len(missed)} of {len(required)} parameters miss their required accuracy{where}.", action
+        accuracy = [f"{len(missed)} of {len(required)} parameters miss their required accuracy{where}."] * bool(missed)
+        beside = [f for f in findings if f.severity > Severity.NOTE and not (missed and f.kind in _ON_ACCURACY)][:1]
+        moved = [_MOVED for f in beside if f.kind in MOVES]
+        return " ".join([*(sentence(f, quantities) for f in beside), *accuracy]), " ".join(
+            [*filter(None, [action]), *moved]
+        )
     if len(missed) > _MOST * len(required):
         return (
             f"The recording does not determine this calibration: {len(missed)} of {len(required)} parameters miss "

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.estimation.finding import KINDS, Finding, Severity, status
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Quantity, Residuals
-from alidade.pipelines.reports.calibration_report import report_html
+from alidade.pipelines.reports.calibration_report import calibration_report, report_html
 from alidade.pipelines.reports.result_json import finding_json, result_json
-from alidade.pipelines.reports.sentences import cause, headline, notes, sentence
+from alidade.pipelines.reports.sentences import cause, headline, notes, sentence, short_verdict
 from tests.support.builders import make_calibration
 from tests.support.pages import Page
 
@@ -281,3 +282,45 @@ def test_result_json_has_findings_and_tables() -> None:
     assert content["status"] == "inconsistent"
     page = Page(report_html(calibration)).text
     assert page.count("31 % of vision measurements rejected") == 2  # in the verdict, and in all findings
+
+
+JUMP = Finding("jump", WEAK, {"since_s": 117.5, "time_s": 117.6, "size": 0.0105, "sigma": 0.0018})
+
+
+def test_the_short_verdict_gives_the_finding_that_makes_the_status() -> None:
+    """A jump with all accuracies met read "weak. 0 of 7 parameters miss their required accuracy"."""
+    text, action = short_verdict([JUMP], QUANTITIES, {MOUNT.name: "observable"}, None)
+    assert text == sentence(JUMP, QUANTITIES)
+    assert action.startswith("What to do: ")
+    both, _ = short_verdict([JUMP], QUANTITIES, {MOUNT.name: "weak"}, None)
+    assert both == f"{text} 1 of 1 parameters miss their required accuracy."
+
+
+def test_nothing_is_stable_where_a_jump_is_found() -> None:
+    quiet = replace(make_calibration(), stability=Stability(0.1, 0.9, 5.0, {}))
+    page = calibration_report(quiet).summary, calibration_report(replace(quiet, findings=(JUMP,))).summary
+    said = [[badge.text for badge in each.badges] for each in page if each is not None]
+    assert "stable" in said[0]
+    assert "vision jumped" in said[1]
+    assert "stable" not in said[1]
+
+
+def test_without_a_solution_nothing_is_said_to_be_good() -> None:
+    """Tables with ✓, "fit as expected" and gains once stood under "No solution"."""
+    made = make_calibration(converged=False, message="not converged after 63 iterations")
+    text = str(replace(made, stability=Stability(0.1, 0.9, 5.0, {})))
+    assert text.startswith("inconsistent. No solution: not converged after 63 iterations. Do not use the values.")
+    assert set(made.verdicts.values()) == {"unobservable", "fixed"}
+    assert not any(word in text for word in ("✓", "as expected", "stable", "times less"))
+    assert made.uses == ()
+
+
+def test_a_recording_that_determines_next_to_nothing_is_said_to_be_too_short() -> None:
+    made = make_calibration()
+    wide = np.diag([0.35**2] * 3 + [0.05**2, 0.05**2, 0.0])
+    short = replace(made.estimate, converged=False, message="not converged after 63 iterations", covariance=wide)
+    (finding,) = diagnose(short, made.problem.quantities)[:1]
+    assert finding.evidence["message"] == (
+        "the recording is too short, or has too little motion, for 5 of 5 parameters "
+        "(not converged after 63 iterations)"
+    )

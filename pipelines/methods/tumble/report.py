@@ -137,7 +137,7 @@ def _offset(sensor: Sensor, estimate: Estimate, values: Mapping[str, float]) -> 
     size = float(np.linalg.norm(b))
     spread = float(np.sqrt(b @ estimate.covariance[np.ix_(rows, rows)] @ b)) / max(size, np.finfo(float).tiny)
     unit, factor = _UNITS[sensor.unit]
-    amount = f"{factor * size:.3g} ± {factor * spread:.1g} {unit} towards {described(-b)}"
+    amount = f"{factor * size:.3g} ± {factor * spread:.1g} {unit}{f' towards {described(-b)}' if size else ''}"
     if sensor.name == "accel":
         says = f"offset: at no acceleration it reads {amount}"
     elif sensor.is_si:
