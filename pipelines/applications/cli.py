@@ -197,7 +197,7 @@ def calibrate(
 
     from alidade.pipelines.applications.joint import calibrate_together
     from alidade.pipelines.applications.session import open_session
-    from alidade.pipelines.recording.opening import describe_recordings, group_recordings
+    from alidade.pipelines.recording.opening import describe_recordings, group_recordings, naming_parts
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
@@ -226,7 +226,8 @@ def calibrate(
     ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
-            calibration = calibrate_together([partial(read, each) for each in recordings], by_itself)
+            with naming_parts(recordings):
+                calibration = calibrate_together([partial(read, each) for each in recordings], by_itself)
         else:
             session = read(recordings[0])
             (calibration,) = session.calibrations([solver], parse_window(window), check=not no_check)

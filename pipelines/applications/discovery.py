@@ -163,6 +163,7 @@ def _suggestion(
     chosen = methods.method(method)
     needed = [one for need in chosen.requirements for group in need for one in group if not isinstance(one, Setting)]
     taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
+    taken |= {part for source in config.topics.values() for part in source.parts}
     topics: dict[str, TopicSource] = {}
     reasons: list[str] = []
     doubtful: set[str] = set()

@@ -7,7 +7,8 @@ import hashlib
 import os
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,20 @@ def describe_recordings(recordings: Sequence[Where]) -> str:
     """Recordings in words, parts of one side by side."""
     each = [[one] if isinstance(one, (str, Path)) else list(one) for one in recordings]
     return ", ".join(" + ".join(Path(part).name for part in parts) for parts in each)
+
+
+@contextmanager
+def naming_parts(recordings: Sequence[Where]) -> Iterator[None]:
+    """Add to an InputError of several tables how tables of one recording are named."""
+    try:
+        yield
+    except InputError as error:
+        if not all(isinstance(each, str | Path) and Path(each).suffix.lower() in _TABLES for each in recordings):
+            raise
+        raise InputError(
+            f"{error}; each of the {len(recordings)} tables counts as a recording: name those of one by their folder, "
+            "or by a pattern in quotes"
+        ) from error
 
 
 def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:

@@ -31,6 +31,7 @@ AnySeries = TypeVar("AnySeries", bound=Series | JointSeries)
 # Quantities whose faults are looked for, and their unit.
 _UNITS = {"gyro": "rad/s", "accel": "m/s^2", "field": "T"}
 # Kind of sensor -> covariance of its samples, and the noise density below which no sensor is.
+_NAMES = {"gyro": "gyro", "accel": "accelerometer"}
 _NOISE = {
     "gyro": ("gyro_cov", LEAST_GYRO),
     "accel": ("accel_cov", LEAST_ACCEL),
@@ -121,6 +122,8 @@ class StreamReader:
             may_be_held: whether a driver may repeat a reading until there is a new one; it is used once.
         """
         self.count(topic, "stamped by log time (kept)", found.stamped_by_log)
+        for name in () if may_be_constant else quantities:
+            _check_recorded(topic, found, name)
         values = np.concatenate([getattr(found, name).reshape(len(found), -1) for name in quantities], axis=1)
         t, rows = checks.clean(topic, found.t_ns, self.epoch_ns, values, self.dropped, least, slowest_s)
         samples = Samples(t, _rows(found, rows))
@@ -239,6 +242,17 @@ def imu_series(
 def white_covariance(t: Array, density: float | None) -> Array:
     """Covariance (3, 3) of samples at times t (N,), s, with white noise of a density; zeros where it is unknown."""
     return (0.0 if density is None else density**2 / float(np.median(np.diff(t)))) * np.eye(3)
+
+
+def _check_recorded(topic: str, found: AnySeries, name: str) -> None:
+    """Refuse an IMU that states by its covariance of -1 that it has no such sensor, and has none."""
+    if not isinstance(found, ImuSeries) or name not in _NAMES:
+        return
+    values, cov = getattr(found, name), getattr(found, f"{name}_cov")
+    if (cov[:, 0, 0] == -1.0).all() and not plausibility.is_there(name, values, cov):
+        raise InputError(
+            f"topic {topic} has no {_NAMES[name]}, which is needed here: record it, or name its topic or columns"
+        )
 
 
 def _rows(found: AnySeries, rows: NDArray[np.intp]) -> AnySeries:

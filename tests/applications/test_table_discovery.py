@@ -155,13 +155,23 @@ def test_a_time_with_too_few_digits_is_told(tmp_path: Path) -> None:
     assert "x.csv: t is no time: it does not increase from row to row" in found.doubts
 
 
-def test_a_phones_files_of_one_sensor_each_are_one_imu(tmp_path: Path) -> None:
+def test_a_phones_files_of_one_sensor_each_are_one_imu(tmp_path: Path, alidade: Command) -> None:
     write(tmp_path / "Accelerometer.csv", "Time (s),acc x (g),acc y (g),acc z (g)", SECONDS, DIRECTIONS)
     write(tmp_path / "Gyroscope.csv", "Time (s),gyr x (rad/s),gyr y (rad/s),gyr z (rad/s)", SECONDS, RATES)
     found = propose_columns(open_recording(tmp_path))
     assert found is not None
     assert found.columns.keys() == {"/imu/accel", "/imu/gyro"}
     assert found.topics["imu"].parts == ("/imu/gyro", "/imu/accel")
+    # Topics once proposed were not those that calibrate uses: the same two as a reference.
+    shown = alidade("info", str(tmp_path)).out
+    assert "imu: {gyro: /imu/gyro, accel: /imu/accel}" in shown
+    assert "reference_imu" not in shown
+    # Of the shell's own pattern each is a recording, and one without a gyro is not a dead one.
+    apart = [str(path) for path in sorted(tmp_path.glob("*.csv"))]
+    run = alidade("calibrate", *apart, "--auto-columns", "--method", "cube", "--out", str(tmp_path / "out"))
+    assert run.code == 2
+    assert "topic /imu has no gyro, which is needed here" in run.err
+    assert "name those of one by their folder, or by a pattern in quotes" in run.err
 
 
 def test_one_command_calibrates_a_phones_table(tmp_path: Path, alidade: Command) -> None:
