@@ -18,8 +18,9 @@ from alidade.factors.gyro import Derivatives, by_platform_errors, carried, error
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 
-# Numbers of the pictures' errors, columns of their block in this order: time offset, clock skew, angle scale, filter.
-PICTURE = 4
+# The pictures' errors, in the order of their block, and their columns there: s, s/s, share of an angle, s^2.
+PICTURE_ERRORS = "time_offset", "clock_skew", "vision_scale", "vision_filter"
+OFFSET_COLUMN, SKEW_COLUMN, SCALE_COLUMN, FILTER_COLUMN = range(len(PICTURE_ERRORS))
 # rad, beyond which a scale of angles fades out.
 FADE = np.deg2rad(150.0)
 
@@ -73,13 +74,13 @@ class VisionAttitudeFactor(Model):
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitudes, bias, mounts, the pictures' errors and those of the gyros."""
-        picture = 1 if self.elapsed is None else PICTURE
+        picture = 1 if self.elapsed is None else len(PICTURE_ERRORS)
         return ROT3, 3, ROT3, ROT3, picture, *error_blocks(self.errors, self.platform_errors)
 
     def __call__(self, bRv: Array, bias: Array, cRb: Array, vRh: Array, picture: Array, *of_gyros: Array) -> Residuals:
         """Residual sqrt_information * Log(predicted^T measured), (n, 3)."""
         errors, platform = parted(of_gyros, self.errors > 0)
-        at, by_at = self._times(picture)
+        at, by_at = self.exposed(picture)
         anchor = self.time if self.anchor is None else self.anchor
         middle = 0.5 * (anchor + (self.time if self.expected is None else self.expected))
         dV, rate, by_gyro = carried(self.helmet, anchor, middle, at, bias, errors)
@@ -108,6 +109,7 @@ class VisionAttitudeFactor(Model):
             by_times = (by_bRv @ rate[..., None] + by_filtered @ jerk[..., None]) * by_at[:, None]
             by_filter = [by_filtered @ acceleration[..., None]] if picture.shape[1] > 1 else []
             by_bias, *by_errors = (by_dV @ each for each in by_gyro())
+            # The columns of the pictures' errors stand as in PICTURE_ERRORS.
             return (
                 by_dV @ so3.matrix(so3.inverse(dV)),
                 by_bias,
@@ -126,15 +128,16 @@ class VisionAttitudeFactor(Model):
             nothing = np.zeros((len(at), 3))
             return nothing, nothing, nothing
         acceleration, jerk = self.helmet.acceleration(at)
-        filter_ = picture[:, 3:4]
+        filter_ = picture[:, [FILTER_COLUMN]]
         return filter_ * acceleration, acceleration, filter_ * jerk
 
-    def _times(self, picture: Array) -> tuple[Array, Array]:
-        """When the pictures were taken (n,), and its derivatives by time offset and skew (n, 1 or 2)."""
+    def exposed(self, picture: Array) -> tuple[Array, Array]:
+        """When the pictures were taken (n,), s, and its derivatives by time offset and skew (n, 1 or 2)."""
+        offset = picture[:, OFFSET_COLUMN]
         if picture.shape[1] == 1:
-            return self.time + picture[:, 0], np.ones((len(picture), 1))
+            return self.time + offset, np.ones((len(picture), 1))
         elapsed = needed(self.elapsed)
-        at = self.time + picture[:, 0] - picture[:, 1] * elapsed
+        at = self.time + offset - picture[:, SKEW_COLUMN] * elapsed
         return at, np.stack([np.ones_like(elapsed), -elapsed], axis=1)
 
     def _seen(self, cRh: Array, picture: Array) -> tuple[Array, Callable[[], Array], Array]:
@@ -142,7 +145,7 @@ class VisionAttitudeFactor(Model):
         n = len(cRh)
         if picture.shape[1] == 1:
             return cRh, lambda: np.eye(3), np.empty((n, 3, 0))
-        first, scale = needed(self.first), picture[:, 2:3]
+        first, scale = needed(self.first), picture[:, [SCALE_COLUMN]]
         turned = so3.log(so3.multiply(so3.inverse(first), cRh))
         angle = np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
         share, slope = faded(angle)

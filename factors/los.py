@@ -75,6 +75,10 @@ class LosContext(Stacked):
     stamp_shift: Array
     stacked: ClassVar = ("motion", "elapsed", "tracked", "predicted", "stamp_shift")
 
+    def late(self, sight: Array) -> Array:
+        """Time (n,), s, from the shifted stamps to the exposures, by SIGHT_ERRORS (n, 10)."""
+        return np.asarray(sight[:, 0] - sight[:, 1] * self.elapsed - self.stamp_shift)
+
 
 @dataclass(frozen=True)
 class LosDirectionFactor(Model):
@@ -139,7 +143,7 @@ class LosDirectionFactor(Model):
             residual, derivatives = self._residuals(tRm, angles, self.gimbal, 0.0)
             return residual, lambda: derivatives()[:2]
         motion, elapsed, tracked = self.context.motion, self.context.elapsed, self.context.tracked
-        late = sight[:, 0] - sight[:, 1] * elapsed - self.context.stamp_shift
+        late = self.context.late(sight)
         turn, by_late, by_gyro = _carried(motion, late, bias, errors)
         gimbal, by_time, by_delay, by_encoder = self._gimbal(motion, sight[:, 5:9], late[:, None], sight[:, 9:])
         rotation = np.stack([sight[:, 3], np.zeros_like(late), sight[:, 4]], axis=1) * tracked[:, None]

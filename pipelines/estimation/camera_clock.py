@@ -1,4 +1,4 @@
-"""When pictures were taken, by their stamps, and a first guess of it.
+"""When pictures were taken, by their stamps, and a first guess of it, linear in time: offset and skew alone.
 
 Two ordinary clocks drift apart by 1e-4: 60 ms in ten minutes, 0.36 s in an hour, further than motion around a stamp can
 be carried. So a clock is guessed before the graph is made, and keyframes stand where pictures were taken.
@@ -22,6 +22,8 @@ _WRONG_AT_FIRST, _THEN, _PASSES = 0.06, 4.0, 3
 # It is another clock than the stamps' beyond so many sigmas.
 _SIGNIFICANT = 5.0
 
+# Where the clock's offset and skew stand among the numbers of a guess.
+_CLOCK = slice(-2, None)
 # What misses (n, d) at numbers near some, the last two of which are a clock's offset and skew.
 Miss = Callable[[Array], Array]
 
@@ -130,8 +132,8 @@ def guess_clock(
         if until >= last:
             break
         until *= _THEN
-    clock, ends = Clock(begun, *x[-2:].tolist()), np.array([0.0, last])
-    sigmas = _sigmas_at(ends, repeated * covariance[-2:, -2:])
+    clock, ends = Clock(begun, *x[_CLOCK].tolist()), np.array([0.0, last])
+    sigmas = _sigmas_at(ends, repeated * covariance[_CLOCK, _CLOCK])
     significant = (np.abs(clock.late(ends)) > _SIGNIFICANT * sigmas).any()
     return clock if significant else Clock(begun), x
 

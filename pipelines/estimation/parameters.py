@@ -22,7 +22,7 @@ import numpy as np
 from alidade.pipelines.estimation.problem import Array, Findings, Parameter, Quantity
 from alidade.pipelines.settings import Config, check_names
 
-# What is left free has a prior so many times the one in force.
+# The prior of a nuisance parameter that the config sets to null is so many times the usual one.
 _FREE = 10.0
 # A sigma of more than this part of its prior's says nothing, one of less than that determines it.
 _UNINFORMED = 0.98
@@ -33,7 +33,7 @@ _NUMBERS = re.compile(r"(_p?[xyzenu]{1,2})?(_sin|_cos)?$")
 _WORDS = {**dict(zip("123", "xyz", strict=True)), "e": "east", "n": "north", "u": "up", "sin": "sine", "cos": "cosine"}
 
 
-SENSORS = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
+SENSOR_NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 
 
 @dataclass(frozen=True)
@@ -144,12 +144,12 @@ def temperature_slope(sensor: str, unit: str, sigma: float) -> ParameterSpec:
         f"{sensor}_temperature",
         f"{unit}/K",
         sigma,
-        f"Temperature slope of the {SENSORS[sensor]} bias, {{axis}}.",
+        f"Temperature slope of the {SENSOR_NAMES[sensor]} bias, {{axis}}.",
         f"{sensor}.temperature",
     )
 
 
-CLOCK_SKEW = scalar("clock_skew", "", 1e-4, "Clock drift, camera against gyro.", "clock.skew", per_recording=True)
+CLOCK_SKEW = scalar("clock_skew", "", 1e-4, "Clock skew, camera against gyro.", "clock.skew", per_recording=True)
 
 
 def gyro_bias(prior: float, require: float) -> ParameterSpec:

@@ -13,7 +13,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.gyro import symmetric
-from alidade.pipelines.estimation.parameters import SENSORS, ParameterSpec
+from alidade.pipelines.estimation.parameters import SENSOR_NAMES, ParameterSpec
 from alidade.pipelines.estimation.problem import Array, CommonFactor, Quantity
 from alidade.pipelines.methods import Correction
 from alidade.pipelines.methods.formula import Formula
@@ -52,7 +52,7 @@ def triad_specs(
         gain, bias: prior sigma and accuracy wanted, of entries of K and of b.
         per_recording: whether b belongs to a recording.
     """
-    sensor = SENSORS[name].capitalize()
+    sensor = SENSOR_NAMES[name].capitalize()
     diagonal, others = (tuple(f"{i}{j}" for i in "123" for j in "123" if (i == j) is own) for own in (True, False))
     gains = ((diagonal, "gain, {first}"), (others, "cross-axis term ({last} into {first})"))
     K = (

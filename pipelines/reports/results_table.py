@@ -15,7 +15,7 @@ import numpy as np
 from alidade.pipelines.diagnostics.observability import DerivedNumber, Verdict, doubted, verdict
 from alidade.pipelines.display.table import Cell, Column, Interval, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
-from alidade.pipelines.estimation.parameters import SENSORS
+from alidade.pipelines.estimation.parameters import SENSOR_NAMES
 from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.methods.triads import TRIADS, numeric_jacobian, parts_of, sensor_model
 from alidade.pipelines.reports.plots import variables
@@ -199,7 +199,7 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     try:
         rows = _derived(c, names, parts)
     except ValueError:  # K is no sensor's
-        return ResultCard(SENSORS[sensor].capitalize(), (_group(c, "K and b", "", names),))
+        return ResultCard(SENSOR_NAMES[sensor].capitalize(), (_group(c, "K and b", "", names),))
     scale = [row.times(100.0) for row in rows[:3]]
     percent = "%"
     if plain and max(abs(row.value) + row.sigma for row in scale) < 100.0 * _PPM:
@@ -216,7 +216,7 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
         groups[2] = ResultGroup("Misalignment", "", (), "0 by definition: it defines the body's axes")
     if common is not None and not unit.startswith("1/"):
         groups.insert(0, _overall(rows[12], common, in_counts))
-    return ResultCard(SENSORS[sensor].capitalize(), tuple(groups))
+    return ResultCard(SENSOR_NAMES[sensor].capitalize(), tuple(groups))
 
 
 def _overall(row: ResultRow, common: DerivedNumber, in_counts: bool) -> ResultGroup:

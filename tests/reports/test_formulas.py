@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,7 +21,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Parameter, Quantity
-from alidade.pipelines.methods import method
+from alidade.pipelines.methods import method, names
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.reports.calibration import calibration_yaml, saved
@@ -247,3 +248,31 @@ def test_a_departure_that_is_significant_is_applied_though_its_sigma_is_nearly_t
     assert replace(calibration, problem=known).applied == list(names)
     (note,) = (note for note in sentences.notes(diagnose(estimate, scales), calibration.quantities) if "state" in note)
     assert note == "If the device is so, state it: `sensors: {gyro: {scale: 0.08}}`"
+
+
+# Parameters that no formula uses, and why.
+NOT_UNDONE = {
+    **dict.fromkeys(("target_rate_x", "target_rate_z"), "motion of the target, no error of a sensor"),
+    **dict.fromkeys(("field_e", "field_n", "field_u", "field_strength", "field_dip", "gravity"), "of the place"),
+    **dict.fromkeys(("encoder_delay", "mag_delay"), "says when a reading is true, which leaves its number as it is"),
+    **dict.fromkeys(("gyro_filter", "vision_filter"), "a low-pass: what it took away needs the readings around it"),
+    **dict.fromkeys(("accel_arm_x", "accel_arm_y", "accel_arm_z"), "its share needs the angular acceleration"),
+    **dict.fromkeys(("camera_focal", "camera_centre_x", "camera_centre_y"), "of pictures; formulas begin at attitudes"),
+    **dict.fromkeys(("tag_17_px", "tag_17_py", "tag_17_pz"), "a position; formulas turn, they move nothing"),
+    "vision_scale": "of angles since the recording's first picture, which later ones do not have",
+}
+
+
+@pytest.mark.parametrize("name", names())
+def test_formulas_undo_every_parameter(name: str) -> None:
+    """In calibration.yaml nothing is listed that its formulas forget."""
+    parameters = [each.replace("*", "17") for spec in method(name).parameters for each in spec.names]
+    trees = [formula.tree for formula in method(name).report.formulas(parameters, Config())]
+    used = {node.id for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    forgotten = {each for each in parameters if not {each, each[:-2]} & used}
+    assert forgotten == set(parameters) & NOT_UNDONE.keys()
+
+
+def test_nothing_is_said_of_parameters_that_are_not_there() -> None:
+    there = {each.replace("*", "17") for name in names() for spec in method(name).parameters for each in spec.names}
+    assert NOT_UNDONE.keys() <= there

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.attitude import SKEW_COLUMN
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.camera_clock import Clock, Miss, first_span, guess_clock, turns_near
 from alidade.pipelines.estimation.priors import prior_sigmas
@@ -19,6 +20,8 @@ _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
 # Pairs of pictures from which the clock is estimated.
 _CLOCK_PAIRS = 1000
+# What is estimated with the clock: a correction of the mount, rad, the gyro bias, rad/s; offset, s, and skew, s/s.
+_MOUNT, _BIAS, _CLOCK = slice(0, 3), slice(3, 6), slice(6, 8)
 
 
 def guess(gyro: GyroPath, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:
@@ -69,11 +72,11 @@ def guess_picture_clock(
         elapsed: (n,) stamps of the pictures since the recording's first, s.
         begun: that one, s.
         measured: (n, 4) cRh.
-        parameters: the helmet's mount, bias, and one whose first two numbers are offset and skew, with their priors.
+        parameters: the helmet's mount, bias, and the pictures' errors, with their priors.
         sigma: of one picture, rad.
     """
-    # The mount is a correction of the guess.
-    prior = 1.0 / np.concatenate([prior_sigmas(p)[:size] for p, size in zip(parameters, (3, 3, 2), strict=True)])
+    numbers = zip(parameters, (3, 3, SKEW_COLUMN + 1), strict=True)
+    prior = 1.0 / np.concatenate([prior_sigmas(parameter)[:size] for parameter, size in numbers])
 
     def carried(at: Array, seen: Array) -> Array:
         return seen if platform is None else so3.multiply(platform.attitude(at), seen)
@@ -85,7 +88,7 @@ def guess_picture_clock(
 
     def near(i: NDArray[np.intp], j: NDArray[np.intp], x: Array) -> Miss:
         def taken(x: Array) -> tuple[Array, Array]:
-            clock = Clock(begun, *x[-2:])
+            clock = Clock(begun, *x[_CLOCK])
             return clock.taken(elapsed[i]), clock.taken(elapsed[j])
 
         before, after = taken(x)
@@ -94,8 +97,8 @@ def guess_picture_clock(
 
         def miss(x: Array) -> Array:
             turns = turns_at(*taken(x))
-            predicted = so3.multiply(turns.wxyz, so3.exp(turns.bias_jacobian @ x[3:6]))
-            vRh = so3.multiply(mount, so3.exp(x[None, :3]))
+            predicted = so3.multiply(turns.wxyz, so3.exp(turns.bias_jacobian @ x[_BIAS]))
+            vRh = so3.multiply(mount, so3.exp(x[None, _MOUNT]))
             return so3.log(so3.multiply(so3.inverse(so3.compose(vRh, turn, so3.inverse(vRh))), predicted))
 
         return miss

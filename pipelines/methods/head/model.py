@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.attitude import FADE, VisionAttitudeFactor
+from alidade.factors.attitude import FADE, OFFSET_COLUMN, SKEW_COLUMN, VisionAttitudeFactor
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
@@ -204,7 +204,7 @@ def _prepare(
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     if before is None:
         gyro = GyroPath(data.head_t, data.head_gyro)
-        if parameters.clock and clock is None:
+        if parameters.has_picture_errors and clock is None:
             by = parameters.helmet, parameters.bias, parameters.picture
             guessed = guess_picture_clock(gyro, platform, stamps - begun, begun, measured, by, sigma)
             if np.abs(guessed.late(stamps - begun)).max() > _NEAR:
@@ -339,8 +339,8 @@ def _begin(model: _Model, step: Step) -> None:
         if vector is not None:
             zeros = np.zeros(len(vector.quantities))
             initial = zeros.copy()
-            if vector is p.picture and p.clock:
-                initial[:2] = model.clock.offset, model.clock.skew
+            if vector is p.picture and p.has_picture_errors:
+                initial[[OFFSET_COLUMN, SKEW_COLUMN]] = model.clock.offset, model.clock.skew
             step.initial.insert(vector.key, initial)
             step.factors.append(vector_prior(vector, zeros))
 
@@ -368,8 +368,8 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
         platform_errors=p.platform is not None,
         anchor=chain.time[of],
         expected=model.taken[rows],
-        elapsed=model.elapsed[rows] if p.clock else None,
-        first=np.broadcast_to(model.first, (len(rows), 4)) if p.clock else None,
+        elapsed=model.elapsed[rows] if p.has_picture_errors else None,
+        first=np.broadcast_to(model.first, (len(rows), 4)) if p.has_picture_errors else None,
     )
     states = [chain.state(k) for k in of]
     keys = p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys
@@ -381,7 +381,8 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
     rows, of = _pictures(model, [k - model.chain.first for k in keyframes])
     if len(rows) == 0:
         return Attitudes(np.empty(0), np.empty((0, 4)))
-    at = Clock(model.origins[0], *values.atVector(model.parameters.picture.key)[:2]).exposed(model.stamps[rows])
+    offset_and_skew = values.atVector(model.parameters.picture.key)[: SKEW_COLUMN + 1]
+    at = Clock(model.origins[0], *offset_and_skew).exposed(model.stamps[rows])
     return Attitudes(at, model.chain.attitudes(of, model.taken[rows], at, values))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import gtsam
 
+from alidade.factors.attitude import PICTURE_ERRORS
 from alidade.factors.earth import EARTH_RATE
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
@@ -61,13 +62,14 @@ VISION_FILTER = scalar(
     "Low-pass of vision: half the second moment of its impulse response, less the gyro's.",
     "camera.filter",
 )
-# Behind the time offset, in the order of the factor's columns (factors.attitude.PICTURE).
-PICTURES = (CLOCK_SKEW, VISION_SCALE, VISION_FILTER)
+# In the order in which simulators draw their values: a new one is the last, or every seed has other ones.
 NUISANCE = (
     *(*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE),
     *(CLOCK_SKEW, VISION_SCALE, GYRO_SLOPE, VISION_FILTER),
 )
 PARAMETERS = (BIAS, HELMET, CAMERA, OFFSET, *NUISANCE)
+# Those of the pictures, behind the time offset, in the order of the factor's columns.
+PICTURE_SPECS = tuple(next(spec for spec in NUISANCE if spec.name == name) for name in PICTURE_ERRORS[1:])
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class HeadParameters:
     Attributes:
         bias: the helmet gyro's (3), rad/s, its first node.
         helmet, camera: vRh, cRb.
-        picture: time offset alone, or with clock skew, vision scale and filter.
+        picture: the time offset alone, or all of PICTURE_ERRORS.
         gyro: S of the helmet's gyro and what its drivers do, see alidade.factors.gyro; None for a perfect one.
         platform: bias and S of the platform's gyro (9); None for a perfect one, or none.
     """
@@ -122,7 +124,7 @@ class HeadParameters:
             config = config.model_copy(update={"priors": {"vision_scale": 0.0, **config.priors}})
         check_parameters(PARAMETERS, config)
         mounts = quantities(HELMET, config), quantities(CAMERA, config, fixed=not platform)
-        clock = parameter(_key("T"), PICTURES, config)
+        clock = parameter(_key("T"), PICTURE_SPECS, config)
         return cls(
             bias=Parameter(FIRST_BIAS, quantities(BIAS, config, extra_sigma=0.0 if platform else EARTH_RATE)),
             helmet=Parameter(_key("H"), mounts[0], rotation_vector_coordinates),
@@ -135,8 +137,8 @@ class HeadParameters:
         )
 
     @property
-    def clock(self) -> bool:
-        """Whether clock skew, vision scale and filter are variables."""
+    def has_picture_errors(self) -> bool:
+        """Whether the pictures' errors behind the time offset are variables."""
         return len(self.picture.quantities) > 1
 
     @property
