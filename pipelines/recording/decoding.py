@@ -379,10 +379,12 @@ def _append_alike(
     plan: _Plan, block: MessageBlock, left: NDArray[np.int64], table: ColumnTable, rows: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """Append those of the messages `left` that have a layout, all at once. Returns which of them these are."""
-    if plan.layout is None or not len(left):
+    if plan.layout is None:
         return np.zeros(len(left), dtype=bool)
     size = len(plan.layout.first)
     alike = block.size[left] == size
+    if not alike.any():
+        return alike
     data = byte_windows(block.buffer, size)[block.start[left[alike]]].view(np.uint8).reshape(-1, size)
     agrees = plan.layout.agrees(data)
     alike[alike] = agrees
