@@ -320,7 +320,7 @@ def _paired(recording: Recording, gyro: str, attitude: TopicSource) -> Pairing |
         rates, poses = recording.imu(gyro), recording.poses_of(attitude)
     except InputError:
         return None
-    there = (name for name, topic in recording.topics.items() if topic.type == messages.IMU and name != gyro)
+    there = (name for name, topic in recording.topics.items() if topic.type in messages.IMUS and name != gyro)
     others = filter(None, (_rates(recording, name) for name in there))
     carriers = [(other.t_ns, other.gyro) for other in others]
     return pair(rates.t_ns, rates.gyro, poses.t_ns, poses.wxyz, carriers)
@@ -349,7 +349,7 @@ def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool
 
 def _split_imu(recording: Recording, used: set[str]) -> TopicSource | None:
     """A gyro and an accelerometer on two topics, as some drivers publish them; None where there are not both."""
-    free = [n for n, t in recording.topics.items() if t.type == messages.IMU and t.count and n not in used]
+    free = [n for n, t in recording.topics.items() if t.type in messages.IMUS and t.count and n not in used]
     there = {name: imu for name in free if (imu := _rates(recording, name)) is not None} if len(free) > 1 else {}
     gyros = [n for n, imu in there.items() if _has(imu, "gyro") and not _has(imu, "accel")]
     accels = [n for n, imu in there.items() if _has(imu, "accel") and not _has(imu, "gyro")]

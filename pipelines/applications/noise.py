@@ -116,12 +116,12 @@ def noise(
     names = [
         name
         for name, topic in opened.topics.items()
-        if (topic.type in (messages.IMU, messages.MAGNETIC_FIELD) or name in rates)
+        if (topic.type in (*messages.IMUS, messages.MAGNETIC_FIELD) or name in rates)
         and topic.is_readable
         and topic.count
     ]
     if not names:
-        kinds = f"{messages.IMU} or {messages.MAGNETIC_FIELD}"
+        kinds = f"{', '.join(messages.IMUS)} or {messages.MAGNETIC_FIELD}"
         raise InputError(
             f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {opened.there()}; tables need "
             "--auto-columns or --config with their `columns`, rates alone their topic under `topics` in it, as head_imu"

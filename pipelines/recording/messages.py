@@ -45,19 +45,21 @@ TAG_DETECTIONS = "apriltag_msgs/msg/AprilTagDetectionArray"
 
 # What an attitude is taken from; of an Imu its orientation. A TFMessage besides needs the pair of frames.
 ATTITUDES = (POSE, PLAIN_POSE, QUATERNION, TRANSFORM, ODOMETRY, IMU)
+# Angular rates and accelerations in one message.
+IMUS = (IMU,)
 # What angular rates are taken from where no acceleration is needed.
-RATES = (IMU, VECTOR, TWIST)
+RATES = (*IMUS, VECTOR, TWIST)
 # Pictures, as files and raw.
 PICTURES = (COMPRESSED_IMAGE, IMAGE)
 
 # All types that anything is taken from.
 SENSORS = (
-    *(IMU, MAGNETIC_FIELD, JOINT_STATE, NAV_SAT_FIX, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, VECTOR, QUATERNION, POSE),
+    *(*IMUS, MAGNETIC_FIELD, JOINT_STATE, NAV_SAT_FIX, CAMERA_INFO, *PICTURES, VECTOR, QUATERNION, POSE),
     *(PLAIN_POSE, TRANSFORM, ODOMETRY, TWIST, ACCEL, TF, TAG_DETECTIONS, TEMPERATURE),
 )
 
-# Not among the types rosbags brings along.
-_APRILTAG_MSGS = {
+# Definitions of types that rosbags does not bring along.
+_DEFINITIONS = {
     "apriltag_msgs/msg/Point": "float64 x\nfloat64 y\n",
     "apriltag_msgs/msg/AprilTagDetection": (
         "string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n"
@@ -287,10 +289,10 @@ def has_header(text: str) -> bool:
 def definition_text(name: str) -> str:
     """The text that a recording carries for a type, with all the types it is made of.
 
-    Raises MessageError for a type that is not one of ROS 2 Humble's or of apriltag_msgs.
+    Raises MessageError for a type that is neither one of ROS 2 Humble's nor in _DEFINITIONS.
     """
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for own, text in _APRILTAG_MSGS.items():
+    for own, text in _DEFINITIONS.items():
         store.register(get_types_from_msg(text, own))
     if name not in store.types:
         raise MessageError(f"the message type {name} is not known, and the recording does not define it")

@@ -254,7 +254,7 @@ class Recording:
         """A sensor_msgs/Imu topic, or rates alone from a Vector3Stamped or TwistStamped one: accelerations NaN."""
         if topic in self._sources:
             return self._derived_imu(topic, self._sources[topic])
-        if self._require(topic, *messages.RATES).type == messages.IMU:
+        if self._require(topic, *messages.RATES).type in messages.IMUS:
             return self._series(series.ImuSeries, topic, frame)
         rate = self._series(series.VectorSeries, topic, frame)
         return series.ImuSeries(
@@ -375,7 +375,7 @@ class Recording:
     def _part(self, topic: str, which: str) -> series.VectorSeries:
         """The rates or accelerations on a topic that holds either."""
         info = self._require(topic, *messages.RATES, messages.ACCEL)
-        if info.type != messages.IMU:
+        if info.type not in messages.IMUS:
             return self._series(series.VectorSeries, topic)
         imu = self._series(series.ImuSeries, topic)
         return series.VectorSeries(

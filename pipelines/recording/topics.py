@@ -48,7 +48,7 @@ class Setting:
 Need = Sequence[Sequence[Topic | Setting]]
 
 # Topics that several methods read.
-IMU = Topic("imu", "/imu", (messages.IMU,))
+IMU = Topic("imu", "/imu", messages.IMUS)
 MAG = Topic("mag", "/mag", (messages.MAGNETIC_FIELD,))
 FIX = Topic("fix", "/fix", (messages.NAV_SAT_FIX,))
 TEMPERATURE = Topic("temperature", "/temperature", (messages.TEMPERATURE,))

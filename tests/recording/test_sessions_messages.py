@@ -11,10 +11,15 @@ import pytest
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import alidade
+from alidade.pipelines.applications.discovery import suggestions
 from alidade.pipelines.applications.session import resolve_method, session_facts
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.decoding import NUMERIC_TYPES
 from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.recording.series import ImuSeries, PoseSeries, VectorSeries
+from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
 from tests.support.raw_messages import FLAT, OLD_TAGS, POINT_TAGS, STORE, T0, random_message, read_any, write_raw
 
@@ -39,6 +44,37 @@ def _numbers_without_strings(definition: messages.Definition, message: Any) -> n
         names = [name for name, _ in STORE.fielddefs[message.__msgtype__][1]]
         return np.concatenate([_numbers_without_strings(definition, getattr(message, name)) for name in names])
     return definition.numbers(message)
+
+
+def test_every_type_has_a_definition_and_is_read_by_something() -> None:
+    for kind in messages.SENSORS:
+        assert messages.known(kind)
+    single = {messages.CAMERA_INFO, *messages.PICTURES, messages.TF, messages.TAG_DETECTIONS}
+    assert set(messages.SENSORS) == NUMERIC_TYPES | single
+
+
+def test_groups_of_types_are_those_that_have_columns() -> None:
+    imu, vector, pose = ({each.TYPE, *each.OTHERS} for each in (ImuSeries, VectorSeries, PoseSeries))
+    assert set(messages.IMUS) == imu
+    assert {*messages.RATES, messages.ACCEL} == imu | vector
+    assert set(messages.ATTITUDES) == pose | {messages.QUATERNION, messages.IMU}
+
+
+@pytest.mark.parametrize("kind", messages.IMUS)
+def test_every_imu_is_one_for_reading_discovery_and_noise(kind: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    stamps = [T0 + 10**7 * i for i in range(100)]
+    data = [bytes(STORE.serialize_cdr(random_message(kind, rng, t, "imu"), kind)) for t in stamps]
+    path = write_raw(tmp_path / "x.mcap", "/x", kind, messages.definition_text(kind), data, stamps)
+    recording = open_recording(path)
+    derived = recording.with_config([TopicSource(gyro="/x", accel="/x")])
+    (name,) = derived.topics.keys() - recording.topics.keys()
+    for imu in (recording.imu("/x"), derived.imu(name)):
+        assert np.isfinite([imu.gyro, imu.accel]).all()
+    found = suggestions(recording, Config())
+    assert any(source.name == "/x" for each in found for source in each.topics.values())
+    with pytest.raises(InputError, match="topic /x: acceleration has a norm of"):
+        alidade.noise(path)
 
 
 @pytest.mark.parametrize("cut", [0, 3, 4, 20, 100])

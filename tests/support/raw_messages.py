@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from alidade.pipelines.recording import messages
+from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.recording import open_recording
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 T0 = 1_700_000_000_000_000_000
-FLAT = [
-    messages.IMU,
-    messages.MAGNETIC_FIELD,
-    messages.VECTOR,
-    messages.QUATERNION,
-    messages.POSE,
-    messages.NAV_SAT_FIX,
-    messages.TEMPERATURE,
-]
+READERS: dict[type[series.Series], str] = {
+    series.ImuSeries: "imu",
+    series.MagneticSeries: "magnetic",
+    series.VectorSeries: "vector",
+    series.QuaternionSeries: "quaternion",
+    series.PoseSeries: "poses",
+    series.FixSeries: "fixes",
+    series.TemperatureSeries: "temperature",
+}
+# Every type of message that becomes a series -> how a recording reads it.
+FLAT = {kind: READERS[each] for each in series.Series.__subclasses__() for kind in (each.TYPE, *each.OTHERS)}
+for _kind in FLAT.keys() - STORE.types.keys():
+    STORE.register(get_types_from_msg(messages.definition_text(_kind), _kind))
 
 
 OLD_TAGS = """std_msgs/Header header
@@ -95,13 +100,5 @@ def write_raw(
 
 def read_any(path: Path, kind: str) -> dict[str, Any]:
     recording = open_recording(path)
-    method: Any = {
-        messages.IMU: recording.imu,
-        messages.MAGNETIC_FIELD: recording.magnetic,
-        messages.VECTOR: recording.vector,
-        messages.QUATERNION: recording.quaternion,
-        messages.POSE: recording.poses,
-        messages.NAV_SAT_FIX: recording.fixes,
-        messages.TEMPERATURE: recording.temperature,
-    }.get(kind, lambda topic: recording.joints(topic, ["defgh", "ab"]))
-    return dict(vars(method("/x")))
+    read: Any = getattr(recording, FLAT[kind]) if kind in FLAT else partial(recording.joints, names=["defgh", "ab"])
+    return dict(vars(read("/x")))
