@@ -40,6 +40,8 @@ SECTIONS = [pytest.param(step.file.split("-")[0], step.text, id=step.file) for s
 def test_every_figure_has_an_entry_with_its_sources() -> None:
     sheets = YAML(typ="safe").load(SHEETS.read_text(encoding="utf-8"))
     stated = {f"{sensor}.{figure}" for sensor, sheet in Sensors() for figure in type(sheet).model_fields}
+    used = {spec.data_sheet for name in methods.names() for spec in methods.method(name).parameters if spec.data_sheet}
+    assert used <= stated, "figures that settings.py does not have"
     assert sheets["figures"].keys() == stated
     cited = {
         key for entry in sheets["figures"].values() for device in entry.get("devices", ()) for key in _cited(device)

@@ -4,8 +4,8 @@
 
 Blocks are told by what follows their fence: `sh` (a command a line; a comment says `exit code 3` where it is not 0),
 `yaml file=NAME`, `python` (one program a page), and `text output`, what the last command before it prints: there `...`
-stands for anything, blanks and the lines of tables do not count, and numbers agree to a unit of their last digit or to
-2 %.
+stands for anything, blanks and the lines of tables do not count, and numbers agree to 2 %, counts below 50 exactly, or
+to a unit of their last decimal.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _plain(text: str) -> str:
 
 def _alike(shown: str, printed: str) -> bool:
     mantissa, _, exponent = shown.partition("e")
-    digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+    digit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2])) if set(".e") & set(shown) else 0.0
     return abs(float(shown) - float(printed)) <= max(1.001 * digit, 0.02 * abs(float(shown)))
 
 

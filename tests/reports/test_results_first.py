@@ -15,10 +15,11 @@ from alidade.pipelines.display.figure import Figure
 from alidade.pipelines.display.svg import interval_bar, svg, ticks
 from alidade.pipelines.display.table import Interval
 from alidade.pipelines.display.units import rounded, to_digits_of
+from alidade.pipelines.methods import method, names
 from alidade.pipelines.methods.triads import parts_of, sensor_model
 from alidade.pipelines.reports.calibration_report import calibration_report, report_html
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.reports.results_table import result_cards
+from alidade.pipelines.reports.results_table import CARD_UNITS, result_cards
 from alidade.pipelines.reports.terminal import console, print_report
 from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_browser, running
 from tests.support.pages import Page
@@ -27,6 +28,14 @@ from tests.support.pages import Page
 MAX_HEIGHT = 6000
 SCENARIOS: dict[str, object] = {"tumble": None, "head": "head_mounts", "los": None, "cube": None, "indexer": None}
 CASES = [pytest.param(name, marks=[pytest.mark.slow] * (name != "tumble")) for name in SCENARIOS]
+
+
+@pytest.mark.parametrize("name", names())
+def test_cards_are_of_parameters_in_units_that_reports_have(name: str) -> None:
+    groups = [group for card in method(name).report.cards.values() for group in card]
+    assert {unit for _, unit, _ in groups} <= {"", *CARD_UNITS}
+    for parameter in (each for _, _, parameters in groups for each in parameters):
+        assert method(name).describe(parameter), parameter
 
 
 @cache

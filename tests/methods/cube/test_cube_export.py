@@ -302,11 +302,13 @@ def test_wrong_format_and_method() -> None:
         export(_calibration({}, {}, "head"), "px4")
 
 
-def test_command_and_python_name_every_format() -> None:
+def test_command_python_and_page_name_every_format() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
     shown = CliRunner().invoke(app, ["export", "-h"], env={"COLUMNS": "200"}).output
     for form in (*FORMATS, *MOUNT_FORMATS):
         assert form in shown
         assert form in str(alidade.export.__doc__)
+        assert f"\n| `{form}`" in page
 
 
 def test_without_magnetometer_nothing_is_said_about_one() -> None:
