@@ -320,7 +320,7 @@ class Problem:
             this graph that is in them and from which on there are steps; -inf: from all data, with all steps. It agrees
             with this one on variables, and its steps stay as they are, but for the last one and those of the last
             `unsettled` s. None if there is no such keyframe. Not every graph can be built from the end alone.
-        unsettled: see `continuation`, s.
+        unsettled: so long, s, is the end of the graph whose steps still change while the recording grows.
         noises: that are in force, with what sensors' own samples say of them.
         constants: numbers of the recording that formulas need beside the parameters, by name.
         keyframes: where they stand; None: there are no pictures with a clock that is estimated.
@@ -328,8 +328,8 @@ class Problem:
             other minima. None: the method has no such.
         layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
-        may_step: rotations that may change at one moment, as a mount that slips.
-        finer: the graph for noise levels, where keyframes stand closer than in this one; None: where this one serves.
+        may_step: keys of rotations that may jump once, as a mount that slips: a solver tests for it.
+        finer: noise levels -> the graph with closer keyframes that they need; None where this one serves.
         gaussian_priors: joint priors from elsewhere than data sheets; the last one about a number is in force.
     """
 
