@@ -73,7 +73,7 @@ class VisionAttitudeFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitudes, bias, mounts, the pictures' errors and those of the gyros."""
+        """Blocks of the variables: attitudes, bias, mounts, the pictures' errors and those of the gyros."""
         picture = 1 if self.elapsed is None else len(PICTURE_ERRORS)
         return ROT3, 3, ROT3, ROT3, picture, *error_blocks(self.errors, self.platform_errors)
 

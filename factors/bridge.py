@@ -108,7 +108,7 @@ class BoundModel:
 
     @property
     def factor(self) -> gtsam.CustomFactor:
-        """A gtsam factor that asks this model, and keeps it.
+        """A gtsam factor that evaluates this model and keeps it alive.
 
         It is not kept here: the two would keep each other for good, since Python's garbage collector cannot see what
         gtsam holds.
@@ -133,7 +133,7 @@ class BoundModel:
         return self._counts(self.residuals(values), self.loss) > 0.5
 
     def under(self, loss: TruncatedLoss | None) -> BoundModel:
-        """The same with another loss, if it has one at all."""
+        """This model under another loss; unchanged where it has none."""
         if self.loss is None or self.loss == loss:
             return self
         other = copy(self)
@@ -141,7 +141,7 @@ class BoundModel:
         return other
 
     def weighed(self, weights: Array) -> BoundModel:
-        """The same with its whitened residuals multiplied by other weights (m,) or (n, m): noise of 1 / weights.
+        """This model with its whitened residuals multiplied by weights (m,) or (n, m): noise of 1 / weights.
 
         They take the place of those it has.
         """

@@ -97,7 +97,7 @@ class StrengthFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Triad, strength and what the drivers do."""
+        """Blocks of the variables: triad, strength and the drivers' effects."""
         return (9 if self.symmetric else 12, 1, *([] if self.drivers is None else [self.drivers.shape[1]]))
 
     def __call__(self, triads: Array, strength: Array, *drift: Array) -> Residuals:
@@ -152,7 +152,7 @@ class DipFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Accelerometer, magnetometer, dip and what the drivers do."""
+        """Blocks of the variables: accelerometer, magnetometer, dip and the drivers' effects."""
         triads = (9 if symmetric else 12 for symmetric in self.symmetric)
         return (*triads, 1, *([] if self.drivers is None else [self.drivers.shape[1]]))
 

@@ -105,7 +105,7 @@ def platform_errors(gyro: GyroPath, variable: Array | None, n: int) -> tuple[Arr
 
 
 def by_platform_errors(derivatives: Derivatives, variable: Array | None) -> tuple[Array, ...]:
-    """Derivatives by that variable."""
+    """Derivatives by the variable of the platform gyro's errors."""
     return () if variable is None else (np.concatenate(derivatives(), axis=2),)
 
 

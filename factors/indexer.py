@@ -38,7 +38,7 @@ _GAUSS = 0.5 + np.array([-1.0, 1.0]) / np.sqrt(12.0)
 
 
 def mounting(theta: ArrayLike) -> Array:
-    """Angles theta, shape (..., 3), rad -> tRm, shape (..., 4)."""
+    """Mounting rotation tRm (..., 4) of the angles theta (..., 3), rad."""
     x, y, z = (np.asarray(theta, dtype=float)[..., i, None] for i in range(3))
     return so3.compose(so3.exp(z * _EZ), so3.exp(y * _EY), so3.exp(x * _EX))
 
@@ -51,7 +51,7 @@ def mounting_angles(tRm: ArrayLike) -> Array:
 
 
 def base_from_platform(outer: ArrayLike, inner: ArrayLike, epsilon: ArrayLike = 0.0) -> Array:
-    """baseRt, shape (..., 4), at the axis angles (rad)."""
+    """Rotation baseRt (..., 4) of the platform at the axis angles, rad."""
     alpha, beta, tilt = (np.asarray(a, dtype=float)[..., None] for a in (outer, inner, epsilon))
     return so3.compose(so3.exp(alpha * _EX), so3.exp(tilt * _EY), so3.exp(beta * _EZ))
 
@@ -283,7 +283,7 @@ class IndexerAverageFactor(Model):
         theta_unit: float = 1.0,
         temperature: Array | None = None,
     ) -> IndexerAverageFactor:
-        """From the noise of the sensors.
+        """A factor whose sqrt_information follows from the noise of the sensors.
 
         Args:
             gyro, rates, options, theta_unit, temperature: as the attributes.
@@ -305,12 +305,12 @@ class IndexerAverageFactor(Model):
 
     @property
     def time(self) -> Array:
-        """(n,) ends of the windows, s."""
+        """Ends of the windows (n,), s."""
         return self.rates.edges[1:]
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """theta, bias and the options."""
+        """Blocks of the variables: theta, bias and the options."""
         return (3, 3, *(_SIZES[option] for option in self.options))
 
     def __call__(self, theta: Array, bias: Array, *more: Array) -> Residuals:

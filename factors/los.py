@@ -120,12 +120,12 @@ class LosDirectionFactor(Model):
 
     @property
     def rows(self) -> int:
-        """2, or 3 with the roll."""
+        """Numbers of a residual: 2, or 3 with the roll."""
         return self.measured.shape[1]
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """tRm, the angles and, with a context, bias, SIGHT_ERRORS and the gyro's errors."""
+        """Blocks of the variables: tRm, the angles and, with a context, bias, SIGHT_ERRORS and the gyro's errors."""
         if self.context is None:
             return ROT3, len(self.names)
         return ROT3, len(self.names), 3, len(SIGHT_ERRORS), *([self.errors] if self.errors else [])
@@ -191,7 +191,7 @@ class LosDirectionFactor(Model):
         return angle, gain * by_late, gain * by_delay, -np.stack([gain * sine, gain * cosine], axis=2)
 
     def camera(self, angles: Array) -> Array:
-        """cRm (n, 4) at the stamps and mounting angles (n, d), rad."""
+        """Camera attitudes cRm (n, 4) at the stamps and mounting angles (n, d), rad."""
         turned = self._camera(so3.identity(len(angles)), angles, self.gimbal)
         return so3.from_matrix(turned[:, :3].transpose(2, 0, 1))
 

@@ -29,7 +29,7 @@ Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
 
 
 class LieGroup(Enum):
-    """Variables that are no vectors."""
+    """Variables of a Lie group other than vectors."""
 
     ROT3 = "ROT3"
     POSE3 = "POSE3"
@@ -127,12 +127,12 @@ class Model:
 
 
 def width(block: Block) -> int:
-    """Numbers of a variable as a model gets it."""
+    """Number of values with which a model receives a variable."""
     return block if isinstance(block, int) else {ROT3: 4, POSE3: 7}[block]
 
 
 def dimension(block: Block) -> int:
-    """Numbers of a variable's tangent."""
+    """Dimension of a variable's tangent space."""
     return block if isinstance(block, int) else {ROT3: 3, POSE3: 6}[block]
 
 
@@ -248,7 +248,7 @@ def stack_models(parts: Sequence[Any]) -> Any:
 
 
 def select_rows(whole: Any, rows: Index) -> Any:
-    """A model, array or list of some measurements."""
+    """The measurements of a model, an array or a list at some rows."""
     if whole is None or isinstance(whole, np.ndarray):
         return whole if whole is None else whole[rows]
     if isinstance(whole, list):

@@ -87,19 +87,19 @@ def identity(shape: int | tuple[int, ...] = ()) -> Array:
 
 
 def normalize(q: ArrayLike) -> Array:
-    """Unit quaternions along q."""
+    """Unit quaternions: q scaled to length one."""
     q = np.asarray(q, dtype=float)
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def inverse(q: ArrayLike) -> Array:
-    """aRb -> bRa."""
+    """Inverse rotations: aRb -> bRa."""
     return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 @_in_cache
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
-    """aRb, bRc -> aRc."""
+    """Product of two rotations: aRb, bRc -> aRc."""
     # (a + b j) (c + d j).
     (a, b), (c, d) = _pair(np.asarray(p, dtype=float)), _pair(np.asarray(q, dtype=float))
     first, second = a * c, a * d
@@ -148,7 +148,7 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def hat(v: ArrayLike) -> Array:
-    """Skew matrices, shape (..., 3, 3): hat(v) @ u = cross(v, u)."""
+    """Skew-symmetric matrices (..., 3, 3) of vectors: hat(v) @ u = cross(v, u)."""
     v = np.asarray(v, dtype=float)
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
@@ -159,7 +159,7 @@ def hat(v: ArrayLike) -> Array:
 
 @_in_cache
 def exp(phi: ArrayLike) -> Array:
-    """Rotation vectors, shape (..., 3), rad -> quaternions."""
+    """Quaternions of rotation vectors (..., 3), rad."""
     phi = np.asarray(phi, dtype=float)
     phi = phi if phi.ndim else np.full(3, phi)  # no angle about any axis, as formulas have it where nothing is known
     # The least angle only avoids 0 / 0.
@@ -188,7 +188,7 @@ def log(q: ArrayLike) -> Array:
 
 @_in_cache
 def matrix(q: ArrayLike) -> Array:
-    """Quaternions -> rotation matrices, shape (..., 3, 3)."""
+    """Rotation matrices (..., 3, 3) of quaternions."""
     q = np.asarray(q, dtype=float)
     # As `rotate` has it, of the axes.
     a, b = _pair(q)
@@ -306,7 +306,7 @@ def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
 
 
 def to_gtsam(q: ArrayLike) -> gtsam.Rot3:
-    """One quaternion, shape (4,) -> gtsam.Rot3."""
+    """The gtsam.Rot3 of one quaternion (4,)."""
     import gtsam
 
     w, x, y, z = np.asarray(q, dtype=float).tolist()

@@ -24,7 +24,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def triad(K: Array, b: Array) -> Array:
-    """The triad (12,) with nominal = K raw + b; K (3, 3), b (3,)."""
+    """The numbers (12,) of a triad, nominal = K raw + b, by K (3, 3) and b (3,)."""
     A = np.linalg.inv(K)
     return np.concatenate([A.ravel(), -A @ b])
 
@@ -52,7 +52,7 @@ def calibration(triads: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class TriadPriorFactor(Model):
-    """What is known of K and b beforehand. Block: triad (12).
+    """Prior on K and b of a triad. Block: triad (12).
 
     Attributes:
         time: (n,) s.

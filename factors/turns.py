@@ -110,7 +110,7 @@ class GyroRotationFactor(Model):
 
 @dataclass(frozen=True)
 class Samples:
-    """Times of the N samples of n turns, one turn after the other.
+    """Stamps of the N samples of n turns, one turn after the other.
 
     Attributes:
         t: (N,) stamps, s.
@@ -127,7 +127,7 @@ class Samples:
 
     @classmethod
     def of(cls, stamps: Sequence[Array]) -> Samples:
-        """Samples of turns from the stamps of each, two at least."""
+        """Samples of turns from the stamps of each turn, two at least."""
         counts = np.array([len(each) for each in stamps])
         t, ends = np.concatenate(stamps), np.cumsum(counts)
         step = np.diff(t)[:, None]
@@ -153,7 +153,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Turns:
-    """Turns as a gyro with a given triad measures them.
+    """Rotations of turns, as a gyro with a given triad measures them.
 
     Attributes:
         samples: the samples of all turns.

@@ -77,7 +77,7 @@ def until_passed(items: Iterable[Item], name: Callable[[Item], str], least: int 
 
 
 def sentence() -> str:
-    """Says that an iteration ended for want of time."""
+    """Sentence that the time limit stopped an iteration; empty without a limit."""
     deadline = _deadline.get()
     return "" if deadline is None else f"stopped by the time limit of {deadline.limit:.3g} s"
 

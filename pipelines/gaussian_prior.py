@@ -30,7 +30,7 @@ class GaussianPrior:
     source: str = ""
 
     def of(self, names: Collection[str]) -> GaussianPrior:
-        """What it says of those of these numbers that it knows."""
+        """The prior of those numbers among some that it knows."""
         kept = [i for i, name in enumerate(self.names) if name in names]
         rows = np.array(kept, dtype=np.intp)
         known = tuple(self.names[i] for i in kept)
@@ -49,20 +49,20 @@ class GaussianPrior:
 
     @property
     def sigmas(self) -> Array:
-        """(n,)."""
+        """Standard deviations (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
 
 def independent(
     names: Sequence[str], mean: Sequence[float], sigmas: Sequence[float], source: str = ""
 ) -> GaussianPrior:
-    """Numbers of which each is known by itself."""
+    """Gaussian prior of numbers without correlations."""
     return GaussianPrior(
         tuple(names), np.array(mean, dtype=float), np.diag(np.square(np.array(sigmas, dtype=float))), source
     )
 
 
 def root_of_information(correlation: Array, sigmas: Array) -> Array:
-    """(n, n) R with R'R the information of numbers with these correlations and sigmas (n,)."""
+    """Square root R (n, n) of the information, R'R, of numbers with these correlations and sigmas (n,)."""
     eigenvalues, vectors = np.linalg.eigh(correlation)
     return np.asarray((vectors / np.sqrt(np.maximum(eigenvalues, _LEAST))).T / sigmas)

@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class NoiseSpec:
-    """A noise that a graph may have.
+    """Declaration of a noise that a graph may have.
 
     Attributes:
         name: its key under `noise` in the config, where it is one.

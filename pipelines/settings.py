@@ -79,7 +79,7 @@ Vector = Annotated[tuple[float, float, float], Field(strict=False)]
 
 
 class Section(BaseModel):
-    """Keys and values: strict, unknown keys refused."""
+    """Base of a config's sections: strict, unknown keys refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
@@ -129,7 +129,7 @@ class Sheet(Section):
 
 
 class GyroSheet(Sheet):
-    """Of a gyro."""
+    """Data sheet of a gyro, one sigma each."""
 
     scale: SigmaOrZero | None = None  # no unit
     skew: SigmaOrZero | None = None  # rad: half the angle error between two axes
@@ -139,7 +139,7 @@ class GyroSheet(Sheet):
 
 
 class PlatformGyroSheet(Sheet):
-    """Of a platform's gyro."""
+    """Data sheet of a platform's gyro, one sigma each."""
 
     bias: SigmaOrZero | None = None  # rad/s
     scale: SigmaOrZero | None = None  # no unit
@@ -147,7 +147,7 @@ class PlatformGyroSheet(Sheet):
 
 
 class CameraSheet(Sheet):
-    """Of a camera, or of what makes angles of its pictures."""
+    """Data sheet of a camera, or of what makes angles of its pictures."""
 
     scale: SigmaOrZero | None = None  # of the angles, no unit
     filter: SigmaOrZero | None = None  # s^2, half of second moments of impulse responses, the camera's less the gyro's
@@ -157,21 +157,21 @@ class CameraSheet(Sheet):
 
 
 class EncoderSheet(Sheet):
-    """Of encoders."""
+    """Data sheet of encoders."""
 
     once_per_turn: SigmaOrZero | None = None  # rad: amplitude of the error that comes once a turn, sine and cosine each
     delay: SigmaOrZero | None = None  # s: how late a reading was taken
 
 
 class ClockSheet(Sheet):
-    """Of the pictures' clock against the gyro's."""
+    """Data sheet of the pictures' clock against the gyro's."""
 
     offset: SigmaOrZero | None = None  # s, of a tracker that was not calibrated
     skew: SigmaOrZero | None = None  # s/s
 
 
 class AccelSheet(Sheet):
-    """Of an accelerometer that reads u + square u^2 + cube u^3."""
+    """Data sheet of an accelerometer that reads u + square u^2 + cube u^3."""
 
     square: SigmaOrZero | None = None  # s^2/m
     cube: SigmaOrZero | None = None  # (s^2/m)^2
@@ -179,25 +179,25 @@ class AccelSheet(Sheet):
 
 
 class MagSheet(Sheet):
-    """Of a magnetometer."""
+    """Data sheet of a magnetometer."""
 
     delay: SigmaOrZero | None = None  # s, of a reading against its stamp
 
 
 class ReferenceSheet(Sheet):
-    """Of an attitude reference."""
+    """Data sheet of an attitude reference."""
 
     tilt: SigmaOrZero | None = None  # rad, of its level
 
 
 class FieldSheet(Sheet):
-    """Of the earth's magnetic field where the recording is made."""
+    """Uncertainty of the earth's magnetic field where the recording is made."""
 
     model_error: Sigma | None = None  # T, of its model there
 
 
 class Strength(Section):
-    """As measured."""
+    """Measured strength of the magnetic field."""
 
     value: float  # T
     sigma: Sigma  # T
@@ -210,26 +210,26 @@ class Strength(Section):
 
 
 class EarthField(Section):
-    """The magnetic field."""
+    """Settings of the earth's magnetic field."""
 
     strength: Strength | None = None  # null: the model's
 
 
 class GimbalSheet(Sheet):
-    """Of a gimbal."""
+    """Data sheet of a gimbal."""
 
     collimation: SigmaOrZero | None = None  # rad: optical axis against elevation axis
     nonperpendicularity: SigmaOrZero | None = None  # rad: elevation axis against azimuth axis
 
 
 class TargetSheet(Sheet):
-    """Of a target."""
+    """Data sheet of a target."""
 
     rate: SigmaOrZero | None = None  # rad/s: turn of the direction to it
 
 
 class TagsSheet(Sheet):
-    """Of tags on a body, as a drawing says where they are."""
+    """Uncertainty of tags on a body, placed as a drawing says."""
 
     position: SigmaOrZero | None = None  # m, each way, against the tag with the lowest id
     rotation: SigmaOrZero | None = None  # rad, about each axis, of every tag
@@ -271,7 +271,7 @@ SensorSheets = Annotated[Sensors, BeforeValidator(partial(_ideal, Sensors))]
 
 
 class Vision(Section):
-    """What measures attitudes."""
+    """Settings of what measures attitudes."""
 
     kind: Literal["mocap", "pnp", "vio", "other"] = "other"  # mocap: its vision_scale is 0
 
@@ -354,7 +354,7 @@ class Config(Section):
         return self._origin
 
     def of(self, origin: str) -> Config:
-        """The same config with the file that it is from."""
+        """The config with the name of the file that it is from."""
         out = self.model_copy()
         out._origin = origin
         return out
@@ -370,7 +370,7 @@ class Config(Section):
         return self._gaussian_prior
 
     def with_prior(self, gaussian_prior: GaussianPrior) -> Config:
-        """The same config with what is known from elsewhere; what it says of priors itself goes before that."""
+        """The config with priors from elsewhere, over which those that it states itself take precedence."""
         out = self.model_copy()
         out._gaussian_prior = gaussian_prior
         return out
@@ -411,7 +411,7 @@ def check_names(given: Iterable[str], known: Collection[str], where: str) -> Non
 
 
 def first_given(*values: float | None) -> float:
-    """Of config, message covariance and default, in this order, the first that says something.
+    """The first value that is not None: of config, message covariance and default, in this order.
 
     Raises ValueError if none does.
     """

@@ -60,7 +60,7 @@ class CorrectedTopic:
 
     @property
     def text(self) -> str:
-        """One line."""
+        """One line about the topic: sensors, source, number of messages, frame."""
         frame = f", frame {self.messages.frame_id}" if self.messages.frame_id else ""
         return f"{self.name}: {' and '.join(self.sensors)} of {self.recorded}, {len(self.messages)} messages{frame}"
 

@@ -44,7 +44,7 @@ class Comparison:
     tested: bool = False
 
     def of(self, solver: str) -> Calibration | None:
-        """The calibration by the named solver."""
+        """The calibration of the named solver."""
         return next((c for c in self.calibrations if c.estimate.solver == solver), None)
 
     def difference(self, solver: str) -> SolverDifference | None:

@@ -39,7 +39,7 @@ _DELAY = 0.002
 
 @dataclass(frozen=True)
 class Suggestion:
-    """What a method could read.
+    """The topics that a method could read in a recording.
 
     Attributes:
         method: its name.
@@ -57,7 +57,7 @@ class Suggestion:
 
     @property
     def yaml(self) -> str:
-        """The `topics:` section to paste."""
+        """Config section `topics:` of the suggestion, to paste."""
         given = {key: source.model_dump() for key, source in self.topics.items()}
         return "\n".join(["topics:", *(f"  {key}: {flow_yaml(value)}" for key, value in given.items())])
 

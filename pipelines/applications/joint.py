@@ -69,7 +69,7 @@ _NO_VARIABLE = 0
 
 @dataclass(frozen=True, eq=False)
 class Alone:
-    """What is kept of a recording that was calibrated by itself.
+    """Calibration of one recording by itself, kept for the joint one.
 
     Attributes:
         calibration: what result.json says of it by itself, without the data behind it.
@@ -87,7 +87,7 @@ class Alone:
 
     @classmethod
     def of(cls, session: Session, calibration: Calibration, data: Path) -> Alone:
-        """Of a session's calibration by batch; its data go into a file."""
+        """Keep a session's batch calibration in memory and its data in a file."""
         estimate = calibration.estimate
         assert estimate.sqrt_info is not None
         with data.open("wb") as stream:
@@ -123,27 +123,27 @@ class Alone:
 
     @property
     def name(self) -> str:
-        """Of the file."""
+        """Name of the recording's file."""
         return self.calibration.recording
 
     @property
     def start(self) -> datetime.datetime:
-        """Its date."""
+        """Date of the recording."""
         return datetime.datetime.fromtimestamp(self.day * DAY_S, datetime.UTC)
 
     @property
     def values(self) -> dict[str, float]:
-        """What it estimated by itself."""
+        """Values that the recording alone gave, by parameter."""
         return {name: p.value for name, p in self.calibration.parameters.items()}
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Of what it estimated by itself."""
+        """Sigmas that the recording alone gave, by parameter."""
         found = self.calibration.parameters
         return {name: p.sigma for name, p in found.items() if p.sigma > 0.0}
 
     def loaded(self) -> Any:
-        """Its data."""
+        """The recording's data, read back from their file."""
         with self.data.open("rb") as stream:
             return pickle.load(stream)  # written above, into a folder of our own
 
@@ -151,7 +151,7 @@ class Alone:
 def calibrate_together(
     sessions: Sequence[Callable[[], Session]], written: Callable[[Calibration], None] = lambda _: None
 ) -> Calibration:
-    """The joint calibration by batch.
+    """Calibrate several recordings of a device jointly, by batch.
 
     Args:
         sessions: open the recordings, one after the other.

@@ -39,7 +39,7 @@ _HOLE, _MOST_FILLED = 5, 0.02
 
 @dataclass(frozen=True, eq=False)
 class SensorNoise:
-    """Noise of one sensor.
+    """Allan deviation and noise coefficients of one sensor.
 
     Attributes:
         topic: where it is in the recording.
@@ -62,7 +62,7 @@ class SensorNoise:
 
     @property
     def length_s(self) -> float:
-        """Time at rest, all intervals together."""
+        """Time at rest, s, all intervals together."""
         return self.samples / self.rate_hz
 
 
@@ -78,7 +78,7 @@ class NoiseStudy:
 
     @property
     def config(self) -> dict[str, dict[str, float]]:
-        """The section `noise` of a config."""
+        """Section `noise` of a config with the densities found."""
         from alidade.pipelines.reports.noise_report import section
 
         return {"noise": section(self)[0]}

@@ -37,7 +37,7 @@ class _Result:
 
 
 class MagnetometerResult(tuple[Array, Array, float], _Result):
-    """A (3, 3), b (3,), field; the whole is in `.calibration`."""
+    """Result of a compass calibration: A (3, 3), b (3,), field; details are in `.calibration`."""
 
 
 class StaticResult(tuple[Array, Array, Array, Array], _Result):
@@ -45,7 +45,7 @@ class StaticResult(tuple[Array, Array, Array, Array], _Result):
 
 
 class HandEyeResult(tuple[Array, float], _Result):
-    """R (3, 3), delay; the whole is in `.calibration`."""
+    """Result of a hand-eye calibration: R (3, 3), delay; details are in `.calibration`."""
 
 
 def magcal(m: ArrayLike, t: ArrayLike | None = None, *, config: Settings = None) -> MagnetometerResult:

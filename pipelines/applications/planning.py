@@ -34,7 +34,7 @@ _DRAWS = 5
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a recording of a motion would determine.
+    """Predicted estimate of a recording of one motion.
 
     Attributes:
         scenario: the motion.
@@ -58,7 +58,7 @@ class Prediction:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Parameter -> predicted sigma, SI."""
+        """Predicted sigma of each parameter, SI."""
         sigmas = np.sqrt(np.diag(self.covariance)).tolist()
         return {q.name: sigma for q, sigma in zip(self.quantities, sigmas, strict=True)}
 
@@ -91,7 +91,7 @@ Made = dict[tuple[str, int], Prediction]
 
 @dataclass(frozen=True)
 class Step:
-    """A change of the motion.
+    """Proposed change of the motion, with its prediction.
 
     Attributes:
         change: in words.
@@ -117,7 +117,7 @@ class Plan:
 
     @property
     def best(self) -> Prediction:
-        """With all changes."""
+        """Prediction with all proposed changes."""
         return self.steps[-1].prediction if self.steps else self.now
 
     @property

@@ -155,7 +155,7 @@ class Session:
         return session if prior is None else session.beginning_from(prior)
 
     def beginning_from(self, prior: Path) -> Session:
-        """The same with what an earlier calibration says of the device as prior; a result.json or calibration.yaml.
+        """Session with an earlier calibration of the device as prior, a result.json or calibration.yaml.
 
         Raises:
             InputError: it cannot be used, is another method's, or was made of this recording.
@@ -164,13 +164,13 @@ class Session:
         return replace(self, config=self.config.with_prior(gaussian_prior))
 
     def again(self, recording: Recording) -> Session:
-        """The same method and config with another recording, or another part of it. Raises InputError."""
+        """Session of another recording, or part of one, with the same method and config. Raises InputError."""
         recording = recording.with_config(self.config.topics.values(), self.config.columns)
         return replace(self, data=self.method.read(recording, self.config), recording=recording)
 
     @classmethod
     def of(cls, method: Method, simulated: Simulated, config_file: Settings = None) -> Session:
-        """A simulated recording that was never written."""
+        """Session of a simulated recording that was never written."""
         config = load_config(simulated.config.encode(), config_file)
         return cls(method, simulated.data, config, known=simulated.truth)
 
@@ -184,7 +184,7 @@ class Session:
 
     @property
     def epoch_ns(self) -> int:
-        """Zero of all times, Unix ns: the recording's first stamp."""
+        """Origin of all times, Unix ns: the recording's first stamp."""
         return int(self.data.epoch_ns)
 
     def sha256(self) -> str:
@@ -253,7 +253,7 @@ class Session:
         check: bool = False,
         report: bool = True,
     ) -> list[Calibration]:
-        """One calibration a solver; for the rest see `calibrate`."""
+        """Calibrations of the recording, one a solver; see `calibrate`."""
         if isinstance(solvers, str):
             raise InputError(f"solvers: a list of names is needed, not the text {solvers!r}")
         for solver in solvers:
@@ -275,7 +275,7 @@ class Session:
         return calibration
 
     def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
-        """The time for a calibration, where no command has set one."""
+        """Context with the time limit of a calibration where no command has set one."""
         stamps = [time for time in self.method.faults.times(self.data) if len(time)]
         start = min((float(time[0]) for time in stamps), default=0.0)
         return deadline.usual(max((float(time[-1]) for time in stamps), default=0.0) - start, online)

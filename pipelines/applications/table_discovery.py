@@ -61,7 +61,7 @@ _MOST_DEG_S = 7000.0
 
 @dataclass(frozen=True)
 class Columns:
-    """What tables hold, as far as it can be concluded.
+    """Meaning of a table's columns, as far as it can be concluded.
 
     Attributes:
         columns: topic -> its columns, as under `columns:`.
@@ -77,7 +77,7 @@ class Columns:
 
     @property
     def yaml(self) -> str:
-        """The sections to paste."""
+        """Config sections that describe the columns, to paste."""
         lines = ["columns:"]
         for topic, table in self.columns.items():
             given = {k: v for k, v in table.model_dump(exclude_defaults=True).items() if v is not None}

@@ -26,7 +26,7 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validated:
-    """A calibration tested on a recording.
+    """Result of a calibration's test on a recording.
 
     Attributes:
         calibration: the one validated.
@@ -94,7 +94,7 @@ class Validated:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader has to know beside the numbers."""
+        """Sentences that a reader needs beside the numbers."""
         out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note and not self.device)]
         if self.same_recording:
             out.append("this is the recording it was calibrated on; another one says more")

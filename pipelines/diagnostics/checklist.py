@@ -20,7 +20,7 @@ _STRETCH = 5.0
 
 @dataclass(frozen=True)
 class ChecklistItem:
-    """One thing a method needs.
+    """Motion or position that a method needs, and how far it is covered.
 
     Attributes:
         what: its name.

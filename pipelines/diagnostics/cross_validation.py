@@ -28,17 +28,17 @@ class SplitHalf:
 
     @property
     def step(self) -> float:
-        """Second less first."""
+        """Difference of the estimates, second half less first."""
         return self.second - self.first
 
     @property
     def step_sigma(self) -> float:
-        """One standard deviation of the step."""
+        """Standard deviation of the difference between the halves."""
         return float(np.hypot(self.first_sigma, self.second_sigma))
 
     @property
     def z(self) -> float:
-        """The step over its sigma."""
+        """Difference between the halves over its sigma."""
         return self.step / self.step_sigma
 
 

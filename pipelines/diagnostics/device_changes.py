@@ -45,7 +45,7 @@ _ROUNDING = 1e-10
 
 @dataclass(frozen=True)
 class Change:
-    """A step of a number between a recording and the next one, SI.
+    """Step of a parameter between a recording and the next one, SI.
 
     Attributes:
         name: of the number.
@@ -61,7 +61,7 @@ class Change:
 
     @property
     def z(self) -> float:
-        """Size of the change in its sigmas."""
+        """Size of the step over its sigma."""
         return self.size / self.sigma
 
 

@@ -44,7 +44,7 @@ class ExactInput:
 
 @dataclass(frozen=True)
 class DataFault:
-    """A fault of one method's own kind.
+    """A fault that only one method's data can have.
 
     Attributes:
         label: in words.
@@ -81,7 +81,7 @@ class FaultModel:
     cut: bool = True
 
     def times(self, data: Any) -> list[Array]:
-        """Stamps (n,), s, of all streams that the data have."""
+        """Stamps (n,), s, of all streams in the data."""
         return [time for name in self.streams if (time := getattr(data, name)) is not None]
 
     def span(self, data: Any) -> tuple[float, float]:

@@ -30,7 +30,7 @@ class Fit:
 
     @classmethod
     def of(cls, value: float, dof: float) -> Fit:
-        """A chi-square value with its interval."""
+        """Chi-square value with its interval."""
         if dof < 1.0:
             return cls(value, dof, np.nan, np.nan)
         return cls(value, dof, quantile(_TAIL, dof), quantile(1.0 - _TAIL, dof))
@@ -42,7 +42,7 @@ class Fit:
 
     @property
     def z(self) -> float:
-        """Value less its expectation, in standard deviations."""
+        """Deviation of chi-square from its expectation, in standard deviations."""
         return float((self.value - self.dof) / np.sqrt(2.0 * max(self.dof, 1.0)))
 
 

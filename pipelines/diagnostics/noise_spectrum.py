@@ -50,7 +50,7 @@ _COARSE = 2.0
 
 @dataclass(frozen=True)
 class Coefficient:
-    """One noise coefficient.
+    """Noise coefficient with its interval.
 
     Attributes:
         name: Q, N, B or K.
@@ -71,7 +71,7 @@ class Coefficient:
 
 @dataclass(frozen=True, eq=False)
 class NoiseFit:
-    """Noise of one axis.
+    """Noise coefficients fitted to one axis.
 
     Attributes:
         coefficients: Q, N, B, K.
@@ -106,7 +106,7 @@ class _Bins:
 
 
 def fit_noise(pieces: Sequence[Array], interval_s: float, lines: Sequence[tuple[float, float]] = ()) -> NoiseFit:
-    """The coefficients from pieces of a record at rest.
+    """Fit noise coefficients to pieces of a record at rest.
 
     Args:
         pieces: samples of a rate, each piece evenly spaced by interval_s.

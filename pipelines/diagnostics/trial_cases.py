@@ -40,7 +40,7 @@ def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> I
 
 
 def data_faults(model: FaultModel, data: Any, config: Config, role: str = "usual") -> Iterator[TrialCase]:
-    """The method's own faults of a role."""
+    """Trial cases of the method's own faults of a role."""
     for fault in model.faults:
         if fault.role == role and (corrected := fault.corrected(data, config)) is not None:
             yield TrialCase(fault.label, *corrected)
@@ -54,7 +54,7 @@ def _readings(model: FaultModel, data: Any) -> Iterator[tuple[str, str, Sequence
 
 
 def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """Every choice of opposite signs of a sensor's axes."""
+    """Trial cases of every choice of inverted axes of a sensor."""
     for name, sensor, columns, values in _readings(model, data):
         for signs in product((1.0, -1.0), repeat=len(columns)):
             wrong = [column for column, sign in zip(columns, signs, strict=True) if sign < 0.0]
@@ -86,7 +86,7 @@ def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialC
 
 
 def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """Rates in degrees a second, or turned into radians twice."""
+    """Trial cases of rates in deg/s, or converted to rad/s twice."""
     for name, sensor, _, values in _readings(model, data):
         if "gyro" in name:
             for label, changed in {

@@ -46,17 +46,17 @@ class Truth:
         return name in self.index
 
     def get(self, name: str, default: float = 0.0) -> Array:
-        """Values (...,) of a parameter."""
+        """Values (...,) of a parameter, by name."""
         if name in self.index:
             return np.asarray(self.values[..., self.index[name]])
         return np.full(self.values.shape[:-1], default)
 
     def vector(self, *names: str) -> Array:
-        """Values (..., len(names))."""
+        """Values (..., len(names)) of several parameters."""
         return np.stack([self.get(name) for name in names], axis=-1)
 
     def xyz(self, stem: str) -> Array:
-        """Values (..., 3) of stem_x, stem_y, stem_z."""
+        """Vectors (..., 3) of the parameters stem_x, stem_y, stem_z."""
         return self.vector(*(f"{stem}_{axis}" for axis in "xyz"))
 
     def matrix(self, rows: Sequence[Sequence[str]], diagonal: float = 0.0) -> Array:
@@ -70,7 +70,7 @@ class Applied(Protocol):
 
     @property
     def values(self) -> Mapping[str, float]:
-        """Parameter -> value that is applied."""
+        """Values that are applied, by parameter."""
 
     def __call__(self, **measured: Array) -> Mapping[str, Array]:
         """Results of applying the calibration to measurements, by name."""
@@ -100,7 +100,7 @@ class Coefficients:
 
 @dataclass(frozen=True)
 class Use:
-    """A use of a calibration, and its error.
+    """Application of a calibration, and the error that it leaves there.
 
     Attributes:
         name: for programs.
@@ -222,7 +222,7 @@ class UseBands:
 
 
 def use_bands(use: Use, posterior: Posterior) -> UseBands:
-    """Bands of a use, checked by draws."""
+    """Error bands of a use, linear ones checked by draws."""
     found = UseBands(use, {line.name: _band(use, line, posterior) for line in use.lines})
     shares = coverage(found, posterior, _TEST_DRAWS, seed=1)
     low, high = _COVERAGE

@@ -55,7 +55,7 @@ class Drawing:
             self._head(flat[0], flat[0] - flat[2 if len(flat) > 2 else 1], lit, width)
 
     def face(self, corners: Array, lit: bool = False) -> None:
-        """A filled polygon of corners (n, 3)."""
+        """Draw a filled polygon with corners (n, 3)."""
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in self._flat(corners))
         colour, opacity = (_LIT, 0.4) if lit else (_PLAIN, 0.1)
         self._parts.append(
@@ -73,7 +73,7 @@ class Drawing:
         self.line(middle + radius * (np.cos(angles) * towards + np.sin(angles) * across), True, 4.0, arrows)
 
     def word(self, at: Array, text: str, lit: bool = False, size: float = 15.0) -> None:
-        """A word whose middle stands at a point (3,)."""
+        """Write a word centred at a point (3,)."""
         ((x, y),) = self._flat(at[None])
         self._parts.append(
             f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" font-weight="600" text-anchor="middle" '

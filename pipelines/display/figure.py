@@ -58,7 +58,7 @@ _BROAD_PX = 380
 
 @dataclass
 class Mark:
-    """What is drawn in one colour.
+    """Points, lines or areas of one colour.
 
     Attributes:
         kind: points, line, band, boxes, segments, levels, moments, text, heat or patches.
@@ -85,18 +85,18 @@ class Mark:
 
     @property
     def x(self) -> Array:
-        """Its places across."""
+        """Horizontal coordinates of the mark."""
         return self.columns["x"]
 
     @property
     def y(self) -> Array:
-        """Its places upwards."""
+        """Vertical coordinates of the mark."""
         return self.columns["y"]
 
 
 @dataclass
 class Figure:
-    """Marks on two axes.
+    """Figure of marks on two axes.
 
     Attributes:
         y_title, x_title: of the axes, with unit.
@@ -127,7 +127,7 @@ class Figure:
     marks: list[Mark] = field(default_factory=list)
 
     def named(self, name: str) -> list[Mark]:
-        """The marks of that name."""
+        """The marks of a figure that have a name."""
         return [mark for mark in self.marks if mark.name == name]
 
     def points(
@@ -176,7 +176,7 @@ class Figure:
         texts: Sequence[str] = (),
         alpha: float = 1.0,
     ) -> None:
-        """Filled boxes (n,), such as bars."""
+        """Draw filled boxes (n,), such as bars."""
         columns = {"left": left, "right": right, "low": low, "high": high}
         self._add("boxes", columns, slice(None), color, name, alpha=alpha, texts=texts)
 
@@ -193,15 +193,15 @@ class Figure:
         self._add("segments", {"x": x, "y": y, "x1": x1, "y1": y1}, slice(None), color, name, False)
 
     def levels(self, y: ArrayLike, color: str = "soft", dash: Dash = "dotted", name: str = "") -> None:
-        """Lines across at heights (n,)."""
+        """Draw horizontal lines at heights (n,)."""
         self._add("levels", {"y": y}, slice(None), color, name, bool(name), dash=dash)
 
     def moments(self, x: ArrayLike, color: str = "soft", dash: Dash = "dashed", name: str = "") -> None:
-        """Lines upwards at places (n,)."""
+        """Draw vertical lines at places (n,)."""
         self._add("moments", {"x": x}, slice(None), color, name, False, dash=dash)
 
     def words(self, x: ArrayLike, y: ArrayLike, texts: Sequence[str]) -> None:
-        """Words at places (n,)."""
+        """Write words at places (n,)."""
         self._add("text", {"x": x, "y": y}, slice(None), "ink", "", False, texts=texts)
 
     def heat(self, values: Array, numbers: bool) -> None:

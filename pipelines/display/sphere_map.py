@@ -30,7 +30,7 @@ def widest_gap(directions: Array) -> tuple[float, Array]:
 
 
 def share_near(directions: Array) -> float:
-    """Part of the sphere that is no gap."""
+    """Share of the sphere's area near some directions."""
     return float(np.mean(_distances(directions) <= _GAPS[0]))
 
 

@@ -47,11 +47,11 @@ class Clock:
         return np.asarray(self.offset - self.skew * elapsed)
 
     def taken(self, elapsed: Array) -> Array:
-        """When (n,), s, pictures were taken whose stamps are so long after the first, s."""
+        """Times (n,), s, at which pictures were taken, by their stamps since the first, s."""
         return np.asarray(self.begun + elapsed + self.late(elapsed))
 
     def exposed(self, stamps: Array) -> Array:
-        """When (n,), s, pictures with these stamps (n,), s, were taken."""
+        """Times (n,), s, at which pictures with the stamps (n,), s, were taken."""
         return np.asarray(stamps + self.offset - self.skew * (stamps - self.begun))
 
     def elapsed(self, taken: Array) -> Array:
@@ -82,7 +82,7 @@ class Keyframes:
 
 
 def first_span(skew_sigma: float) -> float:
-    """So long, s, no clock goes wrong by much."""
+    """Length, s, of the beginning over which no clock goes wrong by much."""
     return _WRONG_AT_FIRST / skew_sigma
 
 

@@ -19,7 +19,7 @@ ROUGHLY, _APART = 1.0, 3.0
 
 @dataclass(frozen=True)
 class Noise:
-    """One noise of a problem as it was stated.
+    """A noise of a problem, with the figure that was stated.
 
     Attributes:
         name: as in the config's section `noise`, where it is there.
@@ -49,12 +49,12 @@ class Noise:
 
     @property
     def spec(self) -> NoiseSpec:
-        """Its declaration."""
+        """Declaration of the noise."""
         return self.own or NOISES.get(self.name) or NoiseSpec(self.name, "", "")
 
     @property
     def unit(self) -> str:
-        """SI, or pixels."""
+        """Unit of the noise: SI, or pixels."""
         return self.spec.unit
 
     @property

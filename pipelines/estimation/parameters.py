@@ -38,7 +38,7 @@ SENSOR_NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """Parameters that differ by their axis.
+    """Declaration of parameters that differ by their axis.
 
     Attributes:
         name: what their names begin with, before _AXIS; or with {} where the axis stands.
@@ -92,7 +92,7 @@ scalar = partial(ParameterSpec, axes="")
 
 
 def spec_of(specs: Iterable[ParameterSpec], name: str) -> ParameterSpec | None:
-    """The spec of a parameter; None where there is none."""
+    """Declaration of a parameter; None where there is none."""
     return next((spec for spec in specs if any(fnmatchcase(name, each) for each in spec.names)), None)
 
 

@@ -44,12 +44,12 @@ class LinearModel(Model):
 
     @property
     def rows(self) -> int:
-        """m."""
+        """Numbers m of a residual."""
         return int(self.right.shape[1])
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """The vectors' sizes."""
+        """Sizes of the vectors."""
         return tuple(int(each.shape[2]) for each in self.coefficients)
 
     def __call__(self, *vectors: Array) -> Residuals:
@@ -92,7 +92,7 @@ def prior_sigmas(parameter: Parameter) -> Array:
 
 
 def pinned(quantity: Quantity) -> float:
-    """The sigma that holds a fixed quantity."""
+    """Sigma of the prior that fixes a quantity."""
     return _PINNED * min(quantity.require, quantity.prior_scale)
 
 

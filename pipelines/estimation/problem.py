@@ -43,13 +43,13 @@ Coordinates = Callable[[gtsam.Values, int], tuple[Array, Array]]
 
 
 def vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
-    """A vector variable, reported as it is."""
+    """Coordinates of a vector variable: the vector itself."""
     vector = np.asarray(values.atVector(key), dtype=float)
     return vector, np.eye(len(vector))
 
 
 def rotation_vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
-    """A Rot3 variable, reported as its rotation vector, rad."""
+    """Coordinates of a Rot3 variable: its rotation vector, rad."""
     phi = so3.log(so3.from_gtsam([values.atRot3(key)])[0])
     return phi, so3.right_jacobian_inverse(phi)
 
@@ -93,7 +93,7 @@ class CommonFactor:
 
     @property
     def scale(self) -> str:
-        """Name of the factor."""
+        """Name of the common factor."""
         return f"{self.sensor}_scale"
 
     @property
@@ -108,7 +108,7 @@ _DETERMINED = 0.5
 
 @dataclass(frozen=True)
 class Quantity:
-    """One calibrated number as the contract lists it.
+    """Calibrated number as the result lists it.
 
     Attributes:
         name: as in result.json.
@@ -161,11 +161,11 @@ class Quantity:
 
     @property
     def scale(self) -> float:
-        """Sigma against which this quantity's own is measured."""
+        """Reference for this quantity's sigma: its prior's, or the usual one."""
         return self.prior_sigma or self.prior_scale
 
     def determined(self, sigma: float) -> bool:
-        """Whether a recording that leaves this sigma says what it is, and not the prior."""
+        """Whether the recording, not the prior, determines this quantity, given its posterior sigma."""
         return self.prior_sigma != 0.0 and sigma < _DETERMINED * self.scale
 
 
@@ -214,14 +214,14 @@ class Factor:
 
     @classmethod
     def of(cls, family: str, measurement: BoundModel, beside: Array | None = None) -> Factor:
-        """A measurement that may be an outlier."""
+        """Factor of a measurement that may be an outlier."""
         return cls(family, measurement=measurement, beside=beside)
 
     @classmethod
     def process_of(
         cls, family: str, process: BoundModel, beside: Array | None = None, fixed: Array | None = None
     ) -> Factor:
-        """A factor that joins variables and is never an outlier."""
+        """Factor of a process that joins variables and is never an outlier."""
         return cls(family, process=process, beside=beside, fixed=fixed)
 
     @property
@@ -235,16 +235,16 @@ class Factor:
 
     @property
     def keys(self) -> list[int]:
-        """The variables."""
+        """Keys of the factor's variables."""
         return list(self.factor.keys()) if self.bound is None else self.bound.keys
 
     @property
     def bound(self) -> BoundModel | None:
-        """The vectorised factor behind it, whichever it is."""
+        """The vectorised model behind the factor, measurement or process."""
         return self.measurement or self.process
 
     def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
-        """About the values."""
+        """The factor linearised about the values."""
         return self.factor.linearize(values) if self.bound is None else self.bound.linearized(values)
 
 
@@ -390,7 +390,7 @@ class Problem:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """All reported numbers, in order."""
+        """All calibrated numbers, in reporting order."""
         return tuple(q for p in self.parameters for q in p.quantities)
 
     def prior_covariance(self, names: Sequence[str], sigmas: Array) -> Array:

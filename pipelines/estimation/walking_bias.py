@@ -37,7 +37,7 @@ NODES = "bm"
 
 @dataclass(frozen=True)
 class WalkingBias:
-    """Nodes of a bias over [0, duration].
+    """Random walk of a bias as nodes over [0, duration].
 
     Attributes:
         edges: (J + 1,) s, ends of the segments.

@@ -196,7 +196,7 @@ class Method:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulator:
-    """Simulated recordings.
+    """Declaration of how a method simulates recordings.
 
     Attributes:
         scenario: pydantic model of the settings; all have defaults.
@@ -219,7 +219,7 @@ class Simulator:
 
 @dataclass(frozen=True, kw_only=True)
 class Guidance:
-    """Motion that helps.
+    """Declaration of a method's advice: motion that helps.
 
     Attributes:
         checklist: data, config -> progress of each requirement of the motion, for the person recording.
@@ -253,7 +253,7 @@ class Correction:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Results beside the parameters.
+    """Declaration of a method's results beside its parameters.
 
     Attributes:
         formulas: names of determined parameters, config -> how a result is applied, in order of evaluation.

@@ -60,13 +60,13 @@ class Formula:
 
     @property
     def tree(self) -> ast.expr:
-        """The parsed expression."""
+        """The parsed expression of the formula."""
         return ast.parse(_AXIS.sub(r"\1*\2", self.expression), mode="eval").body
 
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """A value of an expression, or many of them."""
+    """Value of an expression with its kind, or many such values."""
 
     kind: Kind
     array: Array
@@ -78,7 +78,7 @@ class Value:
 
 
 def input_kind(name: str) -> Kind:
-    """Kind of an input by its name."""
+    """Whether an input of a formula is a rotation, a vector or a scalar, by its name."""
     return "rotation" if _ROTATION.fullmatch(name) else "vector" if _VECTOR.fullmatch(name) else "scalar"
 
 
@@ -118,7 +118,7 @@ def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Ma
 
 
 def results(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Value]:
-    """As `apply`, with the kinds of the results; measurements that no formula takes are not looked at."""
+    """Results of formulas with their kinds, as `apply`; measurements of no formula are ignored."""
     space = {name: Value.constant(array) for name, array in (with_vectors(values) | AXES).items()}
     space |= {name: Value(input_kind(name), np.asarray(given, dtype=float)) for name, given in measured.items()}
     found: dict[str, Value] = {}

@@ -47,12 +47,12 @@ def unsettled(temperature: Temperature | None) -> float:
 
 
 def constants(reference: float | None) -> dict[str, float]:
-    """Constants of formulas beside the slopes."""
+    """Constants of formulas that go with slopes over temperature."""
     return {} if reference is None else {FIRST: reference}
 
 
 def topics(temperature: Temperature | None, epoch_ns: int) -> dict[str, series.Topic]:
-    """The topic to be written, if there is a temperature."""
+    """Topic of the temperature to write, if there is one."""
     if temperature is None:
         return {}
     t_ns = nanoseconds(temperature.t, epoch_ns)

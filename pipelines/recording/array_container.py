@@ -95,7 +95,7 @@ def _varying(definition: Definition, t_ns: NDArray[np.int64], encoded: Iterator[
 
 
 def encode_series(topic: series.Topic) -> SeriesEncoder:
-    """The messages of a topic."""
+    """CDR messages of a series, as a topic."""
     if isinstance(topic, series.Series):
         definition = known(topic.TYPE)
         columns = {}

@@ -140,7 +140,7 @@ def seconds(t_ns: NDArray[np.int64], epoch_ns: int) -> Array:
 
 
 def nanoseconds(t: Array, epoch_ns: int) -> NDArray[np.int64]:
-    """The inverse of `seconds`."""
+    """Times in s as Unix ns, the inverse of `seconds`."""
     return np.rint(t * 1e9).astype(np.int64) + epoch_ns
 
 
@@ -196,7 +196,7 @@ def check_overlap(spans: Mapping[str, Array]) -> None:
 
 
 def count(dropped: dict[str, int], reason: str, number: int) -> None:
-    """Add to a tally; nothing for zero."""
+    """Add a count to a tally; nothing for zero."""
     if number:
         dropped[reason] = dropped.get(reason, 0) + number
 

@@ -97,7 +97,7 @@ class DataLoss:
 
 
 class Container(ABC):
-    """Messages by channel.
+    """Base of the recordings' files: messages by channel.
 
     Attributes:
         path: file or folder as the user named it.
@@ -155,7 +155,7 @@ class Container(ABC):
 
     @property
     def missing(self) -> dict[str, int]:
-        """Topic -> messages known to be lost."""
+        """Number of messages known to be lost, by topic."""
         missing: dict[str, int] = {}
         for number, n in self.lost_messages.items():
             if n > 0 and self.is_defined(number):
@@ -272,7 +272,7 @@ class MultiPartContainer(Container):
 
     @property
     def counts(self) -> dict[int, int]:  # type: ignore[override]
-        """Channel -> number of readable messages, as far as is known."""
+        """Number of readable messages of each channel, as far as it is known."""
         return {i * _ID_RANGE + number: n for i, part in enumerate(self.parts) for number, n in part.counts.items()}
 
     @property
@@ -282,7 +282,7 @@ class MultiPartContainer(Container):
 
     @property
     def missing(self) -> dict[str, int]:
-        """Topic -> messages known to be lost."""
+        """Number of messages known to be lost, by topic."""
         missing: dict[str, int] = {}
         for part in self.parts:
             for topic, n in part.missing.items():

@@ -61,7 +61,7 @@ def drop_faults(
 
 
 def drop_frozen(topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str, axes: str) -> NDArray[np.intp]:
-    """As `drop_faults`, of what may reach the end of its range and has outliers that the estimate is to weigh.
+    """Drop faults as `drop_faults`, of what may reach the end of its range and has outliers that the estimate weighs.
 
     It is nowhere at rest: what is frozen for most of the time is so nonetheless.
     """

@@ -300,7 +300,7 @@ def definition_text(name: str) -> str:
 
 
 def known(name: str) -> Definition:
-    """The definition of a type as we write it."""
+    """Definition of a type by the text of `definition_text`. Raises MessageError."""
     return definition(name, definition_text(name))
 
 

@@ -241,7 +241,7 @@ def is_closed(path: Path) -> bool:
 
 
 def parts_in(path: Path) -> list[Path]:
-    """The files of the recording in a folder, in the order of their names. Raises InputError when there are several."""
+    """The files, by name, of the one recording in a folder. Raises InputError when there are several."""
     there = sorted(file for file in path.iterdir() if file.suffix in PARTS and file.is_file())
     if len({_PART_NAME.sub("", file.name) for file in there}) > 1:
         names = ", ".join(file.name for file in there)

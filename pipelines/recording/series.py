@@ -116,7 +116,7 @@ class VectorSeries(Series):
 
 @dataclass(frozen=True, eq=False)
 class QuaternionSeries(Series):
-    """Quaternions (N, 4)."""
+    """Attitudes as quaternions (N, 4)."""
 
     TYPE: ClassVar[str] = messages.QUATERNION
     COLUMNS: ClassVar[dict[str, Column]] = {"wxyz": Column("quaternion", (4,), _XYZW_TO_WXYZ)}

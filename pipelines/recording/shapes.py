@@ -28,7 +28,7 @@ _MEASURED = 20
 
 @dataclass(frozen=True)
 class Rows:
-    """An array's rows, one a stamp.
+    """Array that has one row a stamp.
 
     Attributes:
         shape: of a row; None: any.

@@ -151,7 +151,7 @@ def nanoseconds(path: Path, texts: NDArray[np.str_], unit: str) -> Stamps:
 
 
 def of_rate(count: int, rate_hz: float) -> Stamps:
-    """Times of rows that come at a rate, from 0 on."""
+    """Stamps (n,), ns, of rows that come at a rate, from 0 on."""
     return np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 

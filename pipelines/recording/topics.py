@@ -136,7 +136,7 @@ class TopicSource(BaseModel):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """The recorded topics it is made of."""
+        """Names of the recorded topics that the source is made of."""
         return tuple(part for part in (self.topic, self.gyro, self.accel) if part is not None)
 
     @property
@@ -150,7 +150,7 @@ class TopicSource(BaseModel):
 
 
 def inverted(poses: series.PoseSeries) -> series.PoseSeries:
-    """The inverse of every pose.
+    """Poses with the inverse of every attitude.
 
     The covariance of the rotation is that of delta in R*Exp(delta) before and after: of R' = R^T it is R*cov*R^T.
     Positions' covariances are left out, zero.

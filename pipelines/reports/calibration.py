@@ -61,7 +61,7 @@ class SavedParameter(_Record):
 
     @property
     def in_formulas(self) -> float:
-        """The value that formulas use."""
+        """Value that formulas use for the parameter."""
         return self.value if self.applied is None else self.applied
 
     def __repr__(self) -> str:
@@ -88,7 +88,7 @@ class SavedTransform(_Record):
 
 
 class SavedRecording(_Record):
-    """What it was calibrated on."""
+    """Recording that the device was calibrated on."""
 
     file: str
     sha256: str
@@ -96,7 +96,7 @@ class SavedRecording(_Record):
 
 
 class SavedCalibration(_Record, SensorValues):
-    """calibration.yaml."""
+    """Content of a calibration.yaml."""
 
     schema_name: Annotated[Literal["alidade.calibration/1"], Field(alias="schema")] = "alidade.calibration/1"
     method: str
@@ -117,7 +117,7 @@ class SavedCalibration(_Record, SensorValues):
     _source: str = PrivateAttr(default="")
 
     def with_joint(self, gaussian_prior: GaussianPrior) -> SavedCalibration:
-        """The same with the joint distribution of its parameters, which calibration.yaml does not have."""
+        """This calibration with its parameters' joint distribution, which calibration.yaml does not have."""
         known = self.model_copy()
         known._joint_prior = gaussian_prior
         return known
@@ -171,7 +171,7 @@ class SavedCalibration(_Record, SensorValues):
         return self.parameters[name].value
 
     def application(self) -> Application:
-        """How it is applied, with its config."""
+        """Formulas, values and config with which the calibration is applied."""
         from alidade.pipelines.methods import method
 
         text = "\n".join(self.formulas)
@@ -220,7 +220,7 @@ def calibration_yaml(calibration: Calibration) -> str:
 
 
 def saved(calibration: Calibration) -> SavedCalibration:
-    """What calibration.yaml says."""
+    """The calibration in the text of a calibration.yaml."""
     method = calibration.problem.method
     parameters = {
         p.name: SavedParameter(
@@ -281,7 +281,7 @@ def load_known(path: Path) -> SavedCalibration:
 
 
 def with_covariance(known: SavedCalibration, path: Path) -> SavedCalibration:
-    """The same with the joint covariance in result.json beside a calibration.yaml, if it is of the same calibration."""
+    """A calibration with the joint covariance of the result.json beside it, if that is of the same calibration."""
     beside = path.with_name("result.json")
     if path == beside or not beside.is_file():
         return known

@@ -52,7 +52,7 @@ class Limits(_Fields):
 
 
 class Fields(_Fields):
-    """What only people know; None where it is not stated."""
+    """Entries of a certificate that only people know; None where not stated."""
 
     number: _Text | None = None
     country: Annotated[str, Field(pattern="^[A-Z]{2}$")] | None = None  # ISO 3166-1 alpha-2; of the digital one

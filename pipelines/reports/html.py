@@ -46,7 +46,7 @@ def render_html(report: Report) -> str:
 
 @dataclass(frozen=True)
 class Page:
-    """A page of its own, which a notebook shows in a frame."""
+    """Page in a frame, for a notebook."""
 
     html: str
     height_px: int = 640

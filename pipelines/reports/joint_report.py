@@ -142,7 +142,7 @@ def _band(out: Figure, calibration: Calibration, q: Quantity, factor: float, col
 
 
 def what(step: Change) -> str:
-    """What moved: a turn about an axis, or a number."""
+    """Words for what moved: a turn about an axis, or a number."""
     which, _, axis = step.name.rpartition("_")
     return f"{which} about {axis} moved" if which.endswith("mount") and axis in "xyz" else f"{step.name} changed"
 

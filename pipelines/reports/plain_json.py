@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 
 def plain_json(kind: str, content: Mapping[str, Any]) -> str:
-    """The text, under its schema `alidade.<kind>/1`."""
+    """JSON text of a command's result, under its schema `alidade.<kind>/1`."""
     from pydantic_core import to_json
 
     return to_json({"schema": f"alidade.{kind}/1", **content}, indent=1, inf_nan_mode="null").decode()
 
 
 def validation_json(validated: Validated) -> str:
-    """Of `validate`: the verdict, what changed, and RMS and peak of every kind of error, before and after."""
+    """JSON of `validate`: the verdict, what changed, and RMS and peak of every kind of error, before and after."""
     others = {"device": {v.name: v for v in validated.device}, "expected": {v.name: v for v in validated.best}}
     found = validated.held.changes.found if validated.held else ()
     return plain_json(
@@ -59,7 +59,7 @@ def validation_json(validated: Validated) -> str:
 
 
 def applied_json(applied: Applied) -> str:
-    """Of `apply`: the file, its corrected topics, notes."""
+    """JSON of `apply`: the file, its corrected topics, notes."""
     topics = [
         {
             "name": topic.name,
@@ -74,7 +74,7 @@ def applied_json(applied: Applied) -> str:
 
 
 def plan_json(plan: Plan) -> str:
-    """Of `plan`: sigmas as predicted, now and with all changes, with the budget of these; what is missing; changes."""
+    """JSON of `plan`: predicted sigmas now and with all changes, with their budget; what is missing; changes."""
     now, best = plan.now, plan.best
     return plain_json(
         "plan",
@@ -112,7 +112,7 @@ def plan_json(plan: Plan) -> str:
 
 
 def fleet_json(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
-    """Of `fleet`: the rows of fleet.csv and changes.csv, the components of every parameter, and who needs attention."""
+    """JSON of `fleet`: rows of fleet.csv and changes.csv, components of every parameter, who needs attention."""
     from alidade.pipelines.applications.fleet.analysis import table
     from alidade.pipelines.applications.fleet.attention import units_of_interest
     from alidade.pipelines.applications.fleet.histories import change_table
@@ -135,7 +135,7 @@ def fleet_json(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
 
 
 def study_json(study: Study) -> str:
-    """Of `montecarlo`: the rows of runs.csv and summary.csv."""
+    """JSON of `montecarlo`: the rows of runs.csv and summary.csv."""
     from alidade.pipelines.applications.fleet.montecarlo import run_table, summary_table
 
     return plain_json(
@@ -154,7 +154,7 @@ def study_json(study: Study) -> str:
 def facts_json(
     facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str], columns: Columns | None = None
 ) -> str:
-    """Of `info`: the facts, and what each method has, lacks and could use."""
+    """JSON of `info`: the facts, and what each method has, lacks and could use."""
     suggested = {suggestion.method: suggestion for suggestion in found}
     content = asdict(facts)
     proposed = content.pop("proposed")

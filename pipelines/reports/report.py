@@ -106,7 +106,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Plots:
-    """Figures beside one another."""
+    """Figures side by side."""
 
     plots: tuple[Plot, ...]
 
@@ -121,7 +121,7 @@ class Tables:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Names and what they stand for, one below the other."""
+    """List of names, each with what it stands for."""
 
     items: tuple[tuple[str, str], ...]
 
@@ -139,7 +139,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Headline figures beside one another."""
+    """Headline figures side by side."""
 
     tiles: tuple[Tile, ...]
 
@@ -176,7 +176,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A page.
+    """Report as data: sections with their blocks, which html.py and terminal.py render.
 
     Attributes:
         title: of the window.

@@ -107,7 +107,7 @@ class Calibration(SensorValues):
 
     @property
     def parameters(self) -> dict[str, ParameterResult]:
-        """Name -> parameter, as result.json lists them."""
+        """Parameters by name, as result.json lists them."""
         given = self.verdicts
         rows = zip(
             quantities_of(self.problem, self.estimate),
@@ -135,7 +135,7 @@ class Calibration(SensorValues):
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameter -> value, SI."""
+        """Value of each parameter, SI."""
         return dict(zip(self.estimate.names, self.estimate.values.tolist(), strict=True))
 
     @property
@@ -149,7 +149,7 @@ class Calibration(SensorValues):
         return self.estimate.names, self.covariance
 
     def application(self) -> Application:
-        """How it is applied, with the recording's config."""
+        """Formulas, values and recording's config with which the calibration is applied."""
         unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
         whole = self.method.report.formulas(list(unknown), self.config)
         return Application(self.formulas, whole, self.applied_values, {**self.problem.constants, **unknown})
@@ -240,17 +240,17 @@ class Calibration(SensorValues):
 
     @property
     def start(self) -> str:
-        """Of the recording, ISO 8601."""
+        """Date of the recording's start, ISO 8601."""
         return datetime.datetime.fromtimestamp(self.facts.epoch_ns // 1_000_000_000, datetime.UTC).isoformat()
 
     @property
     def status(self) -> Status:
-        """calibrated, weak, unobservable or inconsistent."""
+        """Status: calibrated, weak, unobservable or inconsistent."""
         return status(self.findings)
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
-        """Parameter -> verdict, of those with a required accuracy."""
+        """Verdicts by parameter, of those with a required accuracy."""
         return verdicts(
             quantities_of(self.problem, self.estimate), self.estimate.covariance, self.findings, self.estimate.values
         )
@@ -263,12 +263,12 @@ class Calibration(SensorValues):
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """Name -> quantity, those of several recordings too."""
+        """Quantities by name, those of several recordings too."""
         return {q.name: q for q in self.problem.quantities}
 
     @property
     def headline(self) -> str:
-        """The status with its reasons."""
+        """Sentence with the status and its reasons."""
         return sentences.headline(self.findings, self.quantities, self.verdicts)
 
     @property
@@ -290,13 +290,13 @@ class Calibration(SensorValues):
 
     @property
     def family_fits(self) -> dict[str, Fit]:
-        """Family -> chi-square with its interval."""
+        """Chi-square with its interval, by family of measurements."""
         chi_square = self.estimate.chi_square
         return {} if chi_square is None else {family: Fit.of(*sums) for family, sums in chi_square.families.items()}
 
     @property
     def covariance(self) -> Array:
-        """(n, n) joint covariance of the parameters, in their order, SI."""
+        """Joint covariance (n, n) of the parameters, in their order, SI."""
         return self.estimate.covariance
 
     @property
@@ -306,7 +306,7 @@ class Calibration(SensorValues):
 
     @property
     def residuals(self) -> Mapping[str, Residuals]:
-        """Family of measurements -> residuals at the estimate."""
+        """Residuals at the estimate, by family of measurements."""
         return self.estimate.residuals
 
     def write(self, folder: str | Path) -> tuple[Path, ...]:
@@ -382,14 +382,14 @@ class Calibration(SensorValues):
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Reason -> number of measurements left out, outliers included."""
+        """Number of measurements left out, outliers included, by reason."""
         outliers = {f"{family}: outliers": n for family, n in self.estimate.rejected.items() if n}
         lost = {f"{topic}: lost with damaged bytes of the file": n for topic, n in self.facts.lost.items()}
         return {**lost, **self.problem.dropped, **outliers}
 
     @property
     def timing(self) -> dict[str, float]:
-        """Phase -> s of wall time."""
+        """Wall time, s, by phase."""
         return {**self.seconds, **self.estimate.seconds}
 
     @property
@@ -410,7 +410,7 @@ class Calibration(SensorValues):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader has to know beside the headline."""
+        """Sentences that a reader needs beside the headline."""
         clipped = tuple(f"{what}: {n} samples left out" for what, n in self.dropped.items() if what.endswith(CLIPPED))
         return (*self.facts.notes, *sentences.notes(self.findings, self.quantities), *clipped)
 
@@ -422,7 +422,7 @@ def quantities_of(problem: Problem, estimate: Estimate) -> tuple[Quantity, ...]:
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of what computed the result."""
+    """Versions of the software that computed the result."""
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:

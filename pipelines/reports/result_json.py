@@ -45,7 +45,7 @@ class _Record(BaseModel):
 
 
 class ParameterResult(_Record):
-    """One parameter; SI."""
+    """Calibrated parameter with its uncertainty; SI."""
 
     name: str
     value: float  # of the estimate
@@ -112,7 +112,7 @@ class FitResult(_Record):
 
 
 class ChiSquareResult(FitResult):
-    """Chi-square of the whole."""
+    """Chi-square of all residuals together."""
 
     families: dict[str, FitResult]  # the same of each family of measurements
 
@@ -153,7 +153,7 @@ class StabilityResult(_Record):
 
 
 class SessionResult(_Record):
-    """What went in; it starts at `start`, ISO 8601."""
+    """Recording that a result is of: start, length, counts of messages and of what was left out."""
 
     sha256: str  # of the file
     start: str  # ISO 8601
@@ -191,7 +191,7 @@ class MeasurementResult(_Record):
 
 
 class SelfCheckResult(_Record):
-    """An incremental estimate beside batch's, in sigmas."""
+    """Difference of an incremental estimate from batch's, in sigmas."""
 
     parameter: str  # the one that differs most
     difference: float  # incremental less batch, in sigmas
@@ -206,7 +206,7 @@ class SecondResult(_Record):
 
 
 class PartParameter(_Record):
-    """A number of one recording; SI."""
+    """Parameter of one recording in a joint calibration; SI."""
 
     name: str
     value: float
@@ -272,7 +272,7 @@ class UseResult(_Record):
 
 
 class Result(_Record):
-    """result.json; null where the solver has no such figure."""
+    """Content of result.json; null where the solver has no such figure."""
 
     schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")] = "alidade.result/1"
     method: str  # of calibration

@@ -63,7 +63,7 @@ class ResultRow:
     known: bool = True
 
     def times(self, factor: float) -> ResultRow:
-        """In another unit."""
+        """The row in another unit, its numbers multiplied by a factor."""
         scaled = {
             name: None if number is None else factor * number
             for name, number in vars(self).items()
@@ -96,7 +96,7 @@ class ResultCard:
 
     @property
     def rows(self) -> list[tuple[ResultGroup, ResultRow]]:
-        """All numbers."""
+        """All rows of the card, each with its group."""
         return [(group, row) for group in self.groups for row in group.rows]
 
 

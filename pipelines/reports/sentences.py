@@ -170,7 +170,7 @@ def label(weights: Mapping[str, float]) -> str:
 
 
 def by_advice(findings: Sequence[Finding], *severities: Severity) -> list[tuple[str, str]]:
-    """(labels, advice) of directions of these severities (none: of all), those with the same advice together."""
+    """Labels and advice of directions of these severities (none: of all), those with the same advice together."""
     labels: dict[str, list[str]] = {}
     for finding in findings:
         if finding.kind == "direction" and (not severities or finding.severity in severities):
@@ -425,7 +425,7 @@ def between(recordings: Sequence[str], dates: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Limit:
-    """What limits a parameter.
+    """Error source that limits a parameter.
 
     Attributes:
         name: of the parameter.
@@ -439,7 +439,7 @@ class Limit:
 
     @property
     def sentence(self) -> str:
-        """The largest source and what to do about it."""
+        """Sentence about the largest error source and what to do about it."""
         source, share = self.parts[0]
         return f"{100.0 * share:.0f} % of the variance of {self.name}: {source}; {self.advice}"
 

@@ -42,7 +42,7 @@ def sketch_with(svg: str, transforms: Mapping[str, SavedTransform]) -> str:
 
 
 def angle(transform: SavedTransform) -> float:
-    """By how much it turns, rad."""
+    """Angle of a rotation, rad."""
     return float(np.linalg.norm(so3.log(np.array(transform.wxyz))))
 
 

@@ -31,7 +31,7 @@ class WithSigma(NamedTuple):
 
 @dataclass(frozen=True)
 class Application:
-    """How a calibration is applied.
+    """Formulas, values and config with which a calibration is applied.
 
     Attributes:
         formulas: of the parameters that are applied; whole: of all parameters.
@@ -46,12 +46,12 @@ class Application:
 
 
 class SensorValues:
-    """Values by sensor, of whatever has parameters by name."""
+    """Base of calibrations that have parameters by name: their values by sensor."""
 
     @property
     @abstractmethod
     def values(self) -> Mapping[str, float]:
-        """Parameter -> value, SI."""
+        """Value of each parameter, SI."""
 
     @abstractmethod
     def _joint(self) -> tuple[Sequence[str], Array]:

@@ -76,7 +76,7 @@ class Renderer:
         self._rays = np.ascontiguousarray(rays[1:-1, 1:-1])
 
     def radiance(self, quads: Sequence[Quad], background: float | Array = 90.0) -> Array:
-        """(height, width) light on the sensor, in grey levels: no blur, no noise, not rounded.
+        """Light (height, width) on the sensor, in grey levels: no blur, no noise, not rounded.
 
         Nearer quads hide farther ones (by the distance of their centres); quads seen from behind are not drawn.
         `background` is a grey level or a picture of the camera's size. A moving scene: average several moments.

@@ -88,7 +88,7 @@ class Warming(ScenarioPart):
         return np.asarray(self.start_c - self.rise_k * np.expm1(-t / self.time_constant_s))
 
     def measured(self, duration: float) -> Temperature:
-        """What messages say of it, s from the start on until the end."""
+        """Temperatures as messages state them, from the start until the end, s."""
         t = np.arange(np.floor(duration * self.rate_hz) + 1.0) / self.rate_hz
         return Temperature(t, self.at(t))
 
@@ -153,7 +153,7 @@ def read_by(rate: Array, sensor: str, values: Mapping[str, float], force: Array 
 
 
 def measured(warming: Warming | None, duration: float) -> Temperature | None:
-    """What messages say; None without a topic."""
+    """Temperatures as messages state them; None without a topic."""
     return None if warming is None else warming.measured(duration)
 
 

@@ -87,7 +87,7 @@ class BatchConfig:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """A solution with everything that is asked of it later.
+    """Solution with what is computed from it later.
 
     Attributes:
         compiled: the problem.
@@ -230,7 +230,7 @@ def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[
 
 
 def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple[str, Problem]] = ()) -> Estimate:
-    """Everything that is reported of a solution; see `solve_batch`."""
+    """Complete estimate of a solution, with covariance and diagnostics; see `solve_batch`."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, posterior.at
     names = tuple(q.name for q in problem.quantities)

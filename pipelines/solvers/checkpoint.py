@@ -34,7 +34,7 @@ _INNOVATIONS, _SHARES = "innovations/", "shares/"
 
 @dataclass(frozen=True)
 class MarginalState:
-    """A Gaussian over some variables, all others marginalised out.
+    """Gaussian over some variables, all others marginalised out.
 
     Attributes:
         time: s, of the last step in it.
@@ -76,7 +76,7 @@ class MarginalState:
 
     @property
     def estimate(self) -> gtsam.Values:
-        """The mean."""
+        """Mean of the Gaussian, as values."""
         graph = gtsam.GaussianFactorGraph()
         graph.add(self.linear)
         return self.values.retract(graph.optimize(ordering_of(self.linear.keys()), gtsam.EliminateQR))

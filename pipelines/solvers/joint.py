@@ -222,7 +222,7 @@ def information_at_levels(problem: Problem, levels: Sequence[Level], device: Col
 
 
 def join(informations: Sequence[SqrtInformation], rates: Mapping[str, float], days: Sequence[float]) -> Joined:
-    """Put recordings together.
+    """Join recordings of one device into a joint estimate.
 
     Args:
         informations: of each, in the order of their dates.

@@ -88,7 +88,7 @@ class Layout:
     def of(
         cls, layout: ChainLayout | None, initial: gtsam.Values, shared: Collection[int] = ()
     ) -> tuple[Layout, Values]:
-        """The layout of the variables of some values, and these.
+        """Layout of the variables of some values, with these values in it.
 
         Args:
             layout: how they are a chain; None: they are none, and every variable is a state by itself.
@@ -170,7 +170,7 @@ class Layout:
         return Values(moved)
 
     def of_key(self, values: Values, key: int) -> Array:
-        """Value (width,) of a variable."""
+        """Value (width,) of the variable with a key."""
         (at,) = self.at([key])
         return values.arrays[self.blocks[self.block[at]]][self.row[at]]
 

@@ -35,7 +35,7 @@ _FIRMER = 100.0
 
 @dataclass(frozen=True)
 class LevenbergConfig:
-    """Termination and damping.
+    """Options of the Levenberg-Marquardt minimisation: termination and damping.
 
     Attributes:
         max_iterations: linear systems solved.
@@ -93,7 +93,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Point):
-    """Where a minimisation ended.
+    """End of a minimisation: values and linear system.
 
     Attributes:
         converged: whether it is a minimum; `message` says how or why not.
@@ -105,7 +105,7 @@ class Solution(Point):
     iterations: int
 
     def at_inliers(self) -> Solution:
-        """The same system, of an engine without what the loss rejects here. Raises IndeterminateStateError."""
+        """The solution's system without what the loss rejects here. Raises IndeterminateStateError."""
         engine = without_rejected(self.engine, self.values)
         out = replace(self, engine=engine, cost=engine.cost(self.values))
         vars(out).update(factorization=self.factorization)

@@ -175,7 +175,7 @@ class Group:
         return len(self.place) == 1 or hasattr(self.model, "stacked")
 
     def within(self, begin: int, end: int) -> Group | None:
-        """Those of its measurements whose place is from `begin` until before `end`, if there are any."""
+        """The group's measurements with a place from `begin` until before `end`, if there are any."""
         some = np.flatnonzero((self.place >= begin) & (self.place < end))
         return self.of(some) if len(some) else None
 
@@ -189,7 +189,7 @@ class Group:
             yield self.of(np.arange(begin, min(begin + PART_STATES, n)))
 
     def of(self, some: Index) -> Group:
-        """Some of its measurements."""
+        """The group with some of its measurements only."""
         if len(some) == len(self.place):
             return self
 
@@ -213,7 +213,7 @@ class Group:
         )
 
     def rows(self, values: Values, width: int) -> tuple[Array, float]:
-        """Rows (n, m, width) on the columns of their target, right side last, and the cost."""
+        """Whitened Jacobian rows (n, m, width) with the right-hand side in the last column, and the group's cost."""
         right, jacobians, cost = self.whitened(values)
         out = np.zeros((*right.shape, width))
         out[..., -1] = right
@@ -235,7 +235,7 @@ def _add(out: Array, columns: Index, jacobian: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """A problem's factors, ready to be evaluated.
+    """Factors of a problem, ready to be evaluated together.
 
     Attributes:
         layout: of its variables.

@@ -33,7 +33,7 @@ ExpectedSquares = Mapping[tuple[str, int], float]
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """When levels change, and how residuals are read.
+    """Options of the noise estimation: when levels change, and how residuals are read.
 
     Attributes:
         max_solutions: solutions with other levels.

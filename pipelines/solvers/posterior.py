@@ -45,7 +45,7 @@ UNSEEN = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Reported:
-    """The reported numbers about some values of all variables.
+    """Reported numbers about some values of all variables.
 
     Attributes:
         names: (n,) of all numbers.
@@ -446,7 +446,7 @@ def sqrt_information_of(gaussian_prior: GaussianPrior, scales: Sequence[float]) 
 
 
 def fewest(R: Array, d: Array, scales: Array) -> tuple[Array, Array]:
-    """The same information in the least number of rows, without empty columns."""
+    """Square-root information with the least number of rows, without empty columns."""
     if not len(R):
         return R, d
     u, s, vt = np.linalg.svd(R * scales, full_matrices=False)

@@ -171,7 +171,7 @@ class WeakDirections:
         return np.asarray((self.strong * self.sigmas**power) @ self.strong.T)
 
     def again(self, R: Array) -> WeakDirections:
-        """The same weak directions with the strong ones of another square-root information (m, m)."""
+        """The weak directions, with the strong ones of another square-root information (m, m)."""
         return WeakDirections.given(R, self.weak, self.precision, self.calibrated)
 
     def with_curvature(self, covariance: Array) -> WeakDirections:

@@ -115,12 +115,12 @@ class Camera:
 
     @property
     def focal(self) -> Array:
-        """(2,) focal lengths fx, fy in px."""
+        """Focal lengths (2,) fx, fy in px."""
         return np.array([self.K[0, 0], self.K[1, 1]])
 
     @property
     def centre(self) -> Array:
-        """(2,) principal point in px."""
+        """Principal point (2,) in px."""
         return np.asarray(self.K[:2, 2])
 
     def project(self, points: ArrayLike) -> Array:
@@ -138,11 +138,11 @@ class Camera:
 
     @property
     def intrinsics(self) -> Array:
-        """(4 + n,) fx, fy, cx, cy in px, then the distortion coefficients."""
+        """Intrinsics (4 + n,): fx, fy, cx, cy in px, then the distortion coefficients."""
         return np.concatenate([self.focal, self.centre, self.coefficients])
 
     def with_intrinsics(self, intrinsics: Array) -> Camera:
-        """The same camera with other intrinsics, in the order of `intrinsics`."""
+        """The camera with other intrinsics, in the order of `intrinsics`."""
         fx, fy, cx, cy = intrinsics[:4]
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return replace(self, K=K, coefficients=intrinsics[4:])

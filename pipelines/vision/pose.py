@@ -72,7 +72,7 @@ def _has_pycolmap() -> bool:
 
 
 def refine_by_pycolmap(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> PoseFit | None:
-    """As `refine`, by pycolmap (Ceres)."""
+    """Refine a pose as `refine`, by pycolmap (Ceres)."""
     import pycolmap
 
     # A pose that the corners leave open is no fault; its covariance has it.
@@ -116,7 +116,7 @@ def _colmap_camera(camera: Camera) -> Any:
 
 
 def refine_here(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> PoseFit | None:
-    """As `refine`, by Levenberg's and Marquardt's steps with OpenCV's derivatives of the projection."""
+    """Refine a pose as `refine`, by Levenberg-Marquardt steps with OpenCV's derivatives of the projection."""
     damping = _DAMPING
     miss, J = _linearized(camera, corners, pixels, cRb, position)
     if not np.isfinite(J).all():
@@ -204,7 +204,7 @@ class TagBody:
 
     @property
     def corners(self) -> Array:
-        """(n, 4, 3) corners in b, m, in the AprilTag library's order."""
+        """Corners (n, 4, 3) in b, m, in the AprilTag library's order."""
         local = SQUARE * self.size[:, None, None]
         return np.asarray(self.position[:, None] + so3.rotate(self.bRt[:, None], local))
 

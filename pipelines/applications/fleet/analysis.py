@@ -83,7 +83,7 @@ class Population:
 
 
 def counting(result: RecordingResult | UnitResult) -> list[str]:
-    """The parameters of a recording that count."""
+    """Names of the parameters by which a recording is compared with others."""
     if result["status"] not in _COUNTED:
         return []
     return [name for name, p in result["parameters"].items() if p["verdict"] in _DETERMINED]

@@ -33,7 +33,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit with what stands out, the worst first."""
+    """A unit of the fleet with what stands out in it, the worst first."""
 
     name: str
     findings: tuple[Finding, ...]
@@ -60,7 +60,7 @@ def units_of_interest(
 
 
 def sentence(units: Sequence[Unit]) -> str:
-    """Their names, as many as can be read."""
+    """Sentence that names the units that need attention, the first few of many."""
     if not units:
         return "no unit needs attention"
     more = len(units) - _MOST_NAMED

@@ -118,7 +118,7 @@ def work_off(
 def completed(
     client: Client, function: Callable[..., Any], tasks: Mapping[str, tuple[Any, ...]]
 ) -> Iterator[tuple[str, Any]]:
-    """(name, what the function returned, or Killed) of every task, as they end.
+    """Name and result of every task as it ends: what the function returned, or Killed.
 
     The function and its arguments travel to the workers, its result travels back. Leaving the loop early withdraws
     what is not running yet.

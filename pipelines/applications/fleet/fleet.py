@@ -68,7 +68,7 @@ class Settings:
     def of(
         cls, method: str | None, config: Path | None, solver: str, window: float | None, prior: str | None = None
     ) -> Settings:
-        """With the text of a config file. Raises InputError when there is no such method, or a file cannot be used."""
+        """Settings with the text of a config file. Raises InputError: no such method, or a file cannot be used."""
         require_extra()
         if method is not None:
             methods.method(method)  # there is one of that name
@@ -85,7 +85,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run of a fleet ended with.
+    """The results of a fleet's run.
 
     Attributes:
         results: by recording, in their order; of those that are finished.
@@ -107,7 +107,7 @@ class Outcome:
 
     @property
     def summary(self) -> list[str]:
-        """In a few lines: how many, with what verdicts, and what was quarantined."""
+        """Summary in a few lines: how many recordings, with what verdicts, and what was quarantined."""
         done = f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run"
         lines = [f"{done}: {self.verdicts}"]
         aside = [name for name, result in self.results.items() if result["exit_code"] == exit_codes.KILLED]

@@ -24,7 +24,7 @@ from alidade.pipelines.solvers.joint import grown, join
 
 @dataclass(frozen=True)
 class History:
-    """A unit over its recordings.
+    """The calibrations of a unit over its recordings.
 
     Attributes:
         unit: its name.
@@ -43,7 +43,7 @@ class History:
     found: tuple[Change, ...]
 
     def after(self, step: Change) -> tuple[str, ...]:
-        """The recordings after a step."""
+        """The recordings of a unit after a step."""
         return self.recordings[step.after + 1 :]
 
     @property
@@ -61,13 +61,13 @@ def packed(sqrt_info: SqrtInformation) -> str:
 
 
 def unpacked(text: str) -> SqrtInformation:
-    """The other way round."""
+    """The square-root information in a text of `packed`."""
     with np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False) as arrays:
         return SqrtInformation(**{**arrays, "names": tuple(arrays["names"].tolist())})
 
 
 def histories(results: Mapping[str, UnitResult], asked: Mapping[str, Sequence[str]]) -> list[History]:
-    """Of every unit that was recorded several times.
+    """Histories of all units that were recorded several times.
 
     Args:
         results: of the fleet, by recording.
@@ -83,7 +83,7 @@ def histories(results: Mapping[str, UnitResult], asked: Mapping[str, Sequence[st
 
 
 def change_table(found: Sequence[History]) -> list[Row]:
-    """A row a step of a unit's device between two recordings, SI."""
+    """Rows of changes.csv: a step of a unit's device between two recordings each, SI."""
     return [
         {
             "unit": history.unit,

@@ -44,7 +44,7 @@ SOLVERS = ("published", "batch", "incremental")
 
 @dataclass(frozen=True)
 class Study:
-    """Runs of one scenario.
+    """Simulated and solved runs of one scenario.
 
     Attributes:
         method: simulated and solved.
@@ -69,7 +69,7 @@ class Study:
         return [run[solver] for run in self.results.values() if solver in run and run[solver].get("dof")]
 
     def failures(self, solver: str) -> dict[int, str]:
-        """Seed -> why there is no estimate."""
+        """Reasons why a seed has no estimate, by seed."""
         return {
             seed: run[solver]["reason"]
             for seed, run in self.results.items()
@@ -77,17 +77,17 @@ class Study:
         }
 
     def statuses(self, solver: str) -> dict[str, int]:
-        """Status -> number of runs."""
+        """Number of runs by status."""
         found = [run[solver]["status"] for run in self.results.values() if solver in run]
         return {status: found.count(status) for status in sorted(set(found))}
 
     def nees(self, solver: str) -> statistics.Nees:
-        """Mean NEES; needs an estimate."""
+        """Mean NEES (normalised estimation error squared) of the runs; needs an estimate."""
         found = self.estimates(solver)
         return statistics.mean_nees(np.array([r["nees"] for r in found]), np.array([float(r["dof"]) for r in found]))
 
     def normalised(self, solver: str) -> Array:
-        """All errors in sigmas, over runs and parameters."""
+        """Errors over their sigmas, of all runs and parameters."""
         return np.array([p["error"] / p["sigma"] for r in self.estimates(solver) for p in r["parameters"].values()])
 
     def accuracies(self, solver: str) -> dict[str, tuple[statistics.Accuracy, ParameterError]]:
@@ -166,7 +166,7 @@ def run_study(
 def simulate_and_solve(
     method: str, scenario: BaseModel, seed: int, solvers: Sequence[str], window: float | None
 ) -> dict[str, RunResult]:
-    """On the worker: solver -> numbers of one seed of a scenario."""
+    """Simulate and solve one seed of a scenario on a worker: solver -> numbers."""
     from alidade.pipelines.applications.session import Session
 
     chosen = methods.method(method)

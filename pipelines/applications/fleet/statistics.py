@@ -77,7 +77,7 @@ class Accuracy:
 
 
 def accuracy(errors: Array, sigmas: Array) -> Accuracy:
-    """Of errors and sigmas (n,)."""
+    """Accuracy (mean, RMS, coverage) of errors (n,) with sigmas (n,)."""
     scatter = float(errors.std(ddof=1)) if len(errors) > 1 else math.nan
     return Accuracy(
         float(errors.mean()),
@@ -142,7 +142,7 @@ class Trend:
 
     @property
     def z(self) -> float:
-        """The slope in its sigmas."""
+        """The trend's slope over its sigma."""
         return self.slope / self.sigma
 
 

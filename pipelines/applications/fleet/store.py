@@ -32,7 +32,7 @@ RunStatus = Literal["calibrated", "weak", "unobservable", "inconsistent", "faile
 
 
 class ParameterNumbers(TypedDict):
-    """A parameter of one recording; SI."""
+    """Value, sigma and verdict of a parameter of one recording; SI."""
 
     value: float
     sigma: float
@@ -122,7 +122,7 @@ class Store(Generic[Result]):
         self._load()
 
     def add(self, name: str, result: Result) -> None:
-        """Keep a result, in the file before this returns."""
+        """Append a result to the file; it is written when this returns."""
         line = json.dumps({"settings": self._settings, "name": name, "result": result}, allow_nan=False)
         try:
             self._stream.write(line.encode() + b"\n")
@@ -195,5 +195,5 @@ def failure(exit_code: int, reason: str) -> Any:
 
 
 def quarantined() -> Any:
-    """The result of a calibration that killed its workers."""
+    """The result recorded for a calibration that killed its workers."""
     return failure(exit_codes.KILLED, "killed its worker each time it was tried, at last alone; quarantined")

@@ -47,5 +47,5 @@ def write_parquet(path: Path, rows: Sequence[Row]) -> None:
 
 
 def columns(rows: Sequence[Row]) -> list[str]:
-    """Their names."""
+    """Names of the columns of some rows, in the order of their first use."""
     return list(dict.fromkeys(name for row in rows for name in row))

@@ -21,7 +21,7 @@ from alidade.pipelines.reports.whole import write_whole
 
 @dataclass(frozen=True, repr=False)
 class FleetResult:
-    """A calibrated fleet.
+    """Results and report of a calibrated fleet.
 
     Attributes:
         outcome: the results by recording.
@@ -64,7 +64,7 @@ def run_fleet(
 
 
 def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> tuple[Path, ...]:
-    """fleet.csv, fleet.parquet, changes.csv and fleet.html, whole or not at all; returns their paths."""
+    """Write a fleet's report and tables (CSV, Parquet), all of them or none; returns their paths."""
     rows = table(outcome.results, fleet)
     return write_whole(
         out,

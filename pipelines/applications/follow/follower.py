@@ -57,7 +57,7 @@ _SAMPLE = 0.01
 
 @dataclass(frozen=True)
 class Settings:
-    """How to follow.
+    """Settings of a session that follows a recording.
 
     Attributes:
         method, config: override the recording's own.
@@ -78,7 +78,7 @@ class Settings:
 
 
 class Follower:
-    """A recording being followed.
+    """Calibration of a recording while it is written.
 
     Args:
         source: of the recording.

@@ -33,7 +33,7 @@ class _Admitted:
 
 
 class Gate:
-    """Bounds the connections of a server; for any thread.
+    """Limit on the connections of a server; safe in any thread.
 
     Args:
         most: connections of either kind.
@@ -101,7 +101,7 @@ class Attempts:
         return self._at(network_of(address)) >= 1.0
 
     def failed(self, address: str) -> None:
-        """The address has tried a wrong one."""
+        """Count a wrong attempt of an address."""
         address = network_of(address)
         left = self._at(address) - 1.0
         self._left.pop(address, None)

@@ -56,7 +56,7 @@ class View:
 
     @property
     def sigmas(self) -> Array | None:
-        """(n,) standard deviations."""
+        """Standard deviations (n,) of the estimate; None without one."""
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
 
     @property
@@ -68,12 +68,12 @@ class View:
 
     @property
     def status(self) -> str:
-        """Of the estimate; empty while there is too little."""
+        """Status of the estimate; empty while there is too little for one."""
         return "" if self.covariance is None else status(self.findings)
 
     @property
     def short(self) -> tuple[str, ...]:
-        """The parameters whose accuracy wanted is not reached."""
+        """Names of the parameters that have not reached their required accuracy."""
         if self.covariance is None:
             return tuple(q.name for q in self.quantities if q.prior_sigma != 0.0)
         return tuple(name for name, verdict in self.verdicts.items() if verdict in ("weak", "unobservable"))
@@ -123,7 +123,7 @@ class View:
 
     @property
     def estimated(self) -> tuple[str, ...]:
-        """The parameters that are to be determined."""
+        """Names of the parameters that the recording is to determine."""
         return tuple(q.name for q in self.quantities if _is_estimated(q))
 
     @property
@@ -172,7 +172,7 @@ class Watch:
         self.change: Stability | None = None
 
     def look(self, run: IncrementalSolver) -> None:
-        """Look again if the run has come to another moment since."""
+        """Update the view if the run has advanced since the last one."""
         now = run, run.moments
         if not run.started or now == self._seen:
             return
@@ -188,7 +188,7 @@ def _is_estimated(q: Quantity) -> bool:
 def view_of(
     epoch_ns: int, run: IncrementalSolver, checklist: tuple[ChecklistItem, ...], change: Stability | None = None
 ) -> View:
-    """The view of a run so far."""
+    """The view of a run up to now."""
     quantities, advise = run.problem.quantities, run.problem.advice
     time = run.time if np.isfinite(run.time) else 0.0
     if not run.started:

@@ -66,7 +66,7 @@ _HEADERS = {
 
 
 class LivePage:
-    """A server of the page; a context.
+    """Context manager that serves the live page.
 
     Raises InputError when starlette or uvicorn is not installed, or there is no such address or no port free there.
 
@@ -126,7 +126,7 @@ class LivePage:
 
     @property
     def url(self) -> str:
-        """What to open in a browser."""
+        """Address of the page, for a browser."""
         host = self._host
         if self.is_open and ipaddress.ip_address(self._socket.getsockname()[0]).is_unspecified:
             host = _outward(self._families)
@@ -146,7 +146,7 @@ class LivePage:
         self._socket.close()
 
     def show(self, view: View) -> None:
-        """What is known by now."""
+        """Show the current state on the page."""
         self._remember(view)
         if view.covariance is not None:
             self._noted = [note for note in self._noted if not note[1].startswith(WAITING)]
@@ -164,12 +164,12 @@ class LivePage:
         )
 
     def say(self, sentence: str) -> None:
-        """A sentence that stays for a while."""
+        """Show a sentence on the page for a while."""
         self._noted = [*self._noted, (time.monotonic(), printable(sentence, _MAX_NOTE))][-_NOTES:]
         self._tell(notes=self._notes())
 
     def end(self, calibration: Calibration) -> None:
-        """What came out."""
+        """Show the result on the page."""
         self._end(calibration.status, calibration.headline)
 
     # -- the state

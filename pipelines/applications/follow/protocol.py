@@ -17,7 +17,7 @@ LARGEST_ID = (1 << 32) - 1
 
 
 class RefusedError(Exception):
-    """A message of the other side that is none; the text says why."""
+    """Message from the other side that breaks the protocol; the text says why."""
 
 
 def read_message(text: str) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def websockets() -> Any:
-    """The library. Raises InputError when it is not installed."""
+    """The library websockets. Raises InputError when it is not installed."""
     try:
         import websockets.sync.client
         import websockets.sync.server

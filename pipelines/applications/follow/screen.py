@@ -24,7 +24,7 @@ _LINE = 5.0
 
 
 class Screen:
-    """A context in which views are shown as they come."""
+    """Context manager that shows views on the terminal as they come."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -41,16 +41,16 @@ class Screen:
             self._live.stop()
 
     def say(self, text: str) -> None:
-        """One line that stays."""
+        """Print one line above the changing view."""
         self._console.print(escape(text), soft_wrap=True)
 
     def show_address(self, address: str) -> None:
-        """A QR code, where there is a terminal to show it to a phone."""
+        """Print an address as a QR code, where there is a terminal to show it to a phone."""
         if self._console.is_terminal:
             self._console.print(qr(address))
 
     def show(self, view: View) -> None:
-        """The state by now."""
+        """Show the current state."""
         if self._live is not None:
             self._live.update(_page(view), refresh=True)
             return

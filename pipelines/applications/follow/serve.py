@@ -64,7 +64,7 @@ _STATUS = {
 
 
 class LiveServer:
-    """A server on the loopback interface; a context.
+    """Context manager that serves a calibration on the loopback interface.
 
     Raises InputError when websockets is not installed or the port is taken.
 
@@ -98,7 +98,7 @@ class LiveServer:
 
     @property
     def url(self) -> str:
-        """What to open in Foxglove."""
+        """Address of the server, for Foxglove."""
         return f"ws://{HOST}:{self._server.socket.getsockname()[1]}"
 
     def __enter__(self) -> LiveServer:

@@ -49,12 +49,12 @@ class Source(AbstractContextManager["Source"]):
 
     @property
     def where(self) -> Where:
-        """What `open_recording` takes to read it."""
+        """Files or folder with which `open_recording` reads the source."""
         return self.path if self.is_finished or not self.path.is_dir() else self.parts
 
     @property
     def size(self) -> int:
-        """Of all parts, bytes; 0 when there is nothing yet."""
+        """Size of all parts, bytes; 0 when there is nothing yet."""
         return sum(map(_size, self.parts))
 
     @property
@@ -105,7 +105,7 @@ class Stream(Source):
 
     @property
     def where(self) -> Where:
-        """The parts."""
+        """The parts that the stream was written to."""
         return self.parts
 
     def __enter__(self) -> Stream:
@@ -133,7 +133,7 @@ class Stream(Source):
 
 
 class StandardInput(Stream):
-    """An MCAP file that comes in on standard input."""
+    """Source of an MCAP file on standard input."""
 
     def __init__(self, folder: Path | None, stream: BinaryIO | None = None, say: Callable[[str], None] = print) -> None:
         super().__init__("standard input", folder, say)

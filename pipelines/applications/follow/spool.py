@@ -48,11 +48,11 @@ class Spool:
         return len(data)
 
     def tell(self) -> int:
-        """Bytes written by now, on the disk or waiting."""
+        """Position: bytes written by now, on the disk or waiting."""
         return self._end + len(self._waiting)
 
     def drop(self) -> None:
-        """Count a record that nothing has room for."""
+        """Count a record that is lost for want of room."""
         self.dropped += 1
 
     def flush(self, at_once: bool = False) -> None:
@@ -70,7 +70,7 @@ class Spool:
             self._say(f"{self._path}: written again, {lost}")
 
     def close(self) -> None:
-        """With everything on the disk that there is room for."""
+        """Flush to the disk as far as there is room, and close the file."""
         self.flush(at_once=True)
         if self._waiting:
             self._say(f"{self._path}: the last {len(self._waiting)} bytes are lost, there is no room for them")

@@ -259,7 +259,7 @@ def _gains(known: _FisherInformation, choices: Sequence[Resting], field: Array |
 
 @cache
 def rested(up: Side, north: Side | None = None) -> str:
-    """A side up; with another one to the north a compass is drawn."""
+    """Drawing of a cube that rests on a side, with a compass where another side is to point north."""
     ahead = next(side for side in SIDES if side[1] != up[1]) if north is None else north
     return resting(Resting(up=up, north=ahead).nRb, compass=north is not None)
 

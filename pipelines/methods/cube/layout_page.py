@@ -61,7 +61,7 @@ def advice(layout: Layout) -> list[str]:
 
 
 def layout_json(layout: Layout) -> str:
-    """Every tag placed with its sigmas, SI and pixels, and why others are not."""
+    """JSON text of a cube's layout: tags, their poses and sigmas."""
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6).tolist()
     body = layout.body
     return plain_json(

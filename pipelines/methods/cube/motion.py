@@ -40,7 +40,7 @@ class Motion:
         return k, np.where(following > k, np.clip((t - self.stop[k]) / duration, 0.0, 1.0), 0.0), duration
 
     def attitude(self, t: Array) -> Array:
-        """nRb (N, 4) at the times."""
+        """Attitudes nRb (N, 4) at the times."""
         k, u, _ = self._phase(t)
         if len(self.start) == 1:
             return np.broadcast_to(self.nRb[0], (len(t), 4))
@@ -59,7 +59,7 @@ class Motion:
 
 
 def drawn_attitudes(scenario: CubeScenario, rng: np.random.Generator) -> Array:
-    """nRb (P, 4): the random ones, then those given."""
+    """Attitudes nRb (P, 4) of the poses: the random ones, then those given."""
     n = scenario.poses
     given = np.array([each.nRb for each in scenario.attitudes]).reshape(-1, 4)
     if not (n and scenario.turn_axes):
@@ -73,7 +73,7 @@ def drawn_attitudes(scenario: CubeScenario, rng: np.random.Generator) -> Array:
 
 
 def drawn_motion(s: CubeScenario, rng: np.random.Generator) -> Motion:
-    """A way through the scenario's poses."""
+    """Motion through the scenario's poses."""
     nRb = drawn_attitudes(s, rng)
     n = len(nRb)
     place = np.array([0.0, 0.0, s.distance]) + [0.04, 0.03, 0.05] * rng.uniform(-1, 1, (n, 3))

@@ -115,7 +115,7 @@ def tag_place_key(tag: int) -> int:
 
 
 def of_tag(spec: ParameterSpec, tag: int) -> ParameterSpec:
-    """A spec of tags for one of them."""
+    """Declaration of the parameters of one tag, from that of all tags."""
     return replace(spec, axes=tuple(axis.replace("*", str(tag)) for axis in spec.axes))
 
 
@@ -159,12 +159,12 @@ class Parameters:
 
     @property
     def assumed(self) -> tuple[Parameter | None, ...]:
-        """Assumptions alone."""
+        """The nuisance parameters."""
         return (self.sensitivity, self.curvature, self.lens, *self.slopes.values(), self.dead_band)
 
     @property
     def zeros(self) -> tuple[Parameter, ...]:
-        """Vectors with priors about zero."""
+        """The vector parameters with priors about zero."""
         return tuple(p for p in (self.said, *self.places, *self.assumed) if p is not None)
 
     def initial(self, gyro_bias: Array) -> gtsam.Values:

@@ -37,7 +37,7 @@ _NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 @dataclass(frozen=True, eq=False)
 class TriadRegression:
-    """nominal = K raw + b by least squares.
+    """Result of the regression nominal = K raw + b by least squares.
 
     Attributes:
         K: (3, 3).

@@ -39,14 +39,14 @@ TAG_DETECTIONS = Topic("tag_detections", "/tag_detections", (messages.TAG_DETECT
 
 
 class RawConversion(Section):
-    """Nominal conversion of counts: (raw - offset) * scale."""
+    """Nominal conversion of one sensor's counts: (raw - offset) * scale."""
 
     scale: Sigma  # SI per count
     offset: float = 0.0  # counts
 
 
 class Raw(Section):
-    """Conversions of the sensors that record counts."""
+    """Nominal conversions of the sensors that record counts."""
 
     accel: RawConversion | None = None
     gyro: RawConversion | None = None
@@ -204,7 +204,7 @@ def nominal(values: Array, conversion: RawConversion | None) -> Array:
 
 
 def recorded(values: Array, conversion: RawConversion | None) -> Array:
-    """The inverse of `nominal`."""
+    """Readings as recorded, from nominal units: the inverse of `nominal`."""
     return values if conversion is None else values / conversion.scale + conversion.offset
 
 

@@ -26,7 +26,7 @@ class CubeNoise(ScenarioPart):
 
 
 class Errors(ScenarioPart):
-    """Sigmas of what is to be found."""
+    """Sigmas from which a scenario draws the parameters."""
 
     gain: NotNegative = 0.02  # of each entry of K - 1
     accel_bias: NotNegative = 0.3  # m/s^2
@@ -45,7 +45,7 @@ class FieldErrors(ScenarioPart):
 
 
 class Place(ScenarioPart):
-    """Place on the earth."""
+    """Place on the earth where a scenario is recorded."""
 
     latitude_deg: float = 40.0
     longitude_deg: float = 116.3

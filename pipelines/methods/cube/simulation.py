@@ -79,7 +79,7 @@ def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simula
 
 
 def attitudes(scenario: CubeScenario, seed: int) -> Array:
-    """nRb (P, 4) of the poses of a scenario's session."""
+    """Attitudes nRb (P, 4) of the poses of a scenario's session."""
     return _World(scenario, seed).motion.nRb
 
 

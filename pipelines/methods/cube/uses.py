@@ -13,7 +13,7 @@ from alidade.pipelines.settings import Config
 
 
 def uses(true: Truth, config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
-    """Heading, rate and specific force."""
+    """Uses of a cube calibration: heading, rate and specific force."""
     raw = config.section(CubeConfig).raw
 
     def readings(true: Truth, ideal: Mapping[str, Array]) -> dict[str, Array]:

@@ -145,7 +145,7 @@ def _smooth(bias: Array, window: int, threshold: float) -> Array:
 
 
 def attitude(angles: ArrayLike) -> Array:
-    """Yaw, pitch, roll, shape (..., 3), rad -> bRv, shape (..., 4)."""
+    """Attitudes bRv (..., 4) of yaw, pitch, roll (..., 3), rad."""
     yaw, pitch, roll = (np.asarray(angles, dtype=float)[..., i, None] for i in range(3))
     ex, ey, ez = np.eye(3)
     return so3.compose(so3.exp(yaw * ez), so3.exp(pitch * ey), so3.exp(roll * ex))

@@ -30,7 +30,7 @@ TRUTH_ATTITUDE = Topic("truth_attitude", "/truth/attitude", messages.ATTITUDES)
 
 
 class HeadConfig(MethodSection):
-    """The helmet."""
+    """Section `head` of a config."""
 
     key: ClassVar[str] = "head"
 

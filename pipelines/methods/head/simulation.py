@@ -325,7 +325,7 @@ def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
 
 
 def simulated(scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
-    """A session in memory, with pictures if asked for.
+    """Simulated head session in memory, with pictures if asked for.
 
     Raises:
         InputError: its pictures cannot be drawn.

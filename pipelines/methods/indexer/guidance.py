@@ -89,7 +89,7 @@ Axis = Literal["outer", "inner"]
 
 @cache
 def turning(axis: Axis, other_deg: float, ways: str = "start end") -> str:
-    """An axis turned while the other one stands at an angle.
+    """Drawing of one axis turning while the other stands at an angle.
 
     Args:
         axis: that turns.

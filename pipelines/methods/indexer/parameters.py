@@ -69,7 +69,7 @@ def indexer_parameters(config: Config, stamp_sigma: float = 0.0, thermometer: bo
 
 
 def theta_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
-    """The angles in rad."""
+    """Coordinates of the mounting variable: its angles, rad."""
     return THETA_UNIT * np.asarray(values.atVector(key)), THETA_UNIT * np.eye(3)
 
 

@@ -28,7 +28,7 @@ REQUIREMENTS: tuple[Need, ...] = (((IMU,),), ((INDEXER,),), ((FIX,), (_LATITUDE,
 
 
 class IndexerConfig(MethodSection):
-    """The indexer."""
+    """Section `indexer` of a config."""
 
     key: ClassVar[str] = "indexer"
 

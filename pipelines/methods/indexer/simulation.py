@@ -160,7 +160,7 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
 
 
 def simulated(scenario: IndexerScenario, seed: int, _images: bool = False) -> Simulated:
-    """A session in memory."""
+    """Simulated indexer session in memory."""
     return Simulated(*simulate_indexer(scenario, seed), indexer_config(scenario))
 
 

@@ -21,7 +21,7 @@ _LATITUDE = np.deg2rad(45.0)
 
 
 def uses(_true: Truth, _config: Config, noise: Mapping[str, float]) -> Sequence[Use]:
-    """Attitude error over an hour."""
+    """Uses of an indexer calibration: attitude error over an hour."""
     time, angle, rate = _sequence()
     shown = slice(5, None, 6)
     density, walk = noise.get("gyro_density", 0.0), noise.get("gyro_bias_walk", 0.0)

@@ -52,7 +52,7 @@ class Run:
 
     @property
     def direction(self) -> int:
-        """+1 forward, -1 back, 0 at rest."""
+        """Direction of the run: +1 forward, -1 back, 0 at rest."""
         return int(np.sign(self.turned))
 
     @property
@@ -224,7 +224,7 @@ class Group:
 
     @property
     def duration(self) -> float:
-        """Length, s."""
+        """Length of the group, s."""
         return float(self.rates.edges[-1] - self.rates.edges[0])
 
     @property

@@ -42,7 +42,7 @@ def los_direction(measured: Array) -> Array:
 
 
 def los_error(direction: Array) -> Array:
-    """phx, phz (n, 2), rad, of directions (n, 3) in c."""
+    """LOS errors phx, phz (n, 2), rad, of directions (n, 3) in c."""
     x, y, z = direction.T
     return np.stack([-np.arctan2(z, y), np.arctan2(x, y)], axis=1)
 

@@ -263,7 +263,7 @@ def _encoders(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator
 
 
 def carrier_attitude(scenario: LosScenario, t: Array) -> Array:
-    """iRb, shape (N, 4)."""
+    """Attitudes iRb (N, 4) of the carrier."""
     nRb = scenario.carrier.attitude(t)
     if scenario.latitude_deg is None:
         return nRb
@@ -284,7 +284,7 @@ def camera_attitude(scenario: LosScenario, gimbal: Array, effects: Mapping[str, 
 
 
 def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulated:
-    """A session in memory, with pictures if asked for.
+    """Simulated los session in memory, with pictures if asked for.
 
     Raises:
         InputError: its pictures cannot be drawn.

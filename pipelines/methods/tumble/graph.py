@@ -42,7 +42,7 @@ _STRETCH = 0.5
 
 
 def problem(data: TumbleData, config: Config) -> Problem:
-    """The graph.
+    """The graph of a tumble recording.
 
     Raises:
         InputError: too few readings or attitudes, the config names no such parameter, or the date is outside the field

@@ -89,7 +89,7 @@ _NEGATIVE_DIP = (
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """One triad.
+    """Readings, noise and first guess of one triad.
 
     Attributes:
         name: accel or mag.
@@ -133,12 +133,12 @@ class Sensor:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its numbers."""
+        """Names of the triad's parameters."""
         return triad_names(self.name, self.symmetric)
 
     @property
     def scaled(self) -> Array:
-        """(n, 3) raw without unit."""
+        """Raw readings (n, 3) over their radius, without unit."""
         return self.raw / self.radius
 
     @property
@@ -148,12 +148,12 @@ class Sensor:
         return np.repeat([self.strength / self.radius, self.strength], [gains, 3])
 
     def nominal(self, raw: Array) -> Array:
-        """(m, 3) what readings (m, 3) mean at the first guess, in the unit of the strength."""
+        """Nominal vectors (m, 3) of readings (m, 3) at the first guess, in the unit of the strength."""
         return self.strength * nominal_of(raw / self.radius, self.start @ entries(self.symmetric).T)
 
     @property
     def directions(self) -> Array:
-        """(n, 3) of what it measured, unit vectors, at the first guess."""
+        """Unit vectors (n, 3) of the readings at the first guess."""
         vectors = self.nominal(self.raw)
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
@@ -171,7 +171,7 @@ class Dip:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """At which both sensors are used together.
+    """Moments at which both sensors are used together.
 
     Attributes:
         time, accel, mag: (n,) s, (n, 3) and (n, 3), without unit.
@@ -190,7 +190,7 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What the graph needs.
+    """The recording prepared for the graph.
 
     Attributes:
         sensors: accelerometer first.

@@ -46,7 +46,7 @@ class Variable:
 
     @property
     def prior(self) -> Factor:
-        """Its prior factor."""
+        """Prior factor of the variable."""
         return vector_about(self.parameter.key, self.mean, self.sigma)
 
 

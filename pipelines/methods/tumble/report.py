@@ -39,7 +39,7 @@ from alidade.pipelines.settings import Config
 
 
 def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
-    """Of the sensors that there are; raw numbers are as recorded, and results in the unit of the strength."""
+    """Formulas of the sensors present, from raw numbers as recorded to the unit of the strength."""
     found = []
     if "accel_k11" in parameters:
         formula = triad_formula("accel", parameters, "accel", ("accel",), "body's")
@@ -106,7 +106,7 @@ def findings(data: TumbleData, config: Config, estimate: Estimate) -> Findings:
 
 
 def directions(sensor: Sensor, values: Mapping[str, float]) -> Array:
-    """(n, 3) unit vectors in the body of what a sensor measured, calibrated."""
+    """Unit vectors (n, 3) in the body of a sensor's calibrated readings."""
     K, b = triad_of(sensor.name, values)
     vectors = sensor.raw @ K.T + b
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
@@ -189,7 +189,7 @@ def _coverage(sensor: Sensor, values: Mapping[str, float]) -> dict[str, object]:
 
 
 def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:
-    """With the estimate applied."""
+    """Figures of the calibrated readings."""
     estimate = calibration.estimate
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
     found: list[Plot | Table] = [_words(calibration)]

@@ -91,14 +91,14 @@ class Rows:
 
     @classmethod
     def near(cls, time: Array, stamps: Array, rows: Index) -> Rows:
-        """Those of the rows that a keyframe is near."""
+        """The rows that a keyframe is near."""
         after = np.clip(np.searchsorted(time, stamps[rows]), 1, len(time) - 1)
         nearest = np.where(stamps[rows] - time[after - 1] < time[after] - stamps[rows], after - 1, after)
         close = np.abs(time[nearest] - stamps[rows]) <= _APART
         return cls(rows[close], nearest[close])
 
     def of(self, keyframes: range) -> Rows:
-        """Those of some keyframes."""
+        """The rows of some keyframes."""
         chosen = slice(*np.searchsorted(self.keyframe, [keyframes.start, keyframes.stop]))
         return Rows(self.row[chosen], self.keyframe[chosen])
 
@@ -119,7 +119,7 @@ class FieldGuess:
 
     @property
     def mount(self) -> Array:
-        """(3, 3) the rotation of the polar decomposition of K, a mirror where K is left-handed."""
+        """Rotation (3, 3) of K's polar decomposition, a mirror where K is left-handed."""
         u, _, vt = np.linalg.svd(self.K)
         return np.asarray(u @ vt)
 
@@ -131,7 +131,7 @@ class FieldGuess:
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """Attitudes aRb at keyframes.
+    """Chain of the attitudes aRb at keyframes.
 
     Attributes:
         chain: the keyframes, joined by the gyro.
@@ -158,7 +158,7 @@ class Turning:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """In reporting order."""
+        """Parameters of the chain, in reporting order."""
         return tuple(
             each
             for each in (self.bias, self.chain.errors, self.delay, self.filter, self.arm, self.earth_rate)
@@ -167,15 +167,15 @@ class Turning:
 
     @property
     def errors(self) -> int:
-        """Numbers of the gyro's errors."""
+        """Number of the gyro's errors."""
         return 0 if self.chain.errors is None else len(self.chain.errors.quantities)
 
     def elapsed(self, time: Array) -> Array:
-        """(n,) s since the first keyframe, at which a and n coincide."""
+        """Time (n,), s, since the first keyframe, at which a and n coincide."""
         return np.asarray(time - self.chain.time[0])
 
     def aRn(self, time: Array, values: gtsam.Values) -> Array:
-        """(n, 4) how the earth has turned, by its rate as known or as estimated."""
+        """Rotations aRn (n, 4) of the earth since the first keyframe, by its rate as known or as estimated."""
         earth = self.earth
         if earth is None:
             assert self.earth_rate is not None
@@ -276,7 +276,7 @@ def _right_angles() -> Array:
 def turning(
     data: TumbleData, config: Config, guess: FieldGuess, mag: Seen, accel: Seen | None, declination: float, dip: float
 ) -> Turning:
-    """The chain of attitudes.
+    """The chain of attitudes of a tumble recording.
 
     Args:
         data: with a gyro.

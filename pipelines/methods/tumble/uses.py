@@ -14,7 +14,7 @@ from alidade.pipelines.settings import Config
 
 
 def uses(true: Truth, _config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
-    """Heading, rate and specific force."""
+    """Uses of a tumble calibration: heading, rate and specific force."""
     return triad_uses(true, _readings)
 
 

@@ -45,7 +45,7 @@ class TagSeen:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A body of tags as found.
+    """Estimated layout of a body of tags.
 
     Attributes:
         body: the tags that could be placed.
@@ -82,7 +82,7 @@ class Layout:
 
 
 def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool = False) -> Layout:
-    """The layout of a body.
+    """Estimate the layout of a body of tags from pictures.
 
     Args:
         shots: recordings of it; those whose cameras say the same are of one camera.

@@ -24,7 +24,7 @@ LINE_TIME = 3e-5
 
 @dataclass(frozen=True, eq=False)
 class Additional:
-    """Prior sigmas; 0 of what stays as it is.
+    """Prior sigmas of additional parameters; 0 of those that are fixed.
 
     Attributes:
         given: the cameras that the priors are about; their shutters are taken not to roll.
@@ -39,12 +39,12 @@ class Additional:
 
     @property
     def sigma(self) -> Array:
-        """(k,) of all, the intrinsics first."""
+        """Prior sigmas (k,) of all additional parameters, the intrinsics first."""
         return np.concatenate([self.intrinsics.ravel(), self.line_time])
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """(k,)."""
+        """Mask (k,) of the additional parameters that are estimated."""
         return np.asarray(self.sigma > 0.0)
 
     def parts(self, numbers: Array) -> tuple[Array, Array]:
@@ -60,7 +60,7 @@ class Additional:
         return np.concatenate([out.ravel(), bundle.line_time])
 
     def moved(self, bundle: Bundle, step: Array) -> Bundle:
-        """The bundle with a step (k,) added."""
+        """The bundle with a step (k,) added to its additional parameters."""
         intrinsics, line_time = self.parts(step)
         cameras = tuple(
             camera.with_intrinsics(camera.intrinsics + row[: len(camera.intrinsics)]) if row.any() else camera
@@ -83,14 +83,14 @@ class Additional:
 
 
 def nothing(bundle: Bundle) -> Additional:
-    """All stays as it is."""
+    """Additional parameters of a bundle, all fixed."""
     cameras = bundle.cameras
     widest = max(len(camera.intrinsics) for camera in cameras)
     return Additional(cameras, np.zeros((len(cameras), widest)), np.zeros(len(cameras)))
 
 
 def shutters(bundle: Bundle) -> Additional:
-    """The line times, about none: 30 us, as a phone's."""
+    """Line times as additional parameters, with a prior of 30 us about none, as a phone's."""
     return replace(nothing(bundle), line_time=np.full(len(bundle.cameras), LINE_TIME))
 
 
@@ -140,7 +140,7 @@ class Normal:
     gradient: Array
 
     def step(self) -> tuple[Array, Array]:
-        """Of the shared numbers (p,), zero where fixed, and of the pictures (f, 6)."""
+        """Step of the shared numbers (p,), zero where fixed, and of the pictures (f, 6)."""
         moved = -np.linalg.solve(self.information, self.projection)
         pictures = -np.einsum("fij,fj->fi", self.inverse, self.gradient + self.across @ moved)
         shared = np.zeros(len(self.free))
@@ -287,12 +287,12 @@ def adjusted(
 
 
 def weights(rows: Rows, far: float) -> Array:
-    """(m,) of Geman's and McClure's loss; 1 without bound."""
+    """Weights (m,) of Geman's and McClure's loss; 1 without bound."""
     return np.ones(len(rows.miss)) if np.isinf(far) else np.asarray((far / (far + rows.squares)) ** 2)
 
 
 def loss(squares: Array, far: float) -> Array:
-    """Geman's and McClure's of sums of squares."""
+    """Geman's and McClure's loss of sums of squares."""
     return squares if np.isinf(far) else np.asarray(squares * (far / (far + squares)))
 
 

@@ -82,7 +82,7 @@ class Bending:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """What is known of a layout.
+    """Covariance of a layout and of the additional parameters adjusted with it.
 
     Attributes:
         tags: (6 (n - 1), 6 (n - 1)), of all tags but the fixed one, rad and m.

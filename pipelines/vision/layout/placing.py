@@ -198,12 +198,12 @@ def with_pictures(bundle: Bundle, poses: Sides) -> Bundle:
 
 
 def together(sights: Sights) -> NDArray[np.bool_]:
-    """(m,) sights in pictures that show two tags or more."""
+    """Mask (m,) of sights in pictures that show two tags or more."""
     return np.asarray(np.bincount(sights.picture)[sights.picture] > 1)
 
 
 def joint(sights: Sights, tags: int) -> Array:
-    """(n, n) number of pictures that show two tags together."""
+    """Number (n, n) of pictures that show two tags together."""
     a, b = pairs(sights.picture)
     out = np.zeros((tags, tags))
     np.add.at(out, (sights.tag[a], sights.tag[b]), 1.0)
@@ -336,7 +336,7 @@ def flips(bundle: Bundle, sights: Sights) -> Flips:
 
 
 def lone_scale(bundle: Bundle, sights: Sights, found: Flips) -> float:
-    """By how much corners are worse than stated: from each tag by itself, eight numbers for the six of its pose."""
+    """Ratio of the corners' errors to those stated, from each tag by itself: eight numbers for a pose of six."""
     m = len(sights)
     body = replace(bundle.body, bRt=so3.identity(len(bundle.body.ids)), position=np.zeros((len(bundle.body.ids), 3)))
     alone = Sights(np.arange(m), sights.tag, sights.corners, sights.sigma)

@@ -33,7 +33,7 @@ _DEGREE = 4
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A bundle adjusted.
+    """Adjusted bundle with its residuals.
 
     Attributes:
         bundle: with all poses.
@@ -57,19 +57,19 @@ class Fit:
 
     @property
     def freedom(self) -> Array:
-        """(f,) numbers seen in a picture beyond the six of its pose."""
+        """Degrees of freedom (f,) of a picture beyond the six of its pose."""
         return freedom(self.sights, len(self.weight))
 
     @property
     def curvature(self) -> Array:
-        """(f,) what of a picture's information its weight leaves: less, since the weight follows the errors."""
+        """Share (f,) of a picture's information that its weight leaves: less, since the weight follows the errors."""
         squares = np.bincount(self.sights.picture, self.rows.squares, len(self.weight))
         free = np.maximum(self.freedom, 1.0)
         return np.asarray(np.maximum(1.0 - 2.0 * squares / ((_NU + free) * free), 0.1))
 
     @property
     def errors_px(self) -> Array:
-        """(m, 4, 2) errors of the sights used, px."""
+        """Errors (m, 4, 2) of the sights used, px."""
         return self.rows.miss.reshape(-1, 4, 2) * self.sights.sigma[:, None, None]
 
     def rms_px(self, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
@@ -144,7 +144,7 @@ def _moving(bundle: Bundle, sights: Sights, additional: Additional) -> Bundle:
 
 
 def freedom(sights: Sights, pictures: int) -> Array:
-    """(f,) numbers seen in a picture beyond the six of its pose."""
+    """Degrees of freedom (f,) of a picture beyond the six of its pose."""
     return np.asarray(np.maximum(8.0 * np.bincount(sights.picture, minlength=pictures) - 6.0, 0.0))
 
 

@@ -34,7 +34,7 @@ _FORWARD = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """Tags in pictures, by ascending picture.
+    """Sightings of tags in pictures, by ascending picture.
 
     Attributes:
         picture, tag: (m,) indices.
@@ -56,7 +56,7 @@ class Sights:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """All that is adjusted.
+    """Cameras, body and poses of the pictures that are adjusted.
 
     Attributes:
         cameras: one or more.
@@ -80,12 +80,12 @@ class Bundle:
 
     @classmethod
     def of(cls, cameras: tuple[Camera, ...], camera: Index, body: TagBody, cRb: Array, position: Array) -> Bundle:
-        """As if nothing moved while a picture is taken."""
+        """Bundle of pictures during which nothing moves."""
         f = len(cRb)
         return cls(cameras, camera, body, cRb, position, np.full(f, np.nan), np.zeros((f, 6)), np.zeros(len(cameras)))
 
     def lines(self, sights: Sights) -> Array:
-        """(m, 4) by how many rows corners are below the middle of their picture."""
+        """Rows (m, 4) by which corners lie below the middle of their picture."""
         middle = np.array([0.5 * (camera.height - 1) for camera in self.cameras])
         return np.asarray(sights.corners[..., 1] - middle[self.camera[sights.picture], None])
 
@@ -118,25 +118,25 @@ class Rows:
 
     @cached_property
     def squares(self) -> Array:
-        """(m,) sums of squares."""
+        """Sums of squares (m,) of the residuals."""
         return np.asarray((self.miss**2).sum(axis=1))
 
     @cached_property
     def by_picture(self) -> Array:
-        """(m, 8, 6) by [delta, epsilon] of pictures: cRb Exp(delta), position + epsilon."""
+        """Jacobian (m, 8, 6) by [delta, epsilon] of pictures: cRb Exp(delta), position + epsilon."""
         by = np.concatenate([-self._by_turned @ so3.hat(self.turned), self.by_point], axis=-1)
         return by.reshape(-1, 8, 6)
 
     @cached_property
     def by_tag(self) -> Array:
-        """(m, 8, 6) by [delta, epsilon] of tags: bRt Exp(delta), position + epsilon."""
+        """Jacobian (m, 8, 6) by [delta, epsilon] of tags: bRt Exp(delta), position + epsilon."""
         in_b = self._by_turned if self.turn is None else self._by_turned @ so3.matrix(self.turn)
         in_t = in_b @ so3.matrix(self.bRt)[:, None]
         return np.concatenate([-in_t @ so3.hat(self.local), in_b], axis=-1).reshape(-1, 8, 6)
 
     @property
     def velocity(self) -> Array:
-        """(m, 4, 3) m/s, of the corners in the camera's frame."""
+        """Velocities (m, 4, 3), m/s, of the corners in the camera's frame."""
         w, v = np.split(self.motion, 2, axis=-1)
         return np.asarray(so3.rotate(self.cRb, so3.cross(w, self.turned)) + v)
 
@@ -181,7 +181,7 @@ class Shots:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Sights of all recordings.
+    """Sightings of all recordings together.
 
     Attributes:
         start: the bundle with all pictures' poses at the origin.
