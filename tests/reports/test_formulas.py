@@ -259,6 +259,7 @@ NOT_UNDONE = {
     **dict.fromkeys(("accel_arm_x", "accel_arm_y", "accel_arm_z"), "its share needs the angular acceleration"),
     **dict.fromkeys(("camera_focal", "camera_centre_x", "camera_centre_y"), "of pictures; formulas begin at attitudes"),
     **dict.fromkeys(("tag_17_px", "tag_17_py", "tag_17_pz"), "a position; formulas turn, they move nothing"),
+    "gyro_dead_band": "added to the size of readings, whose sign no formula has; a premise of the result says so",
     "vision_scale": "of angles since the recording's first picture, which later ones do not have",
 }
 

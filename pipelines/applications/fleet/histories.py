@@ -53,7 +53,7 @@ class History:
 
 
 def packed(sqrt_info: SqrtInformation) -> str:
-    """What a recording says of its numbers, as text; R and d in triangular form."""
+    """The square-root information of a recording as text, R and d in triangular form."""
     triangle = np.linalg.qr(np.column_stack([sqrt_info.R, sqrt_info.d])).R
     with io.BytesIO() as stream:
         np.savez_compressed(stream, **vars(replace(sqrt_info, R=triangle[:, :-1], d=triangle[:, -1])))
