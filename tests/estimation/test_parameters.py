@@ -20,10 +20,11 @@ from alidade.pipelines.estimation.parameters import ParameterSpec, prior_z_score
 from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
-from alidade.pipelines.methods.head.parameters import GYRO_SLOPE, PARAMETERS
+from alidade.pipelines.methods.head.parameters import PARAMETERS
 from alidade.pipelines.methods.head.recording import HeadData, read_head
 from alidade.pipelines.methods.head.report import findings
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch

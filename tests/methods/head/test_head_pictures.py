@@ -11,9 +11,10 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.head.parameters import GYRO_SLOPE, PARAMETERS
+from alidade.pipelines.methods.head.parameters import PARAMETERS
 from alidade.pipelines.methods.head.recording import HeadData, read_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head, simulate_pictures
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 from tests.support.solved import calibrate
