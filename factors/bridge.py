@@ -125,7 +125,7 @@ class BoundModel:
         return -augmented[:, -1], augmented[:, :-1]
 
     def linearized(self, values: gtsam.Values) -> gtsam.JacobianFactor:
-        """What `factor.linearize` gives, in a third of the time: that has gtsam take Jacobians key by key."""
+        """Linear factor as of `factor.linearize`, in a third of the time: that has gtsam take Jacobians key by key."""
         return jacobian_factor(self.keys, [*self.widths, 1], self._augmented(values, self.loss))
 
     def used(self, values: gtsam.Values) -> Mask:

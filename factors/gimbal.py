@@ -62,7 +62,7 @@ class GimbalPath:
 
 @dataclass(frozen=True)
 class LocalMotion(Stacked):
-    """How gyro and gimbal move around the stamps of n pictures, smoothed.
+    """Smoothed motion of gyro and gimbal around the stamps of n pictures.
 
     A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion
     is no larger than what noise puts into rates, and the gimbal follows the noise of the gyro that drives it. So the

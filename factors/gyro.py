@@ -261,7 +261,7 @@ def _by_scale(vectors: Array) -> Array:
 def rate_error(
     bias_error: Array, errors: Array | None, rate: Array, drivers: Array | None
 ) -> tuple[Array, Derivatives]:
-    """What a gyro reads too much (n, 3), rad/s, given what it reads and its drivers, and its derivatives.
+    """Error (n, 3), rad/s, of a gyro's reading, given the reading and its drivers, and its derivatives.
 
     Args:
         bias_error: (n, 3), the bias beyond what was taken off the rates.

@@ -323,7 +323,7 @@ _rates, _drivers, _attitudes, _integrals = map(attrgetter, ("rate", "drivers", "
 
 
 def trapezoid_excess(t: Array, mean: Array) -> Array:
-    """What trapezoids on interval means count too much, as a rate: d2 / 8 - 3 d4 / 128, of central differences.
+    """Rate error of trapezoids on interval means: d2 / 8 - 3 d4 / 128, of central differences.
 
     Zero at the ends and where the stamps are not even, as beside a gap; next to such places the second alone.
     """

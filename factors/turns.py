@@ -141,7 +141,7 @@ class Samples:
         return np.asarray(means - excess)
 
     def turned(self, matrices: Array, vectors: Array) -> Array:
-        """Each turn's matrix (n, 3, 3) times its samples' vectors (N, 3)."""
+        """Product of each turn's matrix (n, 3, 3) and its samples' vectors (N, 3)."""
         return np.einsum("kij,kj->ki", matrices[self.turn], vectors)
 
     def products(self, matrices: Array, vectors: Array) -> Array:
@@ -181,7 +181,7 @@ class Turns:
         accel_triads: Array | None = None,
         accel: Array | None = None,
     ) -> Turns:
-        """From readings (N, 3) of gyro and, if it feels force, accelerometer, with G (n, 9) and the triads (n, 12)."""
+        """Turns from readings (N, 3) of gyro and, if it feels force, accelerometer, with G (n, 9), triads (n, 12)."""
         A, c = parts(triads)
         K, offset = np.asarray(np.linalg.inv(A), dtype=float), c[samples.turn]
         if sensitivity is None or accel_triads is None or accel is None:

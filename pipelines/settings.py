@@ -317,7 +317,7 @@ Share = Annotated[str | float, PlainValidator(_share)]
 
 
 class MethodSection(Section):
-    """What a config says for one method alone, under that method's key."""
+    """Base of a config's section for one method alone, under that method's key."""
 
     key: ClassVar[str]
 
@@ -398,7 +398,7 @@ class Config(Section):
         return topic.name if source is None else source.parts[0]
 
     def section(self, kind: type[_Own]) -> _Own:
-        """What it says for one method, by the model of that section; as by default where it says nothing."""
+        """Section of one method, by its model; defaults where the config has none."""
         found = getattr(self, kind.key, None)
         return found if isinstance(found, kind) else kind()
 
@@ -422,7 +422,7 @@ def first_given(*values: float | None) -> float:
 
 
 def first_error(error: ValidationError, model: type[BaseModel]) -> tuple[tuple[int | str, ...], str]:
-    """Where content that a model rejects is wrong first, and a sentence about it."""
+    """Place where content that a model rejects is wrong first, and a sentence about it."""
     # An unknown key explains more than what follows from it.
     first: Any = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
     path = tuple(part for part in first["loc"] if not str(part).startswith("["))

@@ -63,7 +63,7 @@ class Suggestion:
 
 
 def suggestions(recording: Recording, config: Config, only: Sequence[str] | None = None) -> tuple[Suggestion, ...]:
-    """One for each method (of `only`) that lacks something and could have topics of the recording."""
+    """Suggested topics for each method (of `only`) that lacks something and could have it from the recording."""
     found = []
     pairings: dict[tuple[str, str], Pairing | None] = {}
     for name in methods.names() if only is None else only:
@@ -103,7 +103,7 @@ def with_suggested(recording: Recording, config: Config, method: str | None = No
 
 
 def nearest_suggestion(found: Sequence[Suggestion]) -> str:
-    """What there is for the method that lacks least, as a phrase; empty if there is nothing."""
+    """Phrase with the suggestion for the method that lacks least; empty if there is none."""
     if not found:
         return ""
     best = min(found, key=lambda suggestion: len(suggestion.missing))

@@ -545,7 +545,7 @@ def _refused(method: Method, recording: Recording, config: Config) -> str:
 
 
 def missing_for(name: str, recording: Recording, config: Config) -> tuple[str, ...]:
-    """What a recording with this config lacks for a method, one phrase each; nothing if it can serve it."""
+    """Phrases for what a recording with this config lacks for a method; none if it can serve it."""
     return lacking(methods.method(name).requirements, recording, config)
 
 

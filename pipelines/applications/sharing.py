@@ -53,7 +53,7 @@ def _share(config: Config, name: str) -> str | float | None:
 
 
 def device_prior(known: SavedCalibration, method: Method, config: Config, sha256: str, start_ns: int) -> GaussianPrior:
-    """What an earlier calibration says of the device at the time of another recording.
+    """Prior on the device at the time of another recording, from an earlier calibration.
 
     Args:
         known: the earlier calibration.

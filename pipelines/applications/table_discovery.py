@@ -89,7 +89,7 @@ class Columns:
 
 
 def propose_columns(recording: Recording) -> Columns | None:
-    """What the tables of a recording hold that no config describes; None where there is no such table."""
+    """Proposed meaning of a recording's tables that no config describes; None where there is no such table."""
     tables = tables_of(recording.container)
     if not tables:
         return None

@@ -115,7 +115,7 @@ def _solved(
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """One kind of error of a recording, before and after compensation; a method may have several.
+    """Error of one kind before and after compensation; a method may have several.
 
     Attributes:
         name: what is compared with what.

@@ -93,7 +93,7 @@ def find_hypotheses(
 
 
 def misstatements(build: Build, model: FaultModel, data: Any, config: Config) -> tuple[Finding, ...]:
-    """What the config states, and without which the recording fits as well, by parameters much nearer to their priors.
+    """Statements of the config without which the recording fits as well, by parameters much nearer to their priors.
 
     Arguments as of `find_hypotheses`. Faults without such a statement cost nothing.
     """

@@ -23,7 +23,7 @@ def described(direction: object) -> str:
 
 
 def widest_gap(directions: Array) -> tuple[float, Array]:
-    """How far, rad, the direction (3,) that is farthest from all unit vectors (n, 3) is from the nearest."""
+    """Angle, rad, from the direction (3,) that is farthest from all unit vectors (n, 3) to the nearest of them."""
     away = _distances(directions)
     widest = int(np.argmax(away))
     return float(away[widest]), _SPHERE[widest]

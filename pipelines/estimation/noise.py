@@ -103,7 +103,7 @@ class Level:
 
     @property
     def known(self) -> float:
-        """One sigma of the logarithm of what was stated: wide when the recording contradicts it."""
+        """Sigma of the stated noise's logarithm: wide when the recording contradicts it."""
         return max(self.noise.known, ROUGHLY) if self.contradicted else self.noise.known
 
     @property

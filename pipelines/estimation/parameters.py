@@ -216,7 +216,7 @@ def quantities(
 
 
 def parameter(key: int, specs: Sequence[ParameterSpec], config: Config) -> Parameter | None:
-    """One variable of several specs; None if all are fixed, so that the graph can do without."""
+    """Variable of several specs; None if all are fixed, so that the graph can do without."""
     all_of_them = tuple(q for spec in specs for q in quantities(spec, config))
     return Parameter(key, all_of_them) if any(q.prior_sigma for q in all_of_them) else None
 
@@ -259,7 +259,7 @@ def fixed_without_force(spec: ParameterSpec, config: Config, topic: str) -> Find
 
 
 def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: float = 1.0) -> float | None:
-    """How far the recording takes an assumption from its prior, in sigmas of what it could; None if it says nothing.
+    """Shift of an assumption from its prior by the recording, in sigmas of that shift; None if it is not determined.
 
     With s = sigma / inflation, p the prior's sigma and V = sigma^2 - (s^2 / p)^2 what comes from elsewhere than from
     the prior, the estimate's change from the prior has the variance (p - s^2 / p)^2 + V; for white noise p^2 - s^2.

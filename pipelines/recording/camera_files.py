@@ -49,7 +49,7 @@ def read_cameras(path: Path, data: Path) -> CameraFile:
 
 
 def camera(content: Mapping[str, Any], frame_id: str, t_ns: int = 0) -> series.CameraInfo:
-    """One camera of such a file, or of a sensor.yaml in EuRoC's form.
+    """Camera of a file of several, or of a sensor.yaml in EuRoC's form.
 
     Raises AttributeError, KeyError, TypeError or ValueError where something is missing or of another kind.
     """

@@ -319,7 +319,7 @@ def _of_result(path: Path, text: str) -> SavedCalibration:
 
 
 def as_saved(given: str | Path | Calibration | SavedCalibration, config: Config | None = None) -> SavedCalibration:
-    """What calibration.yaml says of a calibration; of a file with the config that its formulas are for.
+    """A calibration as calibration.yaml has it; of a file with the config that its formulas are for.
 
     Raises:
         InputError: the file cannot be used.

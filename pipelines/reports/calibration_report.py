@@ -81,7 +81,7 @@ def report_html(calibration: Calibration) -> str:
 
 
 def short_report(calibration: Calibration) -> Report:
-    """What a terminal and a notebook show of a calibration: verdict, uses and results."""
+    """Short report for terminal and notebook: verdict, uses and results."""
     return _report(calibration, ())
 
 

@@ -72,7 +72,7 @@ def _at_rest(sensor: SensorNoise) -> str:
 
 
 def remarks(sensor: SensorNoise) -> list[str]:
-    """What a reader has to know beside the coefficients, one sentence each."""
+    """Sentences that a reader needs beside the coefficients."""
     out = []
     for name, words in _COEFFICIENTS.items():
         silent = [c for axis in sensor.axes if (c := _of(sensor, axis, name)).value is None]

@@ -52,7 +52,7 @@ def common_plots(calibration: Calibration) -> list[Plot]:
 
 
 def components(names: Sequence[str] | None, residuals: Residuals) -> list[str]:
-    """What each number of residuals is; where the method does not say, three are x, y, z, eight a tag's corners."""
+    """Names of a residual's numbers; where the method has none, three are x, y, z, eight a tag's corners."""
     width = residuals.whitened.shape[1]
     if names is not None:
         return list(names[:width])

@@ -156,7 +156,7 @@ class Calibration(SensorValues):
 
     @cached_property
     def uses(self) -> tuple[UseBands, ...]:
-        """What the calibration is used for, with the error before and after it and the 95 % band; none unsolved."""
+        """Uses of the calibration, with the error before and after it and the 95 % band; none without a solution."""
         from alidade.pipelines.reports.uses import uses_of
 
         return () if has_no_solution(self.findings) else uses_of(self)
@@ -343,7 +343,7 @@ class Calibration(SensorValues):
 
     @property
     def formulas(self) -> Sequence[Formula]:
-        """How it is applied, assumptions that the recording does not determine left out."""
+        """Formulas that apply the calibration, without assumptions that the recording does not determine."""
         return self.method.report.formulas(self.applied, self.config)
 
     @property

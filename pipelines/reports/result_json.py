@@ -245,7 +245,7 @@ class ChangeResult(_Record):
 
 
 class RateResult(_Record):
-    """How far numbers of a kind walk in the root of a day, SI; `upper` is the 95 % bound, null: there is none."""
+    """Walk of numbers of a kind in the root of a day, SI; `upper` is the 95 % bound, null: there is none."""
 
     rate: float  # SI in the root of a day
     upper: _Finite  # 95 % bound; null: there is none

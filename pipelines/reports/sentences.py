@@ -146,7 +146,7 @@ def short_verdict(
 
 
 def notes(findings: Sequence[Finding], quantities: Quantities) -> tuple[str, ...]:
-    """What a reader must know beside the headline, sentences without full stops."""
+    """Sentences that a reader needs beside the headline, without full stops."""
     found = _sentences([finding for finding in findings if finding.severity == Severity.NOTE], quantities)
     return tuple(text.removesuffix(".") for text in found)
 
@@ -445,7 +445,7 @@ class Limit:
 
 
 def limits(budget: Mapping[str, Mapping[str, float]], quantities: Sequence[Quantity]) -> list[Limit]:
-    """What limits each parameter of a budget (parameter -> source -> share), given the quantities of its problem."""
+    """Largest error sources of each parameter of a budget, given the quantities of its problem."""
     assumed = {q.name for q in quantities if q.assumed}
     return [_limit(name, shares, assumed) for name, shares in budget.items()]
 

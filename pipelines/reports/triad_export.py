@@ -56,7 +56,7 @@ def _triad(saved: SavedCalibration, name: str) -> tuple[Array, Array]:
 
 
 def zero_offset(K: Array, b: Array) -> Array:
-    """What the sensor says when the nominal is zero: nominal = K (raw - offset)."""
+    """Offset: the reading where the nominal is zero, nominal = K (raw - offset)."""
     return np.asarray(-np.linalg.solve(K, b))
 
 

@@ -85,7 +85,7 @@ def shipped(folder: Path | None = None) -> dict[str, Path]:
 
 
 def summary(path: Path) -> str:
-    """What a scenario file says of itself: the comment that it begins with, on one line."""
+    """Summary of a scenario file: the comment that it begins with, on one line."""
     lines = path.read_text(encoding="utf-8").splitlines()
     return " ".join(line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), lines))
 

@@ -76,7 +76,7 @@ def exposures(stamps: Array, offset: float, skew: float) -> Array:
 
 
 class Warming(ScenarioPart):
-    """What a sensor's temperature does: it goes from one to another, slower and slower."""
+    """Warm-up of a sensor: its temperature moves from one value to another, slower and slower."""
 
     start_c: Annotated[float, Field(ge=-100.0, le=200.0)] = 20.0
     rise_k: Annotated[float, Field(ge=-100.0, le=100.0)] = 10.0  # after a long time
@@ -143,7 +143,7 @@ def recording_config(method: str, scenario: Any, noise: Mapping[str, float], **m
 
 
 def read_by(rate: Array, sensor: str, values: Mapping[str, float], force: Array | None = None) -> Array:
-    """What a gyro of known errors reads, without bias and noise: (I + S) w + G f, (n, 3) rad/s."""
+    """Reading (n, 3), rad/s, of a gyro of known errors, without bias and noise: (I + S) w + G f."""
     x, y, z = (values[f"{sensor}_scale_{axis}"] for axis in "xyz")
     xy, xz, yz = (values[f"{sensor}_skew_{axes}"] for axes in ("xy", "xz", "yz"))
     read = rate + rate @ np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])

@@ -144,7 +144,7 @@ def _is_finite(factor: Factor, values: gtsam.Values) -> bool:
 
 @dataclass(eq=False)
 class RunState:
-    """What an incremental run knows, beside the steps since its past was marginalised out.
+    """State of an incremental run, beside the steps since its past was marginalised out.
 
     Attributes:
         window: how long states are kept, s or Keyframes; None keeps all.

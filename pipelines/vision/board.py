@@ -28,7 +28,7 @@ MISFIT = "tags do not fit the layout"
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What one picture shows of a body: its stamp, all tag ids in it, the pose, and why that cannot be used, if so."""
+    """View of a body in one picture: stamp, all tag ids in it, the pose, and why that cannot be used, if so."""
 
     t_ns: int
     ids: NDArray[np.int64]

@@ -62,7 +62,7 @@ def refine(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: 
 
 
 def reprojection_errors(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> Array:
-    """Where corners (..., 3) of the body are projected less where they are seen, (..., 2) px."""
+    """Reprojection errors (..., 2), px, of corners (..., 3) of the body: projected less seen."""
     return np.asarray(camera.project(position + so3.rotate(cRb, corners)) - pixels)
 
 
@@ -211,7 +211,7 @@ class TagBody:
 
 @dataclass(frozen=True, eq=False)
 class BodyPose:
-    """Where a body stands in the camera's optical frame c: a point of b is at `cRb * p + position`.
+    """Pose of a body in the camera's optical frame c: a point of b is at `cRb * p + position`.
 
     Attributes:
         cRb: (4,) attitude.

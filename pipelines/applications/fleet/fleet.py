@@ -168,7 +168,7 @@ def calibrate_fleet(
 def calibrate_recording(
     recording: Recording, settings: Settings, unit: str | None = None, known: tuple[str, str | None] | None = None
 ) -> RecordingResult | None:
-    """On the worker: the result of one recording, None when it was made of the very same.
+    """Calibrate one recording on the worker; None when its result was made of the very same.
 
     A result without `sha256` is of a file that could not be read at all; the next run tries again.
 

@@ -96,7 +96,7 @@ def coverage(normalised: Array) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Spread:
-    """Where a parameter lies in the fleet: `centre`, and the spread `tau` that sigmas do not explain."""
+    """Distribution of a parameter in the fleet: `centre`, and the spread `tau` that sigmas do not explain."""
 
     centre: float
     tau: float
@@ -172,7 +172,7 @@ class Component:
 
 
 def components(values: Array, sigmas: Array, units: NDArray[np.intp]) -> tuple[Component | None, Component | None]:
-    """From unit to unit, and from recording to recording of one unit: x = centre + unit + recording + noise.
+    """Variance components from unit to unit and from recording to recording: x = centre + unit + recording + noise.
 
     The second is estimated from differences to the mean of the unit, the first from these means, each by its
     restricted likelihood (Searle, Casella, McCulloch, Variance Components, 1992, 3.7 and 6.6).

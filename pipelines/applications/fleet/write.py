@@ -37,7 +37,7 @@ class FleetResult:
 
     @property
     def summary(self) -> list[str]:
-        """How many recordings with what verdicts, and which units need attention."""
+        """Summary: how many recordings with what verdicts, and which units need attention."""
         units = units_of_interest(self.outcome.results, self.populations, self.histories)
         return [*self.outcome.summary, sentence(units)]
 

@@ -85,7 +85,7 @@ class View:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What to collect and then what to do, in the order of `motion`, each sentence once."""
+        """Sentences about what to collect and then what to do, in the order of `motion`, each once."""
         wanted = tuple(f"{c.what}: {c.wanted}" for c in self.checklist if c.wanted)
         advice = tuple(finding.evidence["advice"] for finding in self._directions)
         return tuple(dict.fromkeys((*wanted, *advice)))
@@ -107,7 +107,7 @@ class View:
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        """What is wrong with the recording rather than missing in it, sentences."""
+        """Sentences about what is wrong with the recording rather than missing in it."""
         if self.change is not None:
             return (self.headline,)
         return (self._verdict,) if self.status == "inconsistent" else ()

@@ -143,7 +143,7 @@ class Sensor:
 
     @property
     def scales(self) -> Array:
-        """What the variable's numbers are multiplied by when they are reported."""
+        """Factors on the variable's numbers when they are reported."""
         gains = len(self.start) - 3
         return np.repeat([self.strength / self.radius, self.strength], [gains, 3])
 

@@ -41,7 +41,7 @@ ACCEL_SQUARE = accel_square(3e-5)
 
 @dataclass(frozen=True, eq=False)
 class TumbleData:
-    """What was measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+    """Measurements of a tumble session. Times are s from epoch_ns (Unix ns), strictly increasing.
 
     mag_t (N,), mag (N, 3): T, or counts; accel_t (M,), accel (M, 3): m/s^2, or counts; None for a sensor that there is
     not, but one there is. gyro_t (L,), gyro (L, 3): rad/s, where there is one beside a magnetometer. mag_density,

@@ -46,7 +46,7 @@ class TumbledGyro(ScenarioPart):
 
 
 class TumbleScenario(ScenarioPart):
-    """What the `tumble` simulator is asked for; every key has a default, `null` leaves a sensor out."""
+    """Settings of the `tumble` simulator; every key has a default, `null` leaves a sensor out."""
 
     attitudes: Annotated[int, Field(ge=2)] = 30  # random ones, gone through one after the other
     turn_rad_s: Positive = 1.5  # mean rate from one to the next

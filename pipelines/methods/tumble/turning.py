@@ -71,7 +71,7 @@ _GAIN = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a sensor measured: time (n,) s, direction (n, 3) in b, and, of all its samples, `whole` (m, 3) in b, SI.
+    """Directions that a sensor measured: time (n,) s, direction (n, 3) in b, and all samples, `whole` (m, 3) in b, SI.
 
     swung: whether it is used while it moves.
     """

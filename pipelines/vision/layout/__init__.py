@@ -32,7 +32,7 @@ _MOSTLY_FALSE = 0.5
 
 @dataclass(frozen=True)
 class TagSeen:
-    """How a tag was seen: in how many pictures used, root mean square error px per axis, sights left out as false.
+    """Statistics of a tag: in how many pictures used, root mean square error px per axis, sights left out as false.
 
     `inflation` is by how much its errors from picture to picture exceed what independent corners would give.
     """
