@@ -20,6 +20,7 @@ _HOMES = {
     "tags": ("TagAttitudeFactor",),
     "triad": (
         "AccelFactor",
+        "FieldPriorFactor",
         "GyroStaticFactor",
         "MagFactor",
         "TriadPriorFactor",

@@ -74,6 +74,40 @@ class TriadPriorFactor(Model):
 
 
 @dataclass(frozen=True)
+class FieldPriorFactor(Model):
+    """What is known of a field beforehand: its strength, and its direction. Block: field (3), T in n.
+
+    The strength is that of the field itself, not of its component along the direction that is known: a field that is
+    1e-6 T off across it would else be read as 10 nT stronger.
+
+    Attributes:
+        time: (n,) s.
+        mean: (n, 3) T.
+        along, across: (n,) sigmas of the strength and of each component across the mean, T.
+    """
+
+    time: Array
+    mean: Array
+    along: Array
+    across: Array
+    shapes: ClassVar = {"mean": (3,), "along": (), "across": ()}
+    rows: int = 3
+    blocks = (3,)
+
+    def __call__(self, field: Array) -> Residuals:
+        """Residual a (|F| - |mean|) / along + (F - a a'F) / across, a the direction of the mean, (n, 3)."""
+        strength, known = (np.linalg.norm(each, axis=1, keepdims=True) for each in (field, self.mean))
+        a, along, across = self.mean / known, self.along[:, None], self.across[:, None]
+        residual = a * (strength - known) / along + (field - a * (a * field).sum(axis=1, keepdims=True)) / across
+
+        def jacobians() -> tuple[Array, ...]:
+            by_strength = a[:, :, None] * (field / strength / along)[:, None]
+            return (by_strength + (np.eye(3) - a[:, :, None] * a[:, None]) / across[..., None],)
+
+        return residual, jacobians
+
+
+@dataclass(frozen=True)
 class AccelFactor(Model):
     """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c + s dT, raw = u + square u^2 + cube u^3, by axis.
 

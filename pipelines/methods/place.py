@@ -43,16 +43,14 @@ def known_strength(config: Config, model: Array | None) -> tuple[float, float] |
     return None if model is None else (float(np.linalg.norm(model)), stated(config, FIELD))
 
 
-def known_field(config: Config, model: Array) -> tuple[Array, Array]:
-    """Prior mean (3,) and square root (3, 3) of the covariance of the field, T, from its model (3,).
+def known_field(config: Config, model: Array) -> tuple[Array, float, float]:
+    """Prior mean (3,) of the field and sigmas of its strength and of each component across, T, from its model (3,).
 
     Its direction is the model's; a strength that was measured replaces the model's.
     """
     strength = known_strength(config, model)
     assert strength is not None
-    along = model / np.linalg.norm(model)
-    across = stated(config, FIELD)
-    return strength[0] * along, across * np.eye(3) + (strength[1] - across) * np.outer(along, along)
+    return strength[0] * model / np.linalg.norm(model), strength[1], stated(config, FIELD)
 
 
 def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float | None, float | None, float]:

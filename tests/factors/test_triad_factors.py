@@ -12,7 +12,16 @@ from alidade.factors.earth import earth_rate
 from alidade.factors.model import Array, Block, Model, dimension, retract
 from alidade.factors.tags import TagAttitudeFactor
 from alidade.factors.testing import assert_jacobians
-from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor, TriadPriorFactor, calibration, parts, triad
+from alidade.factors.triad import (
+    AccelFactor,
+    FieldPriorFactor,
+    GyroStaticFactor,
+    MagFactor,
+    TriadPriorFactor,
+    calibration,
+    parts,
+    triad,
+)
 from alidade.factors.turns import GyroRotationFactor
 from tests.support.numerics import assert_rows_are_independent
 
@@ -259,6 +268,22 @@ def test_prior_jacobians() -> None:
     sigma = rng.uniform(0.1, 2.0, size=(N, 12))
     model = TriadPriorFactor(TIMES, rng.normal(size=(N, 12)), sigma)
     assert_jacobians(model, [_triads(rng, 0.2)])
+
+
+def test_field_prior_jacobians() -> None:
+    rng = _rng(11)
+    along, across = rng.uniform(0.1, 2.0, size=(2, N))
+    assert_jacobians(FieldPriorFactor(TIMES, rng.normal(size=(N, 3)), along, across), [rng.normal(size=(N, 3))])
+
+
+def test_a_field_prior_is_of_the_fields_own_strength() -> None:
+    """A field turned off its model, as strong as it was measured, misses the model's direction alone."""
+    mean, angle = np.array([[0.0, 3e-5, -4e-5]]), 0.1
+    field = so3.rotate(so3.exp([angle, 0.0, 0.0]), mean)
+    residual, _ = FieldPriorFactor(np.zeros(1), mean, np.array([1e-8]), np.array([5e-6]))(field)
+    assert np.linalg.norm(residual) == pytest.approx(5e-5 * np.sin(angle) / 5e-6)
+    residual, _ = FieldPriorFactor(np.zeros(1), mean, np.array([1e-8]), np.array([5e-6]))(mean * (1.0 + 2e-8 / 5e-5))
+    assert np.linalg.norm(residual) == pytest.approx(2.0)
 
 
 def test_an_unknown_quantity_has_no_prior() -> None:

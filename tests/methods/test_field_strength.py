@@ -70,6 +70,16 @@ def test_sigma_of_the_scale_is_true(name: str, measured: float | None) -> None:
     _assert_sigma_of_scale(name, measured, range(8 if name == "tumble" else 4))
 
 
+def test_a_strength_measured_where_a_building_turns_the_field() -> None:
+    """5e-6 T across the model are 230 nT of strength beyond its component along it: else K is 8 sigmas off."""
+    indoors = Config.model_validate({"sensors": {"field": {"model_error": 5e-6}}})
+    seen: dict[str, Any] = {"camera": {"rate_hz": 5.0}, "reference": {}}
+    for seed in (19, 32):
+        c, simulated = _calibrated("cube", seed, indoors, **_field("cube", 5e-6, 1e-7), **seen)
+        assert c.status == "calibrated"
+        assert abs(_z_of_scale(c, dict(simulated.truth))) < 3.5
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
 @pytest.mark.parametrize("measured", [None, 1e-7])

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.triad import TriadPriorFactor, calibration, triad
+from alidade.factors.triad import FieldPriorFactor, TriadPriorFactor, calibration, triad
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
     ParameterSpec,
@@ -23,7 +23,7 @@ from alidade.pipelines.estimation.parameters import (
     scalar,
     stated,
 )
-from alidade.pipelines.estimation.priors import gaussian_about, prior_sigmas, rotation_prior, vector_prior
+from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
 from alidade.pipelines.methods.place import FIELD, known_field
@@ -130,7 +130,7 @@ class Parameters:
         places: corrections of the tags' positions; none without a camera.
         said: correction of what the reference says, tilt about East and North and heading; None without a camera.
         field: the earth's field in n about the model, None without a magnetometer.
-        field_prior: its mean (3,) and the square root (3, 3) of its covariance, T.
+        field_prior: its mean (3,), T, and its factor.
         sensitivity: G of the gyro, None where it does not feel force.
         curvature: square and cube terms of the accelerometer, None where it has none.
         slopes: sensor -> what its offset does with its temperature, where that is known.
@@ -144,7 +144,7 @@ class Parameters:
     places: tuple[Parameter, ...]
     said: Parameter | None
     field: Parameter | None
-    field_prior: tuple[Array, Array] | None
+    field_prior: tuple[Array, Factor] | None
     sensitivity: Parameter | None
     curvature: Parameter | None
     slopes: Mapping[str, Parameter]
@@ -191,10 +191,7 @@ def first_priors(parameters: Parameters) -> list[Factor]:
         factors.append(Factor.process_of("prior", prior.on(own.key)))
     factors += [rotation_prior(p) for p in parameters.rotations]
     factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in parameters.zeros]
-    if parameters.field is not None and parameters.field_prior is not None:
-        key, (mean, root) = parameters.field.key, parameters.field_prior
-        factors.append(gaussian_about(key, mean, np.asarray(np.linalg.inv(root))))
-    return factors
+    return factors if parameters.field_prior is None else [*factors, parameters.field_prior[1]]
 
 
 def cube_parameters(
@@ -273,20 +270,22 @@ def cube_parameters(
     )
 
 
-def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Array]]:
-    """The field, and its prior mean (3,) and the square root (3, 3) of its covariance; the config's priors win."""
-    mean, root = known_field(config, model)
+def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Factor]]:
+    """The field, its prior mean (3,) and the factor of that; the config's priors win."""
+    mean, along, across = known_field(config, model)
     plain = tuple(
         replace(q, prior_mean=float(m), nuisance=True)
         for q, m in zip(quantities(_given(FIELD, config), config), mean, strict=True)
     )
     if config.priors.keys().isdisjoint(FIELD.names):
-        plain = tuple(
-            replace(q, prior_sigma=float(s)) for q, s in zip(plain, np.linalg.norm(root, axis=1), strict=True)
-        )
+        squares = (mean / np.linalg.norm(mean)) ** 2
+        sigmas = np.sqrt(along**2 * squares + across**2 * (1.0 - squares))
+        plain = tuple(replace(q, prior_sigma=float(s)) for q, s in zip(plain, sigmas, strict=True))
+        known = FieldPriorFactor(np.zeros(1), mean[None], np.array([along]), np.array([across]))
+        prior = Factor.process_of("prior", known.on(FIELD_KEY))
     else:
-        root = np.diag(prior_sigmas(Parameter(FIELD_KEY, plain)))
-    return Parameter(FIELD_KEY, with_factor("mag", plain, config, _GAIN[1])), (mean, root)
+        prior = vector_prior(Parameter(FIELD_KEY, plain), mean)
+    return Parameter(FIELD_KEY, with_factor("mag", plain, config, _GAIN[1])), (mean, prior)
 
 
 def _given(spec: ParameterSpec, config: Config) -> ParameterSpec:
