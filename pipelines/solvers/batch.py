@@ -56,7 +56,7 @@ from alidade.pipelines.solvers.posterior import (
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated, without_onsets
 from alidade.pipelines.solvers.step_test import largest_steps
-from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
+from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution, unfinished
 
 # Number of the most influential measurements that are reported.
 INFLUENTIAL = 20
@@ -166,7 +166,8 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
             if levels is None:
                 solution, start = estimate_noise(rest, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
-    return Solved(compiled, solution, start, constrained_solution(compiled, solution.at_inliers()), second)
+    posterior = unfinished if deadline.passed() and not solution.converged else constrained_solution
+    return Solved(compiled, solution, start, posterior(compiled, solution.at_inliers()), second)
 
 
 def solve_batch(

@@ -328,10 +328,17 @@ def _contradicts(before: Posterior, after: Posterior) -> bool:
 
 def _unknown(compiled: Compiled, minimum: Point) -> Posterior:
     """The posterior where no constrained minimum is found: all that is calibrated has its prior."""
-    reported = Reported.of(compiled, minimum.values)
-    R = reported.root(minimum.factorization.root).R
-    fixed = WeakDirections.given(R, np.eye(len(R))[:, reported.calibrated], reported.prior, reported.calibrated)
-    return replace(_constrained(compiled, minimum, fixed), converged=False)
+    return replace(_constrained(compiled, minimum, unfinished(compiled, minimum).directions), converged=False)
+
+
+def unfinished(compiled: Compiled, point: Point) -> Posterior:
+    """The posterior about values that are no minimum: all that is calibrated has its prior's covariance there."""
+    reported = Reported.of(compiled, point.values)
+    R = reported.root(point.factorization.root).R
+    weak = np.eye(len(R))[:, reported.calibrated]
+    return Posterior(
+        point, reported, WeakDirections.given(R, weak, reported.prior, reported.calibrated), converged=False
+    )
 
 
 def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
