@@ -17,7 +17,7 @@ from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_o
 from alidade.pipelines.display.sphere_map import described
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import ROUGHLY, Noise
-from alidade.pipelines.estimation.parameters import SENSORS, ParameterSpec, parameter
+from alidade.pipelines.estimation.parameters import SENSOR_NAMES, ParameterSpec, parameter
 from alidade.pipelines.estimation.parameters import stated as sheet
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
@@ -276,7 +276,7 @@ def _maybe_a_unit(sensor: Sensor) -> str:
     if not unit or "counts" in unit:
         return ""
     return (
-        f"{SENSORS[sensor.name].capitalize()}: a norm of {size:.3g} is none in {SI[sensor.name]}, so it is read as "
+        f"{SENSOR_NAMES[sensor.name].capitalize()}: a norm of {size:.3g} is none in {SI[sensor.name]}, so it is read as "
         f"counts; if it is in {unit}, state `units: {{{kind}: {unit}}}` beside its `columns`, or convert it."
     )
 
