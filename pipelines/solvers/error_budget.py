@@ -151,7 +151,7 @@ def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[s
     layout, reported = influence.at.engine.layout, influence.reported
     rows, _ = group.rows(influence.at.values, layout.sizes[4] + 1)
     A = np.pad(rows[..., :-1].reshape(-1, layout.sizes[4]), ((0, 0), (layout.sizes[3], 0)))
-    about = np.abs(A @ np.linalg.pinv(reported.jacobian)[:, reported.free] * reported.scale)
+    about = np.abs(A @ np.linalg.pinv(reported.jacobian[reported.free] / reported.scale[:, None]))
     largest = about > ROUNDING * about.max(axis=1, keepdims=True, initial=0.0)
     about_each = [[influence.names[i] for i in np.flatnonzero(row)] for row in largest]
     labels = [f"prior of {', '.join(n)}" if 0 < len(n) <= _MOST_NAMED else group.family for n in about_each]

@@ -276,8 +276,8 @@ def _maybe_a_unit(sensor: Sensor) -> str:
     if not unit or "counts" in unit:
         return ""
     return (
-        f"{SENSOR_NAMES[sensor.name].capitalize()}: a norm of {size:.3g} is none in {SI[sensor.name]}, so it is read as "
-        f"counts; if it is in {unit}, state `units: {{{kind}: {unit}}}` beside its `columns`, or convert it."
+        f"{SENSOR_NAMES[sensor.name].capitalize()}: a norm of {size:.3g} is none in {SI[sensor.name]}, so it is read "
+        f"as counts; if it is in {unit}, state `units: {{{kind}: {unit}}}` beside its `columns`, or convert it."
     )
 
 
