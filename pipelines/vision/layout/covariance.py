@@ -5,17 +5,17 @@ and the more so in one in which nothing has moved. The layout errs by L r, L the
 with autocovariance g of r its covariance is the sum over tags, views and lags of L' g(lag) L, as for noise coloured in
 time (alidade.pipelines.solvers.error_budget). g is that of the errors left, all tags together, up to the lag where it
 has died out; tags that fit worse than the others have a variance of their own. What stays the same in all pictures of a
-tag is not in it:
-
-Priors of additional parameters are weighed against such errors, not against independent ones: with the information A
-of independent errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has
-the information A S^-1 A + P. The adjustment, whose information is A + P, takes pictures for better than they are;
-`correction` is the step from there.
+tag is not in it.
 
 A printed tag on a cube is not flat, nor is it quite square: in all its pictures its corners err alike, which neither
 their noise nor its correlation from picture to picture accounts for. What they are off by that no pose takes up has one
 sigma for all tags, as a share of their size, the most likely one. It is not adjusted but counted in the sigmas of the
 layout: adjusted, it takes up errors of another kind too, and halves of real recordings then agree less well.
+
+Priors of additional parameters are weighed against such errors, not against independent ones: with the information A
+of independent errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has
+the information A S^-1 A + P. The adjustment, whose information is A + P, takes pictures for better than they are;
+`correction` is the step from there.
 """
 
 from __future__ import annotations
