@@ -63,6 +63,8 @@ def load_config(attachment: bytes | None, override: Settings = None) -> Config:
         )
     elif override is not None:
         more = _read(read_bytes(override, MAX_YAML_BYTES), str(override))
+        if str(more.get("schema", "")).startswith("alidade."):
+            raise InputError(f"{override}: that is a result, not a config; `--prior` takes it")
     try:
         config = model().model_validate(_merge(base, more))
     except ValidationError as error:

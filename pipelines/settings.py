@@ -50,7 +50,10 @@ def _unit(wxyz: tuple[float, float, float, float]) -> tuple[float, float, float,
 
 
 def _date(value: object) -> object:
-    return datetime.date.fromisoformat(value) if isinstance(value, str) else value
+    try:
+        return datetime.date.fromisoformat(value) if isinstance(value, str) else value
+    except ValueError:
+        raise ValueError("a date year-month-day is needed, as 2026-11-20") from None
 
 
 # In whatever SI unit no figure of a sensor, a mount or a site is larger, and no sigma but 0 smaller: their squares and

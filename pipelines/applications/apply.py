@@ -106,6 +106,8 @@ def apply(
     if auto_columns:
         opened, settings = with_columns(opened, settings)
     known, path = as_saved(calibration, settings), Path(out)
+    if path.suffix.lower() not in ("", ".mcap"):
+        raise InputError(f"{path}: an MCAP file is written, whatever was read: name it {path.stem}.mcap")
     parts = [opened.container, *getattr(opened.container, "parts", ())]
     if path.exists() and any(
         file.exists() and path.samefile(file) for part in parts for file in (part.path, part.data)

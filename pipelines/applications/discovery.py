@@ -163,7 +163,7 @@ def _suggestion(
     chosen = methods.method(method)
     needed = [one for need in chosen.requirements for group in need for one in group if not isinstance(one, Setting)]
     taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
-    taken |= {part for source in config.topics.values() for part in source.parts}
+    taken |= {part for topic in chosen.topics if topic.key in config.topics for part in config.topics[topic.key].parts}
     topics: dict[str, TopicSource] = {}
     reasons: list[str] = []
     doubtful: set[str] = set()

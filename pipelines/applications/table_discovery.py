@@ -101,6 +101,8 @@ def propose_columns(recording: Recording) -> Columns | None:
     gyros = [name for name, table in columns.items() if table.gyro and not table.accel]
     accels = [name for name, table in columns.items() if table.accel and not table.gyro]
     topics = {"imu": TopicSource(gyro=gyros[0], accel=accels[0])} if len(gyros) == len(accels) == 1 else {}
+    if len(gyros) + len(accels) == 1 and "/imu" not in columns:
+        topics = {"imu": TopicSource(topic=(gyros or accels)[0])}
     reasons = tuple(reason for one in found for reason in one.reasons)
     return Columns(columns, topics, reasons, tuple(doubt for one in found for doubt in one.doubts))
 

@@ -42,10 +42,19 @@ def read_cameras(path: Path, data: Path) -> CameraFile:
         chain = {name: each for name, each in content.items() if re.fullmatch(r"cam\d+", name)}
         cameras = {f"/{name}/camera_info": camera(each, name) for name, each in (chain or {"camera": content}).items()}
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path}: no camera calibration of ROS, OpenCV, Kalibr or mrcal ({type(error).__name__}: {error})"
-        ) from error
+        why = f"no camera calibration of ROS, OpenCV, Kalibr or mrcal ({type(error).__name__}: {error})"
+        raise InputError(f"{path}: {_own(content) or why}") from error
     return CameraFile(path, cameras, data)
+
+
+def _own(content: object) -> str:
+    """What a file of alidade's own is, which is no recording; empty for others."""
+    keys = set(content) if isinstance(content, dict) else set()
+    if isinstance(content, dict) and str(content.get("schema", "")).startswith("alidade."):
+        return "that is a result, no recording; `--prior` and `--calibration` take it"
+    if keys & {"method", "topics", "columns", "noise", "priors", "require", "sensors"}:
+        return "that is a config, no recording; `--config` takes it, beside a recording"
+    return ""
 
 
 def camera(content: Mapping[str, Any], frame_id: str, t_ns: int = 0) -> series.CameraInfo:

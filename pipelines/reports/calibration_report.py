@@ -676,7 +676,7 @@ def _provenance(c: Calibration) -> tuple[Block, ...]:
     timing = ", ".join(f"{phase} {seconds:.2f}" for phase, seconds in c.timing.items())
     lines = (
         f"SHA-256 of the recording: `{c.sha256}`",
-        f"Solver: {c.estimate.solver}, {c.estimate.message}. Time, s: {timing}.",
+        f"Solver: {c.estimate.solver}, {c.estimate.message}.{f' Time, s: {timing}.' if timing else ''}",
         ", ".join(f"{package} {version}" for package, version in c.software.items()),
     )
     config = (Details("Config", (Code(c.config_text),), id="config"),) if c.config_text else ()

@@ -116,7 +116,7 @@ def short_verdict(
         first = next(f for f in findings if f.severity > Severity.NOTE)
         if first.kind in ("device_change", "recordings_disagree"):
             return sentence(first, quantities), _WALK
-        what = [" ".join(cause(f, quantities) or ()) for f in findings if f.kind in _CAUSES and f is not first][:1]
+        what = [" ".join(found) for f in findings if f is not first and (found := cause(f, quantities))][:1]
         probable = f" {what[0]}." if what and first.kind not in _CAUSES else ""
         sheets = _sheets([f for f in findings if f.severity > Severity.NOTE], quantities)
         action = f"Do not use the values before the cause is found.{probable} {sheets}"

@@ -110,6 +110,7 @@ def test_the_file_overrides_key_by_key(tmp_path: Path) -> None:
         ("cube: {tags: {a: {size: 1}}}", r"cube\.tags\.a: must be a valid integer"),
         ("cube: {camera_rotation: [1, 1, 0, 0]}", r"cube\.camera_rotation: a unit quaternion .* norm 1\.414"),
         ("date: [1]", "date: must be a valid date"),
+        ("date: 01.08.2020", "date: a date year-month-day is needed, as 2026-11-20, not '01.08.2020'"),
         ("cube: {date: tomorrow}", r"cube\.date: .*tomorrow"),
         ("method: los\nnoise: {a: [1,\npriors: 3", "unreadable YAML, line 3"),
         ("a: 1\na: 2", "unreadable YAML, line 2: .*duplicate key"),
@@ -135,6 +136,12 @@ def test_unreadable_files(tmp_path: Path) -> None:
         load_config(b"\xff\xfe")
     with pytest.raises(InputError, match=r"none\.yaml: cannot be opened"):
         load_config(None, tmp_path / "none.yaml")
+
+
+def test_a_result_given_as_the_config_is_named(tmp_path: Path) -> None:
+    (tmp_path / "calibration.yaml").write_text("schema: alidade.calibration/1\nmethod: head\n")
+    with pytest.raises(InputError, match=r"calibration\.yaml: that is a result, not a config; `--prior` takes it"):
+        load_config(None, tmp_path / "calibration.yaml")
 
 
 def test_a_wrong_key_in_the_recording_is_not_blamed_on_the_file(tmp_path: Path) -> None:

@@ -11,8 +11,10 @@ import pytest
 from alidade import export
 from alidade.factors import so3
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.applications.table_discovery import propose_columns
+from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
+from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.settings import Config
 from tests.support.command import Command
 
 RNG = np.random.default_rng(5)
@@ -144,6 +146,17 @@ def test_three_columns_without_a_header_are_what_the_file_is_named_after(tmp_pat
     unnamed = propose_columns(open_recording(write(tmp_path / "run7.csv", "", counts)))
     assert unnamed is not None
     assert not unnamed.columns
+
+
+def test_an_accelerometers_file_beside_a_compass_is_the_imu(tmp_path: Path) -> None:
+    """It had a topic of its own that no method reads, though `info` said that tumble is served."""
+    write(tmp_path / "acc.csv", "ax (g),ay (g),az (g)", DIRECTIONS)
+    write(tmp_path / "mag.csv", "mx (uT),my (uT),mz (uT)", 45.0 * DIRECTIONS)
+    recording, config = with_columns(open_recording(tmp_path), Config())
+    assert config.topics["imu"].parts == ("/imu/accel",)
+    data = method("tumble").read(recording, config)
+    assert data.accel is not None
+    assert data.mag is not None
 
 
 def test_a_time_with_too_few_digits_is_told(tmp_path: Path) -> None:

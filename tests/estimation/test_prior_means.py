@@ -47,6 +47,13 @@ def believed(problem: Problem, sigma: float = SIGMA) -> Problem:
     return with_priors(problem, [independent(names, MOUNT.tolist(), [sigma] * 3)])
 
 
+def test_a_prior_from_elsewhere_is_no_data_sheets() -> None:
+    """After --prior notes said that a number contradicts its data sheet."""
+    known = with_priors(head_problem(), [independent(["gyro_scale_x"], [0.05], [1e-3])])
+    found = {q.name: q for q in known.quantities}
+    assert (found["gyro_scale_x"].sheet, found["gyro_scale_y"].sheet) == ("", "gyro.scale")
+
+
 def test_a_prior_with_a_mean_is_a_measurement_of_it() -> None:
     """The posterior is that without the default prior, with another measurement: to first order the closed form."""
     problem = as_stated(head_problem())

@@ -103,6 +103,8 @@ def test_beside_a_recording_it_is_one_of_its_topics_and_does_not_begin_it(tmp_pa
         ("a.yaml", ROS.replace("rows: 3, cols: 3, data: [500.5,", "rows: 3, cols: 3, data: ["), "ValueError"),
         ("a.yml", "a: 1", "no camera calibration of ROS, OpenCV, Kalibr or mrcal"),
         ("a.yml", "[1, 2]", "no camera calibration"),
+        ("c.yaml", "method: cube", "that is a config, no recording; `--config` takes it"),
+        ("c.yaml", "schema: alidade.calibration/1", "that is a result, no recording"),
         ("a.yaml", "a: [", "unreadable YAML"),
     ],
 )

@@ -324,3 +324,9 @@ def test_a_recording_that_determines_next_to_nothing_is_said_to_be_too_short() -
         "the recording is too short, or has too little motion, for 5 of 5 parameters "
         "(not converged after 63 iterations)"
     )
+
+
+def test_a_cause_that_is_but_noted_adds_no_stray_full_stop() -> None:
+    note = Finding("prior_conflict", NOTE, {**CONFLICT, "inseparable": (), "effect": {}})
+    _, action = short_verdict([REJECTED, note], QUANTITIES, {MOUNT.name: "observable"}, None)
+    assert action == "Do not use the values before the cause is found."
