@@ -563,6 +563,14 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         return able[0]
     if able:
         raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
+    absent = {
+        f"topics.{key}: no topic {part}"
+        for key, source in config.topics.items()
+        for part in source.parts
+        if part not in recording.topics
+    }
+    if absent:
+        raise InputError(f"{recording.path}: {'; '.join(sorted(absent))}; {recording.there()}")
     nearest = nearest_suggestion(suggestions(recording, config))
     by_name = [
         name for name in methods.names() if not missing_for(name, recording, config.model_copy(update={"method": name}))

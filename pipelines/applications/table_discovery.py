@@ -22,7 +22,7 @@ from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import TableTopic, tables_of
-from alidade.pipelines.recording.table_values import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
+from alidade.pipelines.recording.table_values import COMPATIBLE, TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
@@ -33,6 +33,8 @@ _WORDS = {
     "accel": r"acc|^a(?=_|$)|specific.?force|^f(?=_|$)|^g.?f(?=_|$|orce)",
     "field": r"mag|^m(?=_|$)|^b(?=_|$)|^h(?=_|$)|field",
 }
+# SI units of the sensors.
+_SI = {"gyro": "rad/s", "accel": "m/s^2", "field": "T"}
 _LINEAR = re.compile(r"lin|free|user|without.?g|gravity|acceleration.?no.?g")
 _TIME = re.compile(
     r"^t_|^(t|ts|time|timestamp|stamp|sec|secs|seconds|s|ms|us|ns|millis|micros|clock|epoch|datetime|date)$"
@@ -205,6 +207,7 @@ class _Table:
         """Column and unit of the time: by its name, and that it increases; without names the first that does."""
         increasing = [i for i in range(len(self._values)) if self._increases(i)]
         called = [i for i in increasing if _TIME.search(_bare(self._form.names[i]))]
+        called += [i for i in increasing if self._stated(i) in TIME_UNITS]
         unnamed = self._form.names[0] == "column 1"
         chosen: int | None = next(iter(called), 0 if unnamed and increasing[:1] == [0] else None)
         if chosen is None:
@@ -218,11 +221,15 @@ class _Table:
             self.reasons.append(f"{self.path.name}: {name} is the time, as a date or clock time")
             return {"time": name}
         full = self._form.names[chosen]
-        stated = self._form.units[chosen] or unit_hinted(full) or _unit_word(_bare(full))
+        stated = self._stated(chosen) or _unit_word(_bare(full))
         unit = stated if stated in TIME_UNITS else _time_unit(self._values[chosen])
         by = "header" if stated == unit else "steps"
         self.reasons.append(f"{self.path.name}: {name} is the time, in {unit} by its {by}")
         return {"time": name} if unit == "s" else {"time": name, "unit": unit}
+
+    def _stated(self, i: int) -> str:
+        """The unit of a column by its header; empty where it has none."""
+        return self._form.units[i] or unit_hinted(self._form.names[i])
 
     def _increases(self, i: int) -> bool:
         if ":" in str(self._texts[i][0] if len(self._texts[i]) else ""):
@@ -253,7 +260,7 @@ class _Table:
             return out
         for name, columns in along:
             name = name or self.path.stem.lower()  # x, y, z alone: the file is named after the sensor
-            kind = _kind(name)
+            kind = _kind(name) or self._kind_of_units(columns)
             # ROS calls linear acceleration what has gravity in it.
             is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
             if is_linear or (kind == "accel" and self._lacks_gravity(columns)):
@@ -264,6 +271,12 @@ class _Table:
                 more = ", ".join(self._names(columns))
                 self.doubts.append(f"{self.path.name}: {more} are another {kind}, not used: name them instead if meant")
         return out
+
+    def _kind_of_units(self, columns: Sequence[int]) -> str:
+        """The sensor that measures in the unit that three columns state; empty: none."""
+        stated = {self._stated(i) for i in columns}
+        units = next(iter(stated)) if len(stated) == 1 else ""
+        return next((kind for kind, si in _SI.items() if units in COMPATIBLE[si]), "")
 
     def _norms(self, columns: Sequence[int]) -> Array:
         norms = np.linalg.norm(np.stack([self._values[i] for i in columns]), axis=0)
@@ -287,7 +300,7 @@ class _Table:
 
     def _unit(self, kind: str, columns: Sequence[int]) -> str:
         """The unit of three columns: by their header, else by their numbers; empty for counts."""
-        stated = {unit_of(kind, self._form.units[i] or unit_hinted(self._form.names[i])) for i in columns}
+        stated = {unit_of(kind, self._stated(i)) for i in columns}
         (unit,) = stated if len(stated) == 1 else ("",)
         if unit in UNITS:
             self.reasons.append(f"{self.path.name}: {kind} is in {unit} by its header")
@@ -347,12 +360,12 @@ def _time_unit(values: Array) -> str:
 
 
 def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
-    """Names without their axis, lower case, and columns of those that differ in x, y, z, or 0, 1, 2, alone."""
+    """Names without their axis, lower case, and columns of those that differ in x, y, z, 0, 1, 2 or p, q, r alone."""
     there = {name: i for i, name in reversed(list(enumerate(names)))}
     found: list[tuple[str, tuple[int, ...]]] = []
     for name in names:
         for at, letter in enumerate(name):
-            axes = {"x": "xyz", "X": "XYZ", "0": "012"}.get(letter)
+            axes = {"x": "xyz", "X": "XYZ", "0": "012", "p": "pqr"}.get(letter)
             if axes is None:
                 continue
             three = [f"{name[:at]}{axis}{name[at + 1 :]}" for axis in axes]

@@ -158,7 +158,7 @@ def too_fast(topic: str, t: Array, gyro: Array) -> str:
         return ""
     return (
         f"topic {topic}: rate of {rate[worst]:.4g} at {t[worst]:.6f} s, beyond {MAX_RATE_RAD_S:g} rad/s; "
-        "is the gyro in deg/s? angular_velocity has to be in rad/s"
+        "is the gyro in deg/s? It has to be in rad/s, or `units: {gyro: deg/s}` beside the columns of a table"
     )
 
 

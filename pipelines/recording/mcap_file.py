@@ -191,7 +191,7 @@ class McapFile(Container):
     def _check_magic(self, stream: BinaryIO) -> None:
         start = stream.read(len(MAGIC))
         if not start:
-            raise InputError(f"{self.path}: the file is empty; an MCAP recording is needed")
+            raise InputError(f"{self.path}: the file is empty: nothing was recorded")
         if start != MAGIC:
             raise NotARecordingError(f"{self.path}: not an MCAP file, nor any other recording that is known")
 

@@ -49,7 +49,7 @@ from alidade.pipelines.recording.messages import MessageError
 from alidade.pipelines.recording.opening import Where, open_container
 from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
 from alidade.pipelines.recording.stamps import check_clock, jitter_ns, stamp_notes
-from alidade.pipelines.recording.table_topics import TableTopic, described
+from alidade.pipelines.recording.table_topics import TableTopic, described, tables_of
 from alidade.pipelines.recording.topics import TopicSource, along, inverted, joined
 
 # Topics whose first stamp may start a session. Positions, intrinsics and static frames may be stamped long before it.
@@ -58,6 +58,7 @@ SENSOR_STAMPED_TYPES = {*messages.SENSORS} - {
 }
 # Topics, and pairs of frames, that an error message names.
 MAX_NAMED = 30
+_NO_COLUMNS = "`columns:` in the config say what a table holds, or --auto-columns concludes it"
 # Sigma of the delay with which messages are logged, s: assumed where log times replace stamps.
 UNKNOWN_LOG_DELAY_S = 0.01
 # Quantities that may be counts of a sensor.
@@ -224,9 +225,14 @@ class Recording:
             for name, t in self.recorded.items()
         ]
         more = f" and {len(named) - MAX_NAMED} more" if len(named) > MAX_NAMED else ""
+        tables = [] if named or not tables_of(self.container) else [_NO_COLUMNS]
         ros1 = " (a ROS 1 recording)" if any(t.encoding.startswith("ros1/") for t in self.recorded.values()) else ""
         return "; ".join(
-            [f"topics there{ros1}: {', '.join(named[:MAX_NAMED]) or 'none'}{more}", *self.container.notes(None)]
+            [
+                f"topics there{ros1}: {', '.join(named[:MAX_NAMED]) or 'none'}{more}",
+                *tables,
+                *self.container.notes(None),
+            ]
         )
 
     # -- topics of numbers

@@ -108,6 +108,9 @@ class TableTopic(BaseModel):
         for name, unit in self.units.items():
             if name not in TableTopic.model_fields or unit not in UNITS:
                 raise ValueError(f"units.{name}: {unit} is not one of {', '.join(UNITS)}")
+        for name in {*kinds} & {*_VECTORS}:
+            if len(set(getattr(self, name))) < len(getattr(self, name)):
+                raise ValueError(f"{name}: a column is named twice, {', '.join(getattr(self, name))}")
         if self.axes and not {*kinds} <= {*_VECTORS}:
             raise ValueError("axes go with gyro, accel or field")
         return self

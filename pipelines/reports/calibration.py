@@ -180,7 +180,10 @@ class SavedCalibration(_Record, SensorValues):
         formulas_of = method(self.method).report.formulas
         formulas = formulas_of(applied, self._config)
         if [formula.text for formula in formulas] != self.formulas:
-            raise InputError("apply: the formulas in the calibration are not those of its parameters and this config")
+            raise InputError(
+                "apply: the formulas in the calibration are not those of its parameters and this config: "
+                "`--config` has to be the config of the calibration, as for cube.raw"
+            )
         values = {name: self.parameters[name].in_formulas for name in applied}
         return Application(formulas, formulas_of(list(self.parameters), self._config), values, self.constants)
 

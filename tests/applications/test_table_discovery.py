@@ -148,6 +148,38 @@ def test_three_columns_without_a_header_are_what_the_file_is_named_after(tmp_pat
     assert not unnamed.columns
 
 
+def test_units_in_a_header_say_what_columns_are(tmp_path: Path) -> None:
+    """Names in a language that nobody listed, and a time without a word for it."""
+    header = "Zeit [ms];Beschl_x [g];Beschl_y [g];Beschl_z [g];Bfeld_x [uT];Bfeld_y [uT];Bfeld_z [uT]"
+    columns = (1e3 * SECONDS, DIRECTIONS, 45.0 * DIRECTIONS)
+    found = propose_columns(open_recording(write(tmp_path / "lab.csv", header.replace(";", ","), *columns)))
+    assert found is not None
+    assert (found.columns["/imu"].time, found.columns["/imu"].unit) == ("Zeit [ms]", "ms")
+    assert found.columns["/imu"].accel == ("Beschl_x [g]", "Beschl_y [g]", "Beschl_z [g]")
+    assert found.columns["/mag"].field == ("Bfeld_x [uT]", "Bfeld_y [uT]", "Bfeld_z [uT]")
+    header = "epoch_ms,rate_p(deg/s),rate_q(deg/s),rate_r(deg/s)"
+    found = propose_columns(open_recording(write(tmp_path / "imu.csv", header, 1.6e12 + 1e3 * SECONDS, 50.0 * RATES)))
+    assert found is not None
+    assert found.columns["/imu"].gyro == ("rate_p(deg/s)", "rate_q(deg/s)", "rate_r(deg/s)")
+    assert found.columns["/imu"].time == "epoch_ms"
+
+
+def test_a_table_without_columns_is_told_what_is_lacking(tmp_path: Path, alidade: Command) -> None:
+    path = write(tmp_path / "lab.csv", "t,mx,my,mz", SECONDS, 45.0 * DIRECTIONS)
+    (tmp_path / "twice.yaml").write_text("columns: {/mag: {time: t, field: [mx, my, my]}}")
+    (tmp_path / "absent.yaml").write_text(
+        "columns: {/helm: {time: t, gyro: [mx, my, mz]}}\ntopics: {head_imu: /helmet/imu}"
+    )
+    for config, message in (
+        ("twice.yaml", "field: a column is named twice, mx, my, my"),
+        ("absent.yaml", "topics.head_imu: no topic /helmet/imu"),
+    ):
+        run = alidade("calibrate", str(path), "--config", str(tmp_path / config), "--out", str(tmp_path / "out"))
+        assert run.code == 2
+        assert message in run.err
+    assert "--auto-columns concludes it" in open_recording(path).there()
+
+
 def test_an_accelerometers_file_beside_a_compass_is_the_imu(tmp_path: Path) -> None:
     """It had a topic of its own that no method reads, though `info` said that tumble is served."""
     write(tmp_path / "acc.csv", "ax (g),ay (g),az (g)", DIRECTIONS)
