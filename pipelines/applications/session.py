@@ -136,6 +136,8 @@ class Session:
         if auto_topics:
             recording, config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
+        for sentence in of_other_methods(chosen, config):
+            recording.remark(sentence)
         try:
             data = chosen.read(recording, config)
         except InputError as error:
@@ -547,6 +549,24 @@ def _refused(method: Method, recording: Recording, config: Config) -> str:
 def missing_for(name: str, recording: Recording, config: Config) -> tuple[str, ...]:
     """Phrases for what a recording with this config lacks for a method; none if it can serve it."""
     return lacking(methods.method(name).requirements, recording, config)
+
+
+def of_other_methods(chosen: Method, config: Config) -> Iterator[str]:
+    """Sentences about sections of the config that only other methods read.
+
+    Raises InputError for a prior or requirement of a parameter that only others have.
+    """
+    others = [methods.method(name) for name in methods.names() if name != chosen.name]
+    for where, names in (("priors", config.priors), ("require", config.require)):
+        for name in names:
+            owners = [each.name for each in others if each.spec(name) is not None]
+            if owners and chosen.spec(name) is None:
+                whose = f"a parameter of {' and '.join(owners)}, not of {chosen.name}"
+                raise InputError(f"{config.origin or 'config'}: {where}.{name}: {whose}")
+    own = chosen.config_section and chosen.config_section.key
+    for key in sorted({each.config_section.key for each in others if each.config_section} - {own}):
+        if key in config.model_fields_set:
+            yield f"`{key}:` in the config is of another method: {chosen.name} does not use it"
 
 
 def resolve_method(option: str | None, recording: Recording, config: Config) -> str:

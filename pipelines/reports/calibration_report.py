@@ -65,6 +65,8 @@ _TONES: dict[str, Tone] = {"calibrated": "good", "weak": "warn", "unobservable":
 _CALL = "found = calibration.apply({})  # by name: everything that the formulas give"
 # Badges: inflation of sigmas, share of a family that is rejected, noise used over stated and its inverse.
 _NOTABLE_INFLATION, _NOTABLE_REJECTION, _NOTABLE_NOISE = 1.1, 0.1, 2.0
+# Who stated a noise, in a badge.
+_STATED = {"default": "the default"}
 # Ratio from which on two bounds are said to differ.
 _GAIN = 1.2
 # Parameters whose error budget is shown: those nearest to their requirement.
@@ -178,7 +180,7 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
                 Badge(f"{100.0 * share:.0f} % of {family} rejected", "warn", "measurements that fit no solution")
             )
     found += [
-        Badge(f"{n.name} {n.used / n.stated:.2g} × stated", "warn", f"stated by {n.source}")
+        Badge(f"{n.name} {n.used / n.stated:.2g} × {_STATED.get(n.source, 'stated')}", "warn", f"noise, by {n.source}")
         for n in c.noises
         if n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE
     ]
@@ -189,7 +191,11 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
     if c.fit is not None:
         fits = c.fit.low <= c.fit.value <= c.fit.high
         found.append(
-            Badge("fit as expected" if fits else "misfit", "good" if fits else "warn", "99.9 % interval of chi-square")
+            Badge(
+                "fit as expected" if fits else f"misfit: {_misfit(c.fit)}",
+                "good" if fits else "warn",
+                "99.9 % interval of chi-square",
+            )
         )
     if c.stability is not None:
         found.append(_stability_badge(c.stability.changed, c.findings))
@@ -197,6 +203,11 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
     if errors:
         found.append(Badge(f"simulated: largest error {max(errors):.1f} σ of {len(errors)}", "fixed"))
     return tuple(found)
+
+
+def _misfit(fit: Fit) -> str:
+    """By what residuals differ from the noise used."""
+    return f"residuals {fit.noise_factor:.2g} × the noise"
 
 
 def _stability_badge(changed: bool, findings: Sequence[Finding]) -> Badge:

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from alidade.pipelines.applications.session import of_other_methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.gaussian_prior import independent
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.recording import CubeConfig, field_date
 from alidade.pipelines.methods.head.recording import HEAD_IMU, HeadConfig
 from alidade.pipelines.methods.los.recording import GIMBAL
@@ -136,6 +138,14 @@ def test_unreadable_files(tmp_path: Path) -> None:
         load_config(b"\xff\xfe")
     with pytest.raises(InputError, match=r"none\.yaml: cannot be opened"):
         load_config(None, tmp_path / "none.yaml")
+
+
+def test_what_is_of_another_method_is_named() -> None:
+    head = method("head")
+    config = load_config(b"cube: {raw: {accel: {scale: 0.1}}}\nhead: {}\nrequire: {gyro_bias_x: 0.1}")
+    assert list(of_other_methods(head, config)) == ["`cube:` in the config is of another method: head does not use it"]
+    with pytest.raises(InputError, match=r"require.accel_b1: a parameter of cube and tumble, not of head"):
+        list(of_other_methods(head, load_config(b"require: {accel_b1: 0.1}")))
 
 
 def test_a_result_given_as_the_config_is_named(tmp_path: Path) -> None:

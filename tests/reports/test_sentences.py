@@ -305,6 +305,17 @@ def test_nothing_is_stable_where_a_jump_is_found() -> None:
     assert "stable" not in said[1]
 
 
+def test_badges_say_what_they_compare() -> None:
+    """A noise that nobody stated read "× stated", and "misfit" alone what nobody knew."""
+    level = Level(Noise("gyro_density", 1e-4, "default", 1.0, ("gyro",)), 3.0)
+    poor = ChiSquare(2352.0, 588.0, {"vision": (2352.0, 588.0)})
+    summary = calibration_report(make_calibration(chi_square=poor, levels=(level,))).summary
+    assert summary is not None
+    said = [badge.text for badge in summary.badges]
+    assert "misfit: residuals 2 × the noise" in said
+    assert "gyro_density 3 × the default" in said
+
+
 def test_without_a_solution_nothing_is_said_to_be_good() -> None:
     """Tables with ✓, "fit as expected" and gains once stood under "No solution"."""
     made = make_calibration(converged=False, message="not converged after 63 iterations")
