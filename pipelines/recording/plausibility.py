@@ -42,6 +42,8 @@ _HELD, _MIN_HELD = 0.4, 100
 # A dead band has at least so many samples at its value, and so many times those at both values next to it: without one
 # noise of half a step makes it twice them.
 _LEAST_WITHIN, _ALONE = 20, 10.0
+# Its half width is more than so many of the device's steps: those between neighbouring values where readings are dense.
+_FEWEST_STEPS, _DENSE = 2.0, 0.1
 # Readings pass through a dead band in less than this, s, as fast as so many samples before and after.
 _PASSING_S, _ASIDE = 0.25, 5
 
@@ -193,7 +195,11 @@ def dead_band(t: Array, values: Array) -> tuple[float, Array]:
     found = [value for column in values.T if (value := _one_value(column)) is not None]
     side = np.sign(values - np.median(found)) if found else np.zeros_like(values)
     passed = np.concatenate([_passed(t, *columns) for columns in zip(values.T, side.T, strict=True)])
-    return 0.5 * float(passed.mean()) if len(passed) else 0.0, side
+    half_width = 0.5 * float(passed.mean()) if len(passed) else 0.0
+    # Held readings are not passed through, and those in coarse steps within half a step.
+    if not found or half_width <= _FEWEST_STEPS * np.quantile(np.diff(np.unique(values)), _DENSE):
+        return 0.0, np.zeros_like(values)
+    return half_width, side
 
 
 def _one_value(values: Array) -> float | None:

@@ -30,7 +30,7 @@ from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, NO_RATE, TumbleData
 from alidade.pipelines.methods.tumble.ring import ring
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
-from alidade.pipelines.recording.plausibility import SI, likely_unit
+from alidade.pipelines.recording.plausibility import SI, dead_band, likely_unit
 from alidade.pipelines.settings import Config
 
 # Plausible norms of readings with their offset, SI; others are counts.
@@ -79,6 +79,10 @@ _UPRIGHT = (
 _NOT_AS_FIELD = (
     "The gyro is not used: it does not turn as the field does; are its axes and clock right, and is the field the same "
     "everywhere the device was?"
+)
+_DEAD_BAND = (
+    "The gyro has a dead band: at small rates it reads one value. Its bias and scale may be off by more than their "
+    "sigmas; switch the dead band off in the device and record again."
 )
 _NEVER_TOGETHER = "The magnetometer has no reading during a rest: nothing ties its axes to the accelerometer's."
 _NEGATIVE_DIP = (
@@ -318,15 +322,19 @@ def _about_one_axis(mag: Sensor) -> list[str]:
 
 
 def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, list[str]]:
-    """The magnetometer in the gyro's axes, and why the gyro is not used though it is there."""
+    """The magnetometer in the gyro's axes, and why the gyro is not used though it is there, or what it assumes."""
     if any(reason.endswith(NO_RATE) for reason in data.dropped):
         return None, ["The gyro is not used: it reads more than rad/s can be; is it in deg/s, or in counts?"]
-    if data.gyro is None or data.mag is None:
+    if data.gyro is None or data.gyro_t is None or data.mag is None:
         return None, []
     found = field_guess(data, sensors[-1].time, sensors[-1].raw)
     if found is None:
         return None, [_NOT_AS_FIELD]
-    return found, [_STRAIGHT] if found.assumed and ring(sensors[-1].raw) is not None else []
+    notes = {
+        _STRAIGHT: found.assumed and ring(sensors[-1].raw) is not None,
+        _DEAD_BAND: dead_band(data.gyro_t, data.gyro)[0] > 0.0,
+    }
+    return found, [note for note, holds in notes.items() if holds]
 
 
 def _chained(

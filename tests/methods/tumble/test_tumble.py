@@ -673,6 +673,16 @@ def test_gyro_clipped_at_its_range_is_noticed(tmp_path: Path) -> None:
         assert abs(found.value - simulated.truth[f"gyro_scale_{axis}"]) < 4.0 * found.sigma
 
 
+@pytest.mark.parametrize("subtracted", [0.0, np.deg2rad(0.3)])
+def test_dead_band_of_a_gyro_is_noticed(subtracted: float) -> None:
+    simulated = TUMBLE.simulate(TumbleScenario(attitudes=14, gyro=TumbledGyro()), 1)
+    gyro = simulated.data.gyro
+    left = np.where(np.abs(gyro) < np.deg2rad(0.3), 0.0, gyro - subtracted * np.sign(gyro))
+    banded = Session.of(TUMBLE, replace(simulated, data=replace(simulated.data, gyro=left))).problem()
+    assert "The gyro has a dead band" in " ".join(banded.premises)
+    assert "dead band" not in " ".join(Session.of(TUMBLE, simulated).problem().premises)
+
+
 def test_a_rest_counts_as_one_attitude() -> None:
     data = _simulated(TumbleScenario(attitudes=4, rest_s=3.0), 1).data
     (sensor,) = prepare(data, Config.model_validate({"noise": {"mag_density": 5e-8}})).sensors
