@@ -28,12 +28,15 @@ def recording(shared_data: Path) -> Path:
 
 
 def test_the_scale_is_named_first(recording: Path, tmp_path: Path) -> None:
-    """Its effect on the mount, .28 deg, is just below half of the accuracy required, so that it is a note."""
+    """Fixed at 0 it turns the mount by .53 deg, more than half of what is required.
+
+    With slow errors its sigma is .85 of its prior's: the recording hardly determines it, so that it is a note.
+    """
     found = calibrated(recording, "{}", tmp_path)
     conflicts = [finding.evidence for finding in found.findings if finding.kind == "prior_conflict"]
     assert conflicts[0]["parameter"] == "gyro_scale_x"
     assert abs(conflicts[0]["z"]) > 10.0
-    assert 0.2 < np.rad2deg(abs(conflicts[0]["effect"]["helmet_mount_y"])) < 0.4
+    assert 0.4 < np.rad2deg(abs(conflicts[0]["effect"]["helmet_mount_y"])) < 0.9
     # What is said to be contradicted is applied: without it the rates of turns are off by 7 %.
     assert {"gyro_scale_x", "gyro_scale_y"} <= set(found.applied)
 
