@@ -107,7 +107,7 @@ class Solved:
     def converged(self) -> bool:
         """Whether the values are a minimum, over all directions or over all but weak ones, which are at their priors.
 
-        Along these the cost is what noise makes it: a minimum there is none of the recording's.
+        Along weak directions the cost varies by chance: where it is least there says nothing.
         """
         constrained = self.posterior.converged and self.posterior.directions.weak.shape[1] > 0
         return self.solution.converged or (constrained and not deadline.passed())
