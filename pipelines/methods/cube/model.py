@@ -13,7 +13,7 @@ accel_k31 and accel_k32 are zero unless given a prior.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -107,7 +107,19 @@ def problem(data: CubeData, config: Config) -> Problem:
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=ChainLayout(states="xdepR" if model.reference.moves else "xdep"),
     )
-    return graph if data.camera is None else with_priors(graph, [layout_prior(config)])
+    if data.camera is None:
+        return graph
+    known = with_priors(graph, [layout_prior(config)])
+    return known if config.section(CubeConfig).covariance is not None else _by_sheets(known, graph)
+
+
+def _by_sheets(known: Problem, plain: Problem) -> Problem:
+    """A problem with the joint prior of its tags' data sheets, which are what can be stated."""
+    sheets = {q.name: q.sheet for q in plain.quantities}
+    parameters = tuple(
+        replace(p, quantities=tuple(replace(q, sheet=sheets[q.name]) for q in p.quantities)) for p in known.parameters
+    )
+    return replace(known, parameters=parameters, premises=plain.premises)
 
 
 def _premises(model: Model) -> tuple[str, ...]:
