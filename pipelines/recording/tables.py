@@ -139,6 +139,8 @@ def table_form(path: Path, data: Path) -> TableForm:
     header, units = _header(lines[:first], delimiter, width)
     if not width and header is None:
         raise _unknown(path, ": no line of numbers in it")
+    if header is None and delimiter == ",":
+        _check_decimal_commas(path, lines[:first], width)
     names = (
         [f"column {i + 1}" for i in range(width)] if header is None else _cells(_uncommented(lines[header]), delimiter)
     )
@@ -155,6 +157,16 @@ def table_form(path: Path, data: Path) -> TableForm:
         min(width, len(names)),
         tuple(line.strip() for line in lines[: first if header is None else header] if line.strip()),
     )
+
+
+def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:
+    """Refuse rows of twice as many cells as names, but for a time perhaps: commas mark their decimals too."""
+    names = _cells(_uncommented(next((line for line in reversed(above) if line.strip()), "")), ",")
+    if len(names) > 2 and width in (2 * len(names) - 1, 2 * len(names)):
+        raise InputError(
+            f"{path}: commas separate columns and mark decimals, {len(names)} names over {width} cells: write it with "
+            "semicolons between columns, or with decimal points"
+        )
 
 
 def read_columns(

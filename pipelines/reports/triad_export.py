@@ -44,8 +44,10 @@ def _in_si(
             triads[name] = K / scale, b / scale
             notes.append("magnetometer: calibrated without the field's strength, its scale is as recorded")
         elif unit != "1":
+            recorded = "counts" if unit.endswith("/count") else f"a unit of its own ({unit})"
             raise InputError(
-                f"{name} is calibrated in {unit}; this format corrects SI units: calibrate what the program has"
+                f"{name} was recorded in {recorded}, and this format corrects SI units: calibrate readings that are "
+                "converted, as the program has them, or export ros2"
             )
     return triads, notes
 

@@ -142,6 +142,7 @@ def test_what_stands_for_no_number_is_none_and_a_last_row_that_is_cut_is_left_ou
         ),
         ([HEADER, *rows()], "columns: {/mag: {field: [mx, my, mz]}}", "either time, .*or rate, in Hz, is needed"),
         (["1 January", "no numbers here"], CONFIG, "no line of numbers in it"),
+        ([HEADER, *rows(",", ",")], CONFIG, "commas separate columns and mark decimals, 4 names over 8 cells"),
     ],
 )
 def test_what_cannot_be_read_is_one_line(lines: list[str], config: str, message: str, tmp_path: Path) -> None:
