@@ -50,7 +50,10 @@ _PRIOR = "prior of "
 # Smaller shares are summed, and so are those after so many.
 _LEAST_SHARE, _MOST_PARTS = 0.02, 4
 REST = "everything else"
-_FAR = "check the orientation and the axis order of the sensor, or widen the prior"
+_FAR = (
+    "check the orientation and the axis order of the sensor (`axes:` of its topic turns it, `[x, -y, -z]` by 180 deg "
+    "about x), or widen the prior"
+)
 
 
 def headline(findings: Sequence[Finding], quantities: Quantities, verdicts: Mapping[str, str]) -> str:

@@ -60,7 +60,8 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         NOTE,
         {"parameter": "helmet_mount_z", "value": 3.1, "sigma": 1e-3, "z": 8.9, "inseparable": (), "effect": {}},
         "helmet_mount_z is far from its prior: 177.617 ± 0.057 deg, prior 0 ± 20 deg (z = 8.9); check the orientation "
-        "and the axis order of the sensor, or widen the prior.",
+        "and the axis order of the sensor (`axes:` of its topic turns it, `[x, -y, -z]` by 180 deg about x), or widen "
+        "the prior.",
     ),
     (
         "contradiction",
