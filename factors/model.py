@@ -231,8 +231,9 @@ def stacking_key(model: Model) -> Hashable:
         return id(model)
     declared: Any = model
     alike = tuple(_hashable(getattr(model, f.name)) for f in fields(declared) if f.name not in stacked)
-    absent = tuple(getattr(model, name) is None for name in stacked)
-    return type(model), alike, absent, model.rows, model.blocks
+    parts = [getattr(model, name) for name in stacked]
+    each = tuple(stacking_key(part) if isinstance(part, Model) else part is None for part in parts)
+    return type(model), alike, each, model.rows, model.blocks
 
 
 def stack_models(parts: Sequence[Any]) -> Any:

@@ -154,6 +154,7 @@ class CameraSheet(Sheet):
 
     scale: SigmaOrZero | None = None  # of the angles, no unit
     filter: SigmaOrZero | None = None  # s^2, half of second moments of impulse responses, the camera's less the gyro's
+    map: SigmaOrZero | None = None  # rad rms, of errors by attitude or gimbal angles
     roll: SigmaOrZero | None = None  # rad, about its line of sight as it is mounted
     focal: SigmaOrZero | None = None  # a share of CameraInfo's focal length that this is off by
     centre: SigmaOrZero | None = None  # px that CameraInfo's centre is off by

@@ -103,6 +103,7 @@ class Alone:
             rejected=estimate.rejected,
             levels=estimate.levels,
             inflation=estimate.inflation,
+            error_map=estimate.error_map,
         )
         problem = replace(
             calibration.problem,
@@ -112,6 +113,7 @@ class Alone:
             attitudes=None,
             at_gyro_rate=None,
             finer=None,
+            error_map=None,
         )
         return cls(
             calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
@@ -279,7 +281,9 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
 def _again(method: Method, alone: Alone, others: GaussianPrior, rates: Mapping[str, float]) -> SqrtInformation:
     """What a recording says, linear where the others have the device to be."""
     problem = with_priors(method.graph(alone.loaded(), alone.calibration.config), [others])
-    return information_at_levels(problem, alone.calibration.estimate.levels, rates)
+    estimate = alone.calibration.estimate
+    known = information_at_levels(problem, estimate.levels, rates)
+    return known if estimate.error_map is None else estimate.error_map.known(known, estimate.inflations)
 
 
 def _calibration(

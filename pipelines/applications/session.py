@@ -393,10 +393,13 @@ class Session:
             return ()
         from alidade.pipelines.solvers.freed import freed_information
 
-        sqrt_info = freed_information(self._freed[1], estimate)
         ratios = estimate.inflations if estimate.sandwich is None else estimate.inflations * estimate.sandwich
         ratio = max((r for r, q in zip(ratios.tolist(), quantities, strict=True) if q.judged), default=1.0)
-        return () if sqrt_info is None else contradictions(sqrt_info, self._freed[1].quantities, quantities, ratio)
+        freed, found = self._freed[1], estimate.error_map
+        if found is not None:
+            freed, quantities = found.map.added_to(freed), (*quantities, *found.map.parameter.quantities)
+        sqrt_info = freed_information(freed, estimate)
+        return () if sqrt_info is None else contradictions(sqrt_info, freed.quantities, quantities, ratio)
 
     @cached_property
     def _freed(self) -> tuple[Config, Problem] | None:
@@ -466,7 +469,13 @@ class Session:
         with progress.doing("solving"):
             changed = self._changed() if report else ()
             estimate = solve_batch(
-                problem, budget=report, changed=changed, device=device, elsewhere=others, engine=self.engine
+                problem,
+                budget=report,
+                changed=changed,
+                device=device,
+                elsewhere=others,
+                engine=self.engine,
+                error_map=True,
             )
             return estimate, problem
 

@@ -20,7 +20,8 @@ import numpy as np
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.parameters import prior_z_score
-from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, SqrtInformation, StepEstimate
+from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, StepEstimate
+from alidade.pipelines.estimation.widening import widened
 
 # Probability of calling a recording changed in which nothing changed.
 LEVEL = 1e-3
@@ -179,46 +180,10 @@ def _is_jump(step: StepEstimate, duration: float) -> bool:
 
 
 def with_change(estimate: Estimate, change: Finding) -> Estimate:
-    """The estimate with an immaterial change in its covariance: the steps occur together, P + s s'.
-
-    Whoever reads the estimate reads that covariance: its history from the change on, the budget, and the square-root
-    information from which a joint calibration is made.
-    """
+    """The estimate with an immaterial change in its covariance: the steps occur together, P + s s'."""
     steps: Mapping[str, tuple[float, float]] = change.evidence["steps"]
     step = np.array([steps.get(name, (0.0, 0.0))[0] for name in estimate.names])
-    covariance = estimate.covariance + np.outer(step, step)
-    history, budget = estimate.history, estimate.budget
-    if history is not None:
-        after = (history.time >= change.evidence["time_s"])[:, None]
-        history = replace(history, sigmas=np.where(after, np.hypot(history.sigmas, step), history.sigmas))
-    if budget is not None:
-        share = dict(zip(estimate.names, step**2 / np.maximum(np.diag(covariance), 1e-300), strict=True))
-        budget = {name: _with_share(shares, float(share[name])) for name, shares in budget.items()}
-    sqrt_info = estimate.sqrt_info
-    if sqrt_info is not None:
-        whole = dict(zip(estimate.names, step / estimate.inflations, strict=True))
-        sqrt_info = _marginalised(sqrt_info, np.array([whole[name] for name in sqrt_info.names]))
-    return replace(estimate, covariance=covariance, history=history, budget=budget, sqrt_info=sqrt_info)
-
-
-def _with_share(shares: Mapping[str, float], share: float) -> dict[str, float]:
-    """Shares of a variance with that of the change, the largest first."""
-    if share == 0.0:
-        return dict(shares)
-    whole = {**{source: (1.0 - share) * each for source, each in shares.items()}, CHANGE: share}
-    return dict(sorted(whole.items(), key=lambda item: -item[1]))
-
-
-def _marginalised(sqrt_info: SqrtInformation, step: Array) -> SqrtInformation:
-    """R (x - a s - at) = d with a unit normal a marginalised out: rows whitened by (I + r r')^-1/2, r = R s."""
-    r = sqrt_info.R @ step
-    square = float(r @ r)
-    if square == 0.0:
-        return sqrt_info
-    k = (1.0 - 1.0 / np.sqrt(1.0 + square)) / square
-    return replace(
-        sqrt_info, R=sqrt_info.R - k * np.outer(r, r @ sqrt_info.R), d=sqrt_info.d - k * r * float(r @ sqrt_info.d)
-    )
+    return widened(estimate, CHANGE, step[:, None], change.evidence["time_s"])
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:

@@ -79,7 +79,7 @@ def diagnose(
     if not published:
         found += [*_prior_conflicts(estimate, quantities), *([change] if change else [])]
         found += [*rejections(estimate), *_noise(estimate), *_correlations(estimate)]
-        found += [*_slow_errors(estimate, quantities), *disturbances(estimate)]
+        found += [*_error_map(estimate, quantities), *_slow_errors(estimate, quantities), *disturbances(estimate)]
     found += misfits(estimate.chi_square, estimate.levels)
     if any(finding.severity == WEAK for finding in directions):
         found += _dominant_priors(quantities, estimate.covariance)
@@ -197,6 +197,24 @@ def _correlations(estimate: Estimate) -> Iterator[Finding]:
         share = length / len(estimate.residuals[family].time)
         if share > LIMITS.correlated:
             yield Finding("correlation", INCONSISTENT, {"family": family, "share": share})
+
+
+def _error_map(estimate: Estimate, quantities: Sequence[Quantity], limits: Thresholds) -> Iterator[Finding]:
+    """Errors by where measurements are made; INCONSISTENT where they are as far above their data sheet as no noise."""
+    found = estimate.error_map
+    if found is None:
+        return
+    effect = {q.name: float(shift) for q, shift in zip(quantities, found.shift, strict=True) if q.required and shift}
+    evidence = {
+        "name": found.map.spec.name,
+        "unit": found.map.spec.unit,
+        "rms": found.rms,
+        "prior": found.map.stated,
+        "chi_square": found.chi_square,
+        "dof": found.dof,
+        "effect": effect,
+    }
+    yield Finding("error_map", INCONSISTENT if found.rms > limits.noise_factor * found.map.stated else NOTE, evidence)
 
 
 def _slow_errors(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:

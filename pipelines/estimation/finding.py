@@ -35,6 +35,8 @@ KINDS: Mapping[str, tuple[str, ...]] = {
         "estimated_factor",
     ),  # used, and estimated alone, over stated
     "correlation": ("family", "share"),
+    # Errors of measurements by where they are made: rms, and of which prior; effect: parameter -> shift by them.
+    "error_map": ("name", "unit", "rms", "prior", "chi_square", "dof", "effect"),
     "slow_error": ("parameter", "ratio"),  # sandwich over nominal sigma, the largest of a required parameter
     # Family None: all measurements, of which `largest` departs most; noise_factor times its noise would fit it.
     "misfit": ("family", "chi_square", "dof", "largest", "noise_factor"),

@@ -170,6 +170,13 @@ def accel_square(sigma: float) -> ParameterSpec:
     )
 
 
+def error_map(name: str, axes: str, sigma: float, description: str) -> ParameterSpec:
+    """Numbers of an error map of measurements, see estimation.error_map: of each axis one a harmonic."""
+    return ParameterSpec(
+        name, "rad", sigma, description, "camera.map", axes=[f"{axis}_*" for axis in axes], per_recording=True
+    )
+
+
 def encoder_errors(joints: Sequence[str], once_per_turn: float, delay: float) -> tuple[ParameterSpec, ParameterSpec]:
     """Sine and cosine of each encoder's error once a turn, rad, and the delay of their readings, s; one sigma."""
     return (

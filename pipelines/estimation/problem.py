@@ -26,6 +26,7 @@ from alidade.pipelines.gaussian_prior import GaussianPrior
 
 if TYPE_CHECKING:
     from alidade.pipelines.estimation.camera_clock import Keyframes
+    from alidade.pipelines.estimation.error_map import ErrorMap, FoundMap
 
 
 # What eliminates the linear systems of the batch solver, see solvers.engines.
@@ -330,6 +331,7 @@ class Problem:
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
         may_step: keys of rotations that may jump once, as a mount that slips: a solver tests for it.
         finer: noise levels -> the graph with closer keyframes that they need; None where this one serves.
+        error_map: errors that measurements may have at the places that an estimate finds; None: the method has none.
         gaussian_priors: joint priors from elsewhere than data sheets; the last one about a number is in force.
     """
 
@@ -353,6 +355,7 @@ class Problem:
     marginal_likelihood: bool = False
     may_step: tuple[int, ...] = ()
     finer: Callable[[Sequence[Level]], Problem | None] | None = None
+    error_map: Callable[[Estimate], ErrorMap | None] | None = None
     gaussian_priors: tuple[GaussianPrior, ...] = ()
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
@@ -599,6 +602,7 @@ class Estimate:
         steps: those that explain the recording best, the most significant first; None: not looked for.
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
         sqrt_info: information without the device's priors; None: not asked for.
+        error_map: errors by where measurements are made that were found, and are in it; None: none, or not looked for.
         second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
         concluded: whether an incremental solver's run ended with the solution of all rows together.
         seconds: phase -> wall time.
@@ -627,6 +631,7 @@ class Estimate:
     sandwich: Array | None = None
     steps: tuple[StepEstimate, ...] | None = None
     sqrt_info: SqrtInformation | None = None
+    error_map: FoundMap | None = None
     second: Minimum | None = None
     concluded: bool = False
     seconds: Mapping[str, float] = field(default_factory=dict)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from alidade.factors.chi_square import interval
 from alidade.pipelines.display.figure import AXES, COLORS, PALE, REJECTED, Figure, Plot
-from alidade.pipelines.display.units import human_unit
+from alidade.pipelines.display.units import human_unit, noise_unit
+from alidade.pipelines.estimation.error_map import FoundMap
 from alidade.pipelines.estimation.problem import Array, History, Quantity, Residuals
 from alidade.pipelines.reports.result import Calibration, quantities_of
 
@@ -47,8 +48,28 @@ def common_plots(calibration: Calibration) -> list[Plot]:
             innovations = residuals if estimate.has_innovations else estimate.innovations.get(family)
             if innovations is not None and innovations.used.sum() >= _LEAST_SPECTRUM:
                 plots.append(_spectrum(family, innovations, names))
+    if estimate.error_map is not None:
+        plots.append(_error_map(estimate.error_map))
     correlation, ellipses = _correlation(calibration), _ellipses(calibration)
     return [*plots, *([correlation] if correlation else []), *([ellipses] if ellipses else [])]
+
+
+def _error_map(found: FoundMap) -> Plot:
+    """The errors found over each number of where measurements were made."""
+    places, figures = list(found.map.places.items()), list[Figure]()
+    unit, factor = noise_unit(found.map.spec.name, found.map.spec.unit)
+    for i, (place, x) in enumerate(places):
+        out = Figure(f"error, {unit}" if i == 0 else "", f"{place}, deg", share=1.0 / len(places), y_shared=i > 0)
+        for axis, error in zip(found.map.axes, found.error.T, strict=True):
+            out.points(np.rad2deg(x), factor * error, axis, axis, 3)
+        figures.append(out)
+    return Plot(
+        f"Errors that depend on where measurements are made ({found.map.spec.name})",
+        f"Part of the errors of the measurements that is a smooth function of these numbers, {factor * found.rms:.2g} "
+        f"{unit} rms about an axis. Sigmas include what is not known of it.",
+        figures[0],
+        tuple(figures[1:]),
+    )
 
 
 def components(names: Sequence[str] | None, residuals: Residuals) -> list[str]:

@@ -330,6 +330,15 @@ def _correlation(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
     return f"Residuals of {e['family']} are correlated over {100.0 * e['share']:.0f} % of the recording."
 
 
+def _error_map(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
+    of = "the gimbal angles" if e["name"] == "los_map" else "the attitude"
+    unit, factor = noise_unit(e["name"], e["unit"])
+    size = f"{rounded(factor * e['rms'])} {unit} rms, data sheet {rounded(factor * e['prior'])}"
+    test = f"chi-square {rounded(e['chi_square'], 3)}, dof {e['dof']}"
+    shift = _shift(e["effect"], "", quantities, "correcting them")
+    return f"{e['name']}: errors depend on {of}, {size} ({test}){shift}. Sigmas include what is not known of them."
+
+
 def _slow_error(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
     warning = "Warning: a sensor errs slowly" if e["ratio"] > SLOW_ERROR_WARNING else "A sensor errs slowly"
     return (
@@ -402,6 +411,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "noise": _noise,
     "correlation": _correlation,
     "slow_error": _slow_error,
+    "error_map": _error_map,
     "misfit": _misfit,
     "dominant_prior": _dominant_prior,
     "ambiguous_solution": _ambiguous_solution,

@@ -114,6 +114,18 @@ def true_values(specs: Sequence[ParameterSpec], scenario: Any, rng: np.random.Ge
     return {**drawn, **scenario.effects}
 
 
+def smooth_map(of: Array, axes: int, rms: float, seed: int) -> Array:
+    """Errors (n, axes) that are a smooth function of numbers (n, d) of order 1; mean 0 and this rms about each axis.
+
+    A sum of waves of random directions, a turn or so long, drawn apart from all else.
+    """
+    rng = np.random.default_rng([seed, 4])
+    waves = rng.standard_normal((of.shape[1], 8)) * 1.5
+    error = np.sin(of @ waves + rng.uniform(0.0, 2.0 * np.pi, 8)) @ rng.standard_normal((8, axes))
+    error -= error.mean(axis=0)
+    return np.asarray(rms * error / error.std(axis=0))
+
+
 def by_axis(**vectors: ArrayLike) -> dict[str, float]:
     """Components of vectors as parameters: name_x, name_y, name_z."""
     return {

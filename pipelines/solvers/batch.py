@@ -40,6 +40,7 @@ from alidade.pipelines.solvers.error_budget import (
     most_influential,
     sigma_ratio,
 )
+from alidade.pipelines.solvers.error_map_test import with_error_map
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
@@ -178,6 +179,7 @@ def solve_batch(
     device: Collection[str] = (),
     elsewhere: Callable[[SqrtInformation], Mapping[str, float]] | None = None,
     engine: EngineName = "auto",
+    error_map: bool = False,
 ) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
 
@@ -190,6 +192,7 @@ def solve_batch(
         device: names of the numbers whose priors are not the recording's; asks for what it says without them.
         elsewhere: of what it says, linear about its solution, the numbers about which it is to be linear instead.
         engine: that eliminates the linear systems.
+        error_map: whether to look for errors of measurements that depend on where they are made.
 
     Raises:
         IndeterminateStateError: states other than the parameters are not determined.
@@ -202,6 +205,8 @@ def solve_batch(
     estimate = whole_estimate(solved, budget, changed)
     if device:
         estimate = replace(estimate, sqrt_info=_information_of(solved, device, elsewhere))
+    if error_map:
+        estimate = with_error_map(solved.compiled.problem, solved.engine, solved.values, estimate)
     done = time.perf_counter()
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
 

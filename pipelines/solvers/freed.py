@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.estimation.problem import Estimate, Problem, SqrtInformation
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels
 from alidade.pipelines.solvers.noise_estimation import apply_levels
@@ -22,6 +23,17 @@ _STEPS = 3
 def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | None:
     """Square-root information of a graph about the solution of another one, in which some numbers were fixed.
 
+    Arguments as of `at_solution`; None where the graph does not determine its states.
+    """
+    try:
+        return sqrt_information(*at_solution(freed, estimate), ())
+    except (IndeterminateStateError, np.linalg.LinAlgError):
+        return None
+
+
+def at_solution(freed: Problem, estimate: Estimate) -> tuple[Compiled, Linearization, Values]:
+    """A graph at the solution of another one, in which some numbers were fixed: compiled, its engine, all values.
+
     Noise levels and rejected measurements are the solution's. Levels that a misfit has raised hide its cause: where
     they maximise the likelihood they are found anew.
 
@@ -29,25 +41,22 @@ def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | N
         freed: the graph in which they are free.
         estimate: the solution; a number that it has not is at its prior mean.
 
-    Returns:
-        None where the graph does not determine its states.
+    Raises:
+        IndeterminateStateError, LinAlgError: the graph does not determine its states.
     """
     levels = estimate.levels
     compiled = Compiled.of((freed.finer and freed.finer(levels)) or freed)
     used, values = _used(compiled.engine.groups, estimate), compiled.initial
     numbers = {q.name: q.prior_mean for q in compiled.problem.quantities}
     numbers |= zip(estimate.names, estimate.values.tolist(), strict=True)
-    try:
-        engine = _without_rejected(apply_levels(compiled.engine, levels), used)
-        for _ in range(_STEPS):
-            values = moved_to(compiled, engine, values, numbers)
-        if freed.marginal_likelihood and compiled.engine.is_chain:
-            out = {i: ~used[i] for i, group in enumerate(engine.groups) if group.is_measurement}
-            found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
-            engine = _without_rejected(apply_levels(compiled.engine, found.levels), used)
-        return sqrt_information(compiled, engine, values, ())
-    except (IndeterminateStateError, np.linalg.LinAlgError):
-        return None
+    engine = _without_rejected(apply_levels(compiled.engine, levels), used)
+    for _ in range(_STEPS):
+        values = moved_to(compiled, engine, values, numbers)
+    if freed.marginal_likelihood and compiled.engine.is_chain:
+        out = {i: ~used[i] for i, group in enumerate(engine.groups) if group.is_measurement}
+        found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
+        engine = _without_rejected(apply_levels(compiled.engine, found.levels), used)
+    return compiled, engine, values
 
 
 def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]]:

@@ -14,6 +14,7 @@ from alidade.pipelines.estimation.parameters import (
     CLOCK_SKEW,
     ParameterSpec,
     check_parameters,
+    error_map,
     g_sensitivity,
     gyro_bias,
     gyro_errors,
@@ -62,12 +63,14 @@ VISION_FILTER = scalar(
     "Low-pass of vision: half the second moment of its impulse response, less the gyro's.",
     "camera.filter",
 )
+# A tenth of a degree: distortion, tag sizes and hidden markers.
+VISION_MAP = error_map("vision_map", "xyz", 1.75e-3, "Error of vision about {first} that depends on the attitude.")
 # In the order in which simulators draw their values: a new one is the last, or every seed has other ones.
 NUISANCE = (
     *(*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE),
     *(CLOCK_SKEW, VISION_SCALE, GYRO_SLOPE, VISION_FILTER),
 )
-PARAMETERS = (BIAS, HELMET, CAMERA, OFFSET, *NUISANCE)
+PARAMETERS = (BIAS, HELMET, CAMERA, OFFSET, *NUISANCE, VISION_MAP)
 # Those of the pictures, behind the time offset, in the order of the factor's columns.
 PICTURE_SPECS = tuple(next(spec for spec in NUISANCE if spec.name == name) for name in PICTURE_ERRORS[1:])
 

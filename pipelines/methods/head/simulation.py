@@ -37,6 +37,7 @@ from alidade.pipelines.simulation.sensors import (
     read_by,
     recording_config,
     sample_times,
+    smooth_map,
     true_values,
 )
 from alidade.pipelines.vision.camera import Camera
@@ -163,6 +164,7 @@ class HeadScenario(ScenarioPart):
     # either, but the config does not know.
     sensors: SensorSheets | None = None
     effects: dict[str, float] = {}  # assumptions by name and their true values, whatever the data sheets
+    vision_map: NotNegative = 0.0  # rad, rms about each axis: what vision's error depends on the attitude by
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
     @model_validator(mode="after")
@@ -191,7 +193,7 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
         platform_gyro = read_by(platform_gyro, "platform", effects)
         platform_gyro += [effects[f"platform_bias_{axis}"] for axis in "xyz"]
         platform_gyro = platform_gyro + _white(noise.platform_gyro_density, rate_hz, len(platform_t), rng)
-    vision_t, vision_wxyz = _vision(scenario, effects, rng)
+    vision_t, vision_wxyz = _vision(scenario, effects, rng, seed)
     truth_t = sample_times(scenario.duration_s, scenario.truth_rate_hz)
     variance = noise.vision_attitude**2
     data = HeadData(
@@ -303,9 +305,14 @@ def _acceleration(scenario: HeadScenario, at: Array, h: float = 2e-3) -> Array:
     return np.asarray((ahead + behind) / h**2)
 
 
-def _vision(scenario: HeadScenario, effects: Mapping[str, float], rng: np.random.Generator) -> tuple[Array, Array]:
+def _vision(
+    scenario: HeadScenario, effects: Mapping[str, float], rng: np.random.Generator, seed: int
+) -> tuple[Array, Array]:
     """Stamps and measured cRh, shape (K, 4)."""
     t, _, cRh = _sights(scenario, effects)
+    if scenario.vision_map:
+        seen = so3.matrix(cRh).reshape(-1, 9)
+        cRh = so3.multiply(cRh, so3.exp(smooth_map(seen, 3, scenario.vision_map, seed)))
     n = len(t)
     error = so3.exp(scenario.noise.vision_attitude * rng.standard_normal((n, 3)))
     axis = rng.standard_normal((n, 3))

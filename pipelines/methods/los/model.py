@@ -24,11 +24,12 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
+from alidade.pipelines.estimation.error_map import ErrorMap
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, as_slice
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import acting
 from alidade.pipelines.estimation.priors import rotation_about, vector_prior
-from alidade.pipelines.estimation.problem import Array, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.formula import clock_constants
@@ -41,7 +42,14 @@ from alidade.pipelines.methods.los.initial_values import (
     seen,
     select_pictures,
 )
-from alidade.pipelines.methods.los.parameters import AZIMUTH_ZEROS, BIAS, SENSITIVITY, TIME_OFFSET, LosParameters
+from alidade.pipelines.methods.los.parameters import (
+    AZIMUTH_ZEROS,
+    BIAS,
+    LOS_MAP,
+    SENSITIVITY,
+    TIME_OFFSET,
+    LosParameters,
+)
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.noise import sampled, stated, typical, walking
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
@@ -105,7 +113,17 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.sight, model.clock.begun),
         keyframes=None if model.parameters.sight is None else Keyframes(model.clock, _NEAR),
         layout=LAYOUT,
+        error_map=partial(_error_map, config, model),
     )
+
+
+def _error_map(config: Config, model: _Model, _: Estimate) -> ErrorMap | None:
+    """Errors of LOS errors that depend on the gimbal angles."""
+    alone = np.concatenate([np.sin(model.angles), np.cos(model.angles)], axis=1)
+    products = [alone[:, i] * alone[:, j] for i in (0, 2) for j in (1, 3)]
+    places = {"azimuth": model.angles[:, 0], "elevation": model.angles[:, 1]}
+    harmonics = np.column_stack([alone, *products])
+    return ErrorMap.of(LOS_MAP, config, _FAMILIES, model.chain.time, harmonics, places)
 
 
 def _noises(data: LosData, config: Config) -> dict[str, Level]:

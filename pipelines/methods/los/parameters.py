@@ -13,6 +13,7 @@ from alidade.pipelines.estimation.parameters import (
     ParameterSpec,
     check_parameters,
     encoder_errors,
+    error_map,
     g_sensitivity,
     gyro_bias,
     gyro_errors,
@@ -76,6 +77,7 @@ TARGET_RATE = ParameterSpec(
     axes="xz",
     per_recording=True,
 )
+LOS_MAP = error_map("los_map", "xz", 1e-4, "Error of the LOS error ph{first} that depends on the gimbal angles.")
 ONCE_PER_TURN, DELAY = encoder_errors(JOINTS, 2e-4, 1e-3)
 
 GIMBAL_ERRORS = (ROLL, COLLIMATION, AXES)
@@ -85,7 +87,7 @@ NUISANCE = (*SCALE, SENSITIVITY, *GIMBAL_ERRORS, *TRACKER_ERRORS, GYRO_SLOPE)
 # The angles by which gyro, gimbal axes and camera are mounted.
 ANGLE_SPECS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, *GIMBAL_ERRORS)
 ANGLES = tuple(name for each in ANGLE_SPECS for name in each.names)
-PARAMETERS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, BIAS, *NUISANCE)
+PARAMETERS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, BIAS, *NUISANCE, LOS_MAP)
 
 
 @dataclass(frozen=True)

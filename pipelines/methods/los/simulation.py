@@ -41,6 +41,7 @@ from alidade.pipelines.simulation.sensors import (
     read_by,
     recording_config,
     sample_times,
+    smooth_map,
     true_values,
 )
 
@@ -129,6 +130,7 @@ class LosScenario(ScenarioPart):
     # either, but the config does not know.
     sensors: SensorSheets | None = None
     effects: dict[str, float] = {}  # assumptions by name and their true values, whatever the data sheets
+    los_map: NotNegative = 0.0  # rad, rms of each axis: what LOS errors depend on the gimbal angles by
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
     @model_validator(mode="after")
@@ -184,6 +186,9 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
     gimbal_t, gimbal = _encoders(scenario, motion, rng)
     exact = picture_of(cRt)
     exact[:, :2] *= 1.0 + motion.effects["los_scale"]
+    if scenario.los_map:
+        angles = motion.gimbal_at(image_t)
+        exact[:, :2] += smooth_map(np.hstack([np.sin(angles), np.cos(angles)]), 2, scenario.los_map, seed)
     error = exact + rng.standard_normal(exact.shape) * [noise.los_error, noise.los_error, noise.los_roll]
     outlying = rng.random(len(error)) < scenario.outlier_share
     error[outlying, :2] += scenario.outlier_size * rng.standard_normal((int(outlying.sum()), 2))

@@ -1,0 +1,199 @@
+"""Errors of measurements that are a smooth function of where they are made, as nuisance parameters of a problem.
+
+A map is sum_j f_j c_j, with f the low-order harmonics of an attitude (entries of its matrix) or of gimbal angles
+(sines, cosines and their products). Over the measurements of a recording the f have mean 0, since a constant error is a
+mount, are uncorrelated and of rms 1: principal components of the harmonics. So each c is the rms of an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from alidade.factors.error_map import ErrorMapFactor
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.parameters import ParameterSpec, stated
+from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.problem import (
+    Array,
+    Estimate,
+    Factor,
+    Parameter,
+    Problem,
+    Quantity,
+    SqrtInformation,
+    Step,
+)
+from alidade.pipelines.estimation.widening import marginalised, widened
+from alidade.pipelines.settings import Config
+
+# Components of harmonics below this share of the largest one's rms are of high order, or noise.
+_LEAST = 0.01
+# Of a variance, in the budget.
+SOURCE = "errors that depend on the attitude"
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMap:
+    """A map that measurements of some families may have.
+
+    Attributes:
+        spec: of its parameters.
+        prior: sigma of each, in force.
+        stated: that of the data sheet.
+        families: of the measurements.
+        time: (n,) their times, s, increasing.
+        functions: (n, k) of mean 0 and rms 1.
+        places: where each measurement was made, name -> (n,), rad, to be drawn.
+        moves: whether it moves an estimate; else it may be an error of other sensors as well, and widens sigmas alone.
+    """
+
+    spec: ParameterSpec
+    prior: float
+    stated: float
+    families: tuple[str, ...]
+    time: Array
+    functions: Array
+    places: Mapping[str, Array]
+    moves: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        spec: ParameterSpec,
+        config: Config,
+        families: tuple[str, ...],
+        time: Array,
+        harmonics: Array,
+        places: Mapping[str, Array],
+        moves: bool = True,
+    ) -> ErrorMap | None:
+        """The map over measurements with harmonics (n, h); None where it is fixed, or nothing varies."""
+        prior, centred = stated(config, spec), harmonics - harmonics.mean(axis=0)
+        U, sizes, _ = np.linalg.svd(centred, full_matrices=False)
+        kept = sizes > max(_LEAST * sizes.max(initial=0.0), np.finfo(float).eps * len(time))
+        if prior == 0.0 or not kept.any():
+            return None
+        order = np.argsort(time, kind="stable")
+        functions, places = U[:, kept] * np.sqrt(len(time)), {name: x[order] for name, x in places.items()}
+        return cls(spec, prior, prior, families, time[order], functions[order], places, moves)
+
+    @property
+    def parameter(self) -> Parameter:
+        """Its variable."""
+        names = [f"{self.spec.name}_{axis}_{j + 1}" for j in range(self.functions.shape[1]) for axis in self.axes]
+        return Parameter(
+            int(gtsam.symbol("M", 0)),
+            tuple(
+                Quantity(
+                    name,
+                    self.spec.unit,
+                    self.prior,
+                    self.stated,
+                    self.spec.require,
+                    group="assumption",
+                    sheet=self.spec.data_sheet,
+                )
+                for name in names
+            ),
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Its parameters."""
+        return [q.name for q in self.parameter.quantities]
+
+    @property
+    def axes(self) -> str:
+        """Axes of the error, a letter each."""
+        return "".join(axis.removesuffix("_*") for axis in self.spec.axes)
+
+    def functions_at(self, time: Array) -> Array:
+        """Functions (m, k) of the measurements at their times (m,), s."""
+        return self.functions[np.minimum(np.searchsorted(self.time, time), len(self.time) - 1)]
+
+    def error(self, c: Array) -> Array:
+        """Errors (n, axes) of the measurements."""
+        return np.asarray(self.functions @ c.reshape(self.functions.shape[1], -1))
+
+    def added_to(self, problem: Problem) -> Problem:
+        """The problem with the map free, to be solved as a whole."""
+        parameter, finer = self.parameter, problem.finer
+
+        def closer(levels: Sequence[Level]) -> Problem | None:
+            more = finer(levels) if finer is not None else None
+            return None if more is None else self.added_to(more)
+
+        return replace(
+            problem,
+            parameters=(*problem.parameters, parameter),
+            steps=lambda chunk: self._steps(problem.steps(chunk), parameter),
+            steps_after=None,
+            continuation=None,
+            finer=None if finer is None else closer,
+            error_map=None,
+        )
+
+    def _steps(self, steps: Iterator[Step], parameter: Parameter) -> Iterator[Step]:
+        for number, step in enumerate(steps):
+            factors, initial = [self._with_map(factor, parameter.key) for factor in step.factors], step.initial
+            if number == 0:
+                zeros, initial = np.zeros(len(parameter.quantities)), gtsam.Values(step.initial)
+                initial.insert(parameter.key, zeros)
+                factors.append(vector_prior(parameter, zeros))
+            yield replace(step, initial=initial, factors=factors)
+
+    def _with_map(self, factor: Factor, key: int) -> Factor:
+        measured = factor.measurement
+        if measured is None or factor.family not in self.families:
+            return factor
+        model = ErrorMapFactor(measured.model, self.functions_at(measured.model.time), len(self.axes))
+        return Factor.of(factor.family, model.on(*measured.tied, key, loss=measured.loss), factor.beside)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundMap:
+    """A map that measurements have, and what it does to an estimate of n numbers.
+
+    Attributes:
+        map: with the prior in force, wider than its data sheet where that is too small.
+        error: (n, axes) of the measurements, in the unit of the map.
+        chi_square, dof: of the score test that found it.
+        names: of the estimate's numbers.
+        shift: (n,) by which correcting the errors moves them.
+        columns: (n, m) S: its uncertainty adds S S' to their covariance.
+    """
+
+    map: ErrorMap
+    error: Array
+    chi_square: float
+    dof: int
+    names: tuple[str, ...]
+    shift: Array
+    columns: Array
+
+    @property
+    def rms(self) -> float:
+        """Of the errors about an axis, in the unit of the map."""
+        return float(np.sqrt(np.square(self.error).mean()))
+
+    def applied(self, estimate: Estimate) -> Estimate:
+        """The estimate, made without the map, with it."""
+        out = widened(estimate, SOURCE, self.columns)
+        if not self.map.moves:
+            return out
+        sqrt_info = None if out.sqrt_info is None else self._moved(out.sqrt_info)
+        return replace(out, values=out.values + self.shift, sqrt_info=sqrt_info)
+
+    def known(self, sqrt_info: SqrtInformation, inflations: Array) -> SqrtInformation:
+        """Information of a recording, made without the map, with it; inflations (n,) are those of its estimate."""
+        columns = dict(zip(self.names, self.columns / inflations[:, None], strict=True))
+        moved = self._moved(sqrt_info) if self.map.moves else sqrt_info
+        return marginalised(moved, np.array([columns[name] for name in sqrt_info.names]))
+
+    def _moved(self, sqrt_info: SqrtInformation) -> SqrtInformation:
+        shift = dict(zip(self.names, self.shift.tolist(), strict=True))
+        return replace(sqrt_info, at=sqrt_info.at + [shift[name] for name in sqrt_info.names])

@@ -1,0 +1,61 @@
+"""Estimates with an error in their covariance that their solution does not have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from alidade.pipelines.estimation.problem import Array, Estimate, SqrtInformation
+
+
+def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.inf) -> Estimate:
+    """The estimate with covariance P + S S'.
+
+    Whoever reads the estimate reads that covariance: its history from a time on, the budget, and the square-root
+    information from which a joint calibration is made.
+
+    Args:
+        estimate: of n numbers.
+        source: in the budget.
+        columns: S (n, m).
+        since: s, from which on the error is there.
+    """
+    sigmas = np.linalg.norm(columns, axis=1)
+    covariance = estimate.covariance + columns @ columns.T
+    history, budget = estimate.history, estimate.budget
+    if history is not None:
+        after = (history.time >= since)[:, None]
+        history = replace(history, sigmas=np.where(after, np.hypot(history.sigmas, sigmas), history.sigmas))
+    if budget is not None:
+        share = dict(zip(estimate.names, sigmas**2 / np.maximum(np.diag(covariance), 1e-300), strict=True))
+        budget = {name: _with_share(shares, source, float(share[name])) for name, shares in budget.items()}
+    sqrt_info = estimate.sqrt_info
+    if sqrt_info is not None:
+        whole = dict(zip(estimate.names, columns / estimate.inflations[:, None], strict=True))
+        sqrt_info = marginalised(sqrt_info, np.array([whole[name] for name in sqrt_info.names]))
+    return replace(estimate, covariance=covariance, history=history, budget=budget, sqrt_info=sqrt_info)
+
+
+def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[str, float]:
+    """Shares of a variance with that of one more source, the largest first."""
+    if share == 0.0:
+        return dict(shares)
+    whole = {**{name: (1.0 - share) * each for name, each in shares.items()}, source: share}
+    return dict(sorted(whole.items(), key=lambda item: -item[1]))
+
+
+def marginalised(sqrt_info: SqrtInformation, columns: Array) -> SqrtInformation:
+    """R (x - S a - at) = d with a unit normal a (m,) marginalised out.
+
+    Column by column: rows whitened by (I + r r')^-1/2, r = R s.
+    """
+    for step in columns.T:
+        r = sqrt_info.R @ step
+        square = float(r @ r)
+        if square > 0.0:
+            k = (1.0 - 1.0 / np.sqrt(1.0 + square)) / square
+            R, d = sqrt_info.R - k * np.outer(r, r @ sqrt_info.R), sqrt_info.d - k * r * float(r @ sqrt_info.d)
+            sqrt_info = replace(sqrt_info, R=R, d=d)
+    return sqrt_info

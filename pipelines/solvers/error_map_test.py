@@ -1,0 +1,173 @@
+"""Score test of errors that depend on where measurements are made, see estimation.error_map.
+
+About a solution without a map its numbers c are more shared unknowns of the linear system. Everything else eliminated,
+what is left is R c = d, without the prior of c, sigma p. Of the directions of c that the recording determines better
+than the prior does, singular values of R above 1 / p, the squares of d, over the square of what coloured residuals
+widen sigmas by, sum to chi-square under the model (Rao, Proc. Camb. Phil. Soc. 1948).
+
+Where the sum is significant, c is freed. What it trades with is then known as well as its prior says, which must not
+be smaller than the map: p is at least the rms of the map that makes d most likely. What was solved for moves as it does
+with c, where no other error can be mistaken for a map, and its covariance grows by what c adds. Noise levels, rejected
+measurements and residuals stay those without the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors.chi_square import quantile
+from alidade.factors.error_map import ErrorMapFactor
+from alidade.pipelines import deadline
+from alidade.pipelines.estimation.error_map import ErrorMap, FoundMap
+from alidade.pipelines.estimation.problem import Array, Estimate, PosteriorHistory, Problem, SqrtInformation
+from alidade.pipelines.solvers.chain import IndeterminateStateError
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.error_budget import sigma_ratio
+from alidade.pipelines.solvers.freed import at_solution
+from alidade.pipelines.solvers.layout import Values
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.posterior import sqrt_information
+from alidade.pipelines.solvers.posterior_history import posterior_history
+from alidade.pipelines.solvers.weak_directions import constrained_solution
+
+# Share of recordings without such errors in which they are found.
+FALSE_ALARMS = 1e-2
+_WHAT = "the test for errors that depend on the attitude"
+# Sigmas that the numbers of a map may have, in those of their prior.
+_SIGMAS = np.append(0.0, np.geomspace(1e-2, 1e3, 500))
+
+
+def with_error_map(problem: Problem, engine: Linearization, values: Values, estimate: Estimate) -> Estimate:
+    """The estimate with the errors that measurements have by where they are made, if they have any.
+
+    Args:
+        problem: as it was solved, without a map.
+        engine: of its factors at the solution, rejected measurements left out.
+        values: of the solution.
+        estimate: the same as reported.
+    """
+    error_map = problem.error_map(estimate) if problem.error_map is not None and estimate.converged else None
+    if error_map is None or not engine.is_chain or deadline.passed(_WHAT):
+        return estimate
+    mapped, at = _mapped(engine, values, error_map)
+    k, ratio = len(error_map.names), _ratio(problem, estimate)
+    root = mapped.at(at)[0].eliminate().root
+    chi_square, dof, _ = _tested(root[-k - 1 :, -k - 1 :], error_map, ratio)
+    if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
+        return estimate
+    try:
+        return _freed(problem, error_map, estimate, ratio)
+    except (IndeterminateStateError, np.linalg.LinAlgError):
+        return estimate
+
+
+def _freed(problem: Problem, error_map: ErrorMap, estimate: Estimate, ratio: float) -> Estimate:
+    """The solution with the map free, its prior as wide as the map."""
+    compiled, solution, information = _solved(problem, error_map, estimate)
+    chi_square, dof, rms = _tested(_rows(information, error_map)[1], error_map, ratio)
+    if rms > error_map.prior:
+        error_map = replace(error_map, prior=rms)
+        near = replace(estimate, names=information.names, values=information.at)
+        compiled, solution, information = _solved(problem, error_map, near)
+    if not solution.converged:
+        return estimate
+    rows, root = _rows(information, error_map)
+    p, own = len(rows) - len(root), _own(information, error_map)
+    # Given the map the numbers move by -R_xx^-1 R_xc c; with its prior the information on c is R_cc' R_cc + 1 / p^2.
+    gain = -np.linalg.lstsq(rows[:p, :p], rows[:p, p:-1], rcond=None)[0]
+    R = np.concatenate([root[:-1, :-1], np.eye(len(error_map.names)) / error_map.prior])
+    spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
+    at = dict(zip(information.names, information.at.tolist(), strict=True))
+    shift = np.array([at.get(name, value) for name, value in zip(estimate.names, estimate.values, strict=True)])
+    columns = np.zeros((len(estimate.names), spread.shape[1]))
+    columns[[estimate.names.index(name) for name in information.names if name in estimate.names]] = gain @ spread
+    found = FoundMap(
+        error_map,
+        error_map.error(information.at[own]),
+        chi_square,
+        dof,
+        estimate.names,
+        shift - estimate.values,
+        columns,
+    )
+    out = replace(found.applied(estimate), error_map=found)
+    return _with_history(out, compiled, solution) if error_map.moves else out
+
+
+def _solved(problem: Problem, error_map: ErrorMap, estimate: Estimate) -> tuple[Compiled, Solution, SqrtInformation]:
+    """The minimum with the map free, and what it says without the map's prior.
+
+    Noise levels that contain the map would make it smaller, and are found anew.
+    """
+    compiled, engine, values = at_solution(error_map.added_to(problem), estimate)
+    solution = minimize(engine, values, LevenbergConfig())
+    return compiled, solution, sqrt_information(compiled, engine, solution.values, error_map.names)
+
+
+def _own(information: SqrtInformation, error_map: ErrorMap) -> NDArray[np.bool_]:
+    return np.array([name in error_map.names for name in information.names])
+
+
+def _rows(information: SqrtInformation, error_map: ErrorMap) -> tuple[Array, Array]:
+    """R and right side about the map's numbers from 0 on, these last, and the rows about them alone."""
+    own = _own(information, error_map)
+    right = information.d + information.R[:, own] @ information.at[own]
+    rows = np.column_stack([information.R[:, ~own], information.R[:, own], right])
+    rows = np.pad(rows, ((0, max(0, rows.shape[1] - len(rows))), (0, 0)))
+    rows = np.asarray(np.linalg.qr(rows, mode="r"), dtype=float)
+    return rows, rows[-own.sum() - 1 :, -own.sum() - 1 :]
+
+
+def _with_history(estimate: Estimate, compiled: Compiled, solution: Solution) -> Estimate:
+    """The estimate with the history of the solution with the map in place of its own; without it the map changes it."""
+    history = estimate.posterior_history and posterior_history(compiled, constrained_solution(compiled, solution))
+    if history is None:
+        return estimate
+    n = len(estimate.names)
+    own = PosteriorHistory(history.time, history.values[:, :n], history.covariance[:, :n, :n], history.steady[:n])
+    wide = sigma_ratio(np.diag(own.covariance[-1]), np.diag(estimate.covariance))
+    return replace(estimate, posterior_history=own, history=own.history.inflated(wide))
+
+
+def _tested(root: Array, error_map: ErrorMap, ratio: float) -> tuple[float, int, float]:
+    """Chi-square, its degrees of freedom, and the most likely rms of a map with R, d (k + 1, k + 1)."""
+    U, sizes, _ = np.linalg.svd(root[:-1, :-1] * error_map.prior)
+    squares, seen = np.square(U.T @ root[:-1, -1] / ratio), sizes > 1.0
+    variances = 1.0 + np.square(_SIGMAS[:, None] * sizes / ratio)
+    likely = _SIGMAS[np.argmin((np.log(variances) + squares / variances).sum(axis=1))]
+    rms = np.sqrt(error_map.functions.shape[1]) * error_map.prior * likely
+    return float(squares[seen].sum()), int(seen.sum()), float(rms)
+
+
+def _ratio(problem: Problem, estimate: Estimate) -> float:
+    """What coloured residuals widen the sigma of a parameter that is judged by, at most."""
+    ratios = estimate.inflations if estimate.sandwich is None else estimate.inflations * estimate.sandwich
+    return float(ratios[[q.judged for q in problem.quantities]].max(initial=1.0))
+
+
+def _mapped(engine: Linearization, values: Values, error_map: ErrorMap) -> tuple[Linearization, Values]:
+    """The linearisation with the numbers of a map as its last shared unknowns, without a prior, and these 0."""
+    (n, d, nodes, c, s), k = engine.layout.sizes, len(error_map.names)
+    known = values.arrays.get(k, np.empty((0, k)))
+    begin = {"state": d + c + s, "pair": 2 * d + c + s, "walk": 2 * c + s, "shared": s}
+
+    def added(group: Group) -> Group:
+        if not group.is_measurement or group.family not in error_map.families:
+            return group
+        columns = begin[group.target] + np.arange(k)
+        return replace(
+            group,
+            model=ErrorMapFactor(group.model, error_map.functions_at(group.model.time), len(error_map.axes)),
+            gather=[*group.gather, (k, np.array([len(known)]))],
+            at=[*group.at, np.zeros(1, dtype=np.intp)],
+            columns=[*group.columns, [columns[None]]],
+            deviates=[*group.deviates, np.array([False])],
+        )
+
+    layout = replace(engine.layout, sizes=(n, d, nodes, c, s + k))
+    arrays = {**values.arrays, k: np.concatenate([known, np.zeros((1, k))])}
+    return replace(engine, layout=layout, groups=[added(group) for group in engine.groups]), Values(arrays)

@@ -1,0 +1,115 @@
+"""Errors by where measurements are made, as of vision on the attitude: found, named, covered."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alidade.pipelines import methods
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.reports.result import Calibration
+
+NAMES = {"los": ("los_nominal", "los_map"), "head": ("head_mounts", "vision_map")}
+
+
+def _session(method: str, rms: float, seed: int, duration: float, **more: Any) -> Session:
+    scenario, key = NAMES[method]
+    chosen = methods.method(method)
+    settings = chosen.settings(scenario)
+    changed = settings.model_dump() | {"duration_s": duration, key: rms} | more
+    return Session.of(chosen, chosen.simulate(type(settings).model_validate(changed), seed))
+
+
+@cache
+def _calibrated(method: str, rms: float, seed: int, duration: float, solver: str = "batch") -> Calibration:
+    return _session(method, rms, seed, duration).calibrate(solver, report=False)
+
+
+def _errors(calibration: Calibration) -> np.ndarray:
+    """Errors of what is calibrated, in its sigmas."""
+    truth = calibration.truth or {}
+    return np.array(
+        [
+            (p.value - float(str(truth[name]))) / p.sigma
+            for name, p in calibration.parameters.items()
+            if p.group is None and p.require and name in truth and p.sigma > 0.0
+        ]
+    )
+
+
+@pytest.mark.parametrize("solver", ["batch", pytest.param("incremental", marks=pytest.mark.slow)])
+def test_los_errors_by_gimbal_angles_are_found_named_and_covered(solver: str) -> None:
+    """Without the map delta_z is 13 sigmas and 9 times what is required off, and `calibrated`."""
+    found = _calibrated("los", 1e-4, 2, 20.0, solver)
+    assert found.status == "weak"
+    assert np.abs(_errors(found)).max() < 3.0
+    (note,) = [note for note in found.notes if note.startswith("los_map")]
+    assert "gimbal angles" in note
+    assert found.estimate.error_map is not None
+    assert 3e-5 < found.estimate.error_map.rms < 3e-4
+
+
+def test_clean_los_recording_is_the_same_to_the_last_digit() -> None:
+    session = _session("los", 0.0, 1, 20.0)
+    searched = session.calibrate("batch", report=False)
+    fixed = session.config.model_copy(
+        update={
+            "sensors": session.config.sensors.model_copy(
+                update={"camera": type(session.config.sensors.camera)(map=0.0)}
+            )
+        }
+    )
+    without = Session(session.method, session.data, fixed).calibrate("batch", report=False)
+    assert searched.estimate.error_map is None
+    assert without.problem.error_map is not None
+    assert without.problem.error_map(without.estimate) is None
+    assert np.array_equal(searched.estimate.values, without.estimate.values)
+    assert np.array_equal(searched.estimate.covariance, without.estimate.covariance)
+
+
+def test_vision_errors_by_attitude_widen_sigmas_and_move_nothing() -> None:
+    from alidade.pipelines.solvers.batch import solve, whole_estimate
+    from alidade.pipelines.solvers.engines import Compiled
+    from alidade.pipelines.solvers.error_map_test import with_error_map
+
+    solved = solve(Compiled.of(_session("head", 5e-3, 2, 20.0).problem()))
+    plain = whole_estimate(solved)
+    found = with_error_map(solved.compiled.problem, solved.engine, solved.values, plain)
+    assert found.error_map is not None
+    assert found.error_map.map.spec.name == "vision_map"
+    assert np.array_equal(plain.values, found.values)
+    assert (found.sigmas >= plain.sigmas).all()
+    mounts = [i for i, name in enumerate(found.names) if "mount" in name]
+    assert (found.sigmas[mounts] > 1.2 * plain.sigmas[mounts]).any()
+
+
+def test_map_is_drawn_over_where_measurements_were_made() -> None:
+    from alidade.pipelines.reports.plots import common_plots
+
+    titles = [plot.title for plot in common_plots(_calibrated("los", 1e-4, 2, 20.0))]
+    assert any("los_map" in title for title in titles)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rms", [0.0, 3e-5, 1e-4, 3e-4])
+def test_sigmas_are_right_over_seeds_with_los_maps(rms: float) -> None:
+    found = [_calibrated("los", rms, seed, 20.0) for seed in range(1, 9)]
+    errors = np.abs([_errors(each) for each in found])
+    assert not [each for each in found if each.status == "calibrated" and np.abs(_errors(each)).max() > 4.0]
+    if rms >= 1e-4:
+        assert all(each.estimate.error_map is not None for each in found)
+        assert 0.2 < np.sqrt((errors**2).mean()) < 1.3
+    if rms == 0.0:
+        assert sum(each.estimate.error_map is not None for each in found) <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rms", [2e-3, 5e-3])
+def test_sigmas_are_right_over_seeds_with_vision_maps(rms: float) -> None:
+    found = [_calibrated("head", rms, seed, 30.0) for seed in range(1, 5)]
+    assert sum(each.estimate.error_map is not None for each in found) >= 3
+    covered = [each for each in found if each.estimate.error_map is not None]
+    assert np.abs([_errors(each) for each in covered]).max() < 4.0
