@@ -206,8 +206,8 @@ def _error_map(estimate: Estimate, quantities: Sequence[Quantity], limits: Thres
         return
     effect = {q.name: float(shift) for q, shift in zip(quantities, found.shift, strict=True) if q.required and shift}
     evidence = {
-        "name": found.map.spec.name,
-        "unit": found.map.spec.unit,
+        "name": found.map.name,
+        "unit": found.map.unit,
         "rms": found.rms,
         "prior": found.map.stated,
         "chi_square": found.chi_square,

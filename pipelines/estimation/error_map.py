@@ -7,6 +7,7 @@ mount, are uncorrelated and of rms 1: principal components of the harmonics. So 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +16,6 @@ import numpy as np
 
 from alidade.factors.error_map import ErrorMapFactor
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameters import ParameterSpec, stated
 from alidade.pipelines.estimation.priors import vector_prior
 from alidade.pipelines.estimation.problem import (
     Array,
@@ -28,10 +28,11 @@ from alidade.pipelines.estimation.problem import (
     Step,
 )
 from alidade.pipelines.estimation.widening import marginalised, widened
-from alidade.pipelines.settings import Config
 
 # Components of harmonics below this share of the largest one's rms are of high order, or noise.
 _LEAST = 0.01
+# The data sheet that it is on.
+SHEET = "camera.map"
 # Of a variance, in the budget.
 SOURCE = "errors that depend on the attitude"
 
@@ -41,7 +42,7 @@ class ErrorMap:
     """A map that measurements of some families may have.
 
     Attributes:
-        spec: of its parameters.
+        name, unit, axes, sheet: of its parameters, which are named after it and the axes, a letter each.
         prior: sigma of each, in force.
         stated: that of the data sheet.
         families: of the measurements.
@@ -51,7 +52,10 @@ class ErrorMap:
         moves: whether it moves an estimate; else it may be an error of other sensors as well, and widens sigmas alone.
     """
 
-    spec: ParameterSpec
+    name: str
+    unit: str
+    axes: str
+    sheet: str
     prior: float
     stated: float
     families: tuple[str, ...]
@@ -63,8 +67,9 @@ class ErrorMap:
     @classmethod
     def of(
         cls,
-        spec: ParameterSpec,
-        config: Config,
+        name: str,
+        axes: str,
+        prior: float,
         families: tuple[str, ...],
         time: Array,
         harmonics: Array,
@@ -72,30 +77,30 @@ class ErrorMap:
         moves: bool = True,
     ) -> ErrorMap | None:
         """The map over measurements with harmonics (n, h); None where it is fixed, or nothing varies."""
-        prior, centred = stated(config, spec), harmonics - harmonics.mean(axis=0)
+        centred = harmonics - harmonics.mean(axis=0)
         U, sizes, _ = np.linalg.svd(centred, full_matrices=False)
         kept = sizes > max(_LEAST * sizes.max(initial=0.0), np.finfo(float).eps * len(time))
         if prior == 0.0 or not kept.any():
             return None
         order = np.argsort(time, kind="stable")
-        functions, places = U[:, kept] * np.sqrt(len(time)), {name: x[order] for name, x in places.items()}
-        return cls(spec, prior, prior, families, time[order], functions[order], places, moves)
+        functions, places = U[:, kept] * np.sqrt(len(time)), {place: x[order] for place, x in places.items()}
+        return cls(name, "rad", axes, SHEET, prior, prior, families, time[order], functions[order], places, moves)
 
     @property
     def parameter(self) -> Parameter:
         """Its variable."""
-        names = [f"{self.spec.name}_{axis}_{j + 1}" for j in range(self.functions.shape[1]) for axis in self.axes]
+        names = [f"{self.name}_{axis}_{j + 1}" for j in range(self.functions.shape[1]) for axis in self.axes]
         return Parameter(
             int(gtsam.symbol("M", 0)),
             tuple(
                 Quantity(
                     name,
-                    self.spec.unit,
+                    self.unit,
                     self.prior,
                     self.stated,
-                    self.spec.require,
+                    math.inf,
                     group="assumption",
-                    sheet=self.spec.data_sheet,
+                    sheet=self.sheet,
                 )
                 for name in names
             ),
@@ -105,11 +110,6 @@ class ErrorMap:
     def names(self) -> list[str]:
         """Its parameters."""
         return [q.name for q in self.parameter.quantities]
-
-    @property
-    def axes(self) -> str:
-        """Axes of the error, a letter each."""
-        return "".join(axis.removesuffix("_*") for axis in self.spec.axes)
 
     def functions_at(self, time: Array) -> Array:
         """Functions (m, k) of the measurements at their times (m,), s."""

@@ -57,14 +57,14 @@ def common_plots(calibration: Calibration) -> list[Plot]:
 def _error_map(found: FoundMap) -> Plot:
     """The errors found over each number of where measurements were made."""
     places, figures = list(found.map.places.items()), list[Figure]()
-    unit, factor = noise_unit(found.map.spec.name, found.map.spec.unit)
+    unit, factor = noise_unit(found.map.name, found.map.unit)
     for i, (place, x) in enumerate(places):
         out = Figure(f"error, {unit}" if i == 0 else "", f"{place}, deg", share=1.0 / len(places), y_shared=i > 0)
         for axis, error in zip(found.map.axes, found.error.T, strict=True):
             out.points(np.rad2deg(x), factor * error, axis, axis, 3)
         figures.append(out)
     return Plot(
-        f"Errors that depend on where measurements are made ({found.map.spec.name})",
+        f"Errors that depend on where measurements are made ({found.map.name})",
         f"Part of the errors of the measurements that is a smooth function of these numbers, {factor * found.rms:.2g} "
         f"{unit} rms about an axis. Sigmas include what is not known of it.",
         figures[0],

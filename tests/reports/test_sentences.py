@@ -138,6 +138,21 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "Residuals of vision are correlated over 24 % of the recording.",
     ),
     (
+        "error_map",
+        NOTE,
+        {
+            "name": "vision_map",
+            "unit": "rad",
+            "rms": 1.75e-3,
+            "prior": 1.75e-3,
+            "chi_square": 48.0,
+            "dof": 23,
+            "effect": {},
+        },
+        "vision_map: errors depend on the attitude, 0.10 deg rms, data sheet 0.10 (chi-square 48.0, dof 23). Sigmas "
+        "include what is not known of them.",
+    ),
+    (
         "slow_error",
         NOTE,
         {"parameter": "helmet_mount_z", "ratio": 2.46},

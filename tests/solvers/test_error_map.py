@@ -79,7 +79,7 @@ def test_vision_errors_by_attitude_widen_sigmas_and_move_nothing() -> None:
     plain = whole_estimate(solved)
     found = with_error_map(solved.compiled.problem, solved.engine, solved.values, plain)
     assert found.error_map is not None
-    assert found.error_map.map.spec.name == "vision_map"
+    assert found.error_map.map.name == "vision_map"
     assert np.array_equal(plain.values, found.values)
     assert (found.sigmas >= plain.sigmas).all()
     mounts = [i for i, name in enumerate(found.names) if "mount" in name]

@@ -27,6 +27,7 @@ from alidade.pipelines.estimation.error_map import ErrorMap
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import acting
+from alidade.pipelines.estimation.parameters import stated as stated_figure
 from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
@@ -124,7 +125,16 @@ def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | 
     bRv = estimate.attitudes.wxyz
     turned = so3.log(so3.multiply(so3.inverse(bRv[:1]), bRv))
     places = {f"{axis} of bRv": turned[:, i] for i, axis in enumerate("xyz")}
-    return ErrorMap.of(VISION_MAP, config, (_FAMILY,), model.stamps, so3.matrix(bRv).reshape(-1, 9), places, False)
+    return ErrorMap.of(
+        VISION_MAP.name,
+        "xyz",
+        stated_figure(config, VISION_MAP),
+        (_FAMILY,),
+        model.stamps,
+        so3.matrix(bRv).reshape(-1, 9),
+        places,
+        False,
+    )
 
 
 def _finer(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:

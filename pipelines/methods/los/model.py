@@ -28,6 +28,7 @@ from alidade.pipelines.estimation.error_map import ErrorMap
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, as_slice
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import acting
+from alidade.pipelines.estimation.parameters import stated as stated_figure
 from alidade.pipelines.estimation.priors import rotation_about, vector_prior
 from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
@@ -123,7 +124,9 @@ def _error_map(config: Config, model: _Model, _: Estimate) -> ErrorMap | None:
     products = [alone[:, i] * alone[:, j] for i in (0, 2) for j in (1, 3)]
     places = {"azimuth": model.angles[:, 0], "elevation": model.angles[:, 1]}
     harmonics = np.column_stack([alone, *products])
-    return ErrorMap.of(LOS_MAP, config, _FAMILIES, model.chain.time, harmonics, places)
+    return ErrorMap.of(
+        LOS_MAP.name, "xz", stated_figure(config, LOS_MAP), _FAMILIES, model.chain.time, harmonics, places
+    )
 
 
 def _noises(data: LosData, config: Config) -> dict[str, Level]:
