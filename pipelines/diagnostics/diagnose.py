@@ -199,7 +199,7 @@ def _correlations(estimate: Estimate) -> Iterator[Finding]:
             yield Finding("correlation", INCONSISTENT, {"family": family, "share": share})
 
 
-def _error_map(estimate: Estimate, quantities: Sequence[Quantity], limits: Thresholds) -> Iterator[Finding]:
+def _error_map(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
     """Errors by where measurements are made; INCONSISTENT where they are as far above their data sheet as no noise."""
     found = estimate.error_map
     if found is None:
@@ -214,7 +214,7 @@ def _error_map(estimate: Estimate, quantities: Sequence[Quantity], limits: Thres
         "dof": found.dof,
         "effect": effect,
     }
-    yield Finding("error_map", INCONSISTENT if found.rms > limits.noise_factor * found.map.stated else NOTE, evidence)
+    yield Finding("error_map", INCONSISTENT if found.rms > LIMITS.noise_factor * found.map.stated else NOTE, evidence)
 
 
 def _slow_errors(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
