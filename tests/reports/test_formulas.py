@@ -260,6 +260,8 @@ NOT_UNDONE = {
     **dict.fromkeys(("camera_focal", "camera_centre_x", "camera_centre_y"), "of pictures; formulas begin at attitudes"),
     **dict.fromkeys(("tag_17_px", "tag_17_py", "tag_17_pz"), "a position; formulas turn, they move nothing"),
     "gyro_dead_band": "added to the size of readings, whose sign no formula has; a premise of the result says so",
+    **dict.fromkeys((f"vision_map_{axis}_17" for axis in "xyz"), "of harmonics that one recording's attitudes have"),
+    **dict.fromkeys((f"los_map_{axis}_17" for axis in "xz"), "of harmonics that one recording's gimbal angles have"),
     "vision_scale": "of angles since the recording's first picture, which later ones do not have",
 }
 
