@@ -188,6 +188,6 @@ def test_the_report_tells_both() -> None:
     page = Page(report_html(calibration("cube")))
     assert "Sensitivity to fixed inputs" in page.text
     assert "latitude_deg 0.1 deg nothing noticeably" in page.text  # the field's strength is measured
-    assert re.search(r"tag_size 0.2 % [a-z]+_k\d\d [^<]* more by less", page.text)
+    assert re.search(r"tag_size 0\.2 % [a-z]+_k\d\d [+-]\d\.\d σ", page.text)
     assert "Most influential measurements 20 rows" in page.text
     assert "Sensitivity to fixed inputs" not in Page(report_html(calibration("head"))).text

@@ -244,12 +244,16 @@ def test_most_influential_measurements_are_in_balance_with_all_others() -> None:
     np.testing.assert_allclose([pull.sigmas for pull in first], expected, rtol=1e-4)
 
 
+# Beginnings of numbers that have a prior together.
+JOINT = ("field_", "tag_")
+
+
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_square_root_information_with_device_priors_is_all_there_is(name: str) -> None:
     case = dense(name)
     reported = case.reported
-    # The prior of the field is about three numbers together.
-    device = {name for i in reported.free[::2] if not (name := reported.names[i]).startswith("field_")}
+    # Priors of the field, and of the tags of a drawing, are about several numbers together.
+    device = {name for i in reported.free[::2] if not (name := reported.names[i]).startswith(JOINT)}
     told = sqrt_information(case.compiled, case.linearization, case.values, device)
     information = told.R.T @ told.R + told.prior_R.T @ told.prior_R
     expected = case.numbers @ case.covariance @ case.numbers.T
