@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import Advise, verdict, weak_directions
 from alidade.pipelines.estimation.disturbances import intervals
@@ -92,7 +93,7 @@ def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
     """Why there is no solution: what the solver said, and before it that most parameters are not determined."""
     found = [verdict(q, sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True) if q.judged]
     open_ones, free = found.count("unobservable"), len(found) - found.count("fixed")
-    if estimate.converged or open_ones <= _MOST * free:
+    if estimate.converged or deadline.passed() or open_ones <= _MOST * free:
         return estimate.message
     return (
         f"the recording is too short, or has too little motion, for {open_ones} of {free} parameters "

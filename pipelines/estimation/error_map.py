@@ -34,7 +34,7 @@ _LEAST = 0.01
 # The data sheet that it is on.
 SHEET = "camera.map"
 # Of a variance, in the budget.
-SOURCE = "errors that depend on the attitude"
+SOURCE = "errors by where measurements are made"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +161,7 @@ class FoundMap:
     Attributes:
         map: with the prior in force, wider than its data sheet where that is too small.
         error: (n, axes) of the measurements, in the unit of the map.
-        chi_square, dof: of the score test that found it.
+        chi_square, dof: of the score test, at the levels found with it.
         names: of the estimate's numbers.
         shift: (n,) by which correcting the errors moves them.
         columns: (n, m) S: its uncertainty adds S S' to their covariance.

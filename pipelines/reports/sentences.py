@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
+from alidade.pipelines.diagnostics.change_test import CHANGE
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded, to_digits_of
+from alidade.pipelines.estimation.error_map import SOURCE
 from alidade.pipelines.estimation.finding import Finding, Severity, status
 from alidade.pipelines.estimation.parameters import kind as kind_of
 from alidade.pipelines.estimation.problem import Quantity
@@ -483,6 +485,8 @@ def _described(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
         return source, "record longer, or more often"
     if source == WALK:
         return source, "calibrate more often"
+    if source in (CHANGE, SOURCE):
+        return source, "find what changed" if source == CHANGE else "calibrate the camera, or move the other ways too"
     if not source.startswith(_PRIOR):
         return f"{source} noise", "record longer, or measure it better"
     of = source.removeprefix(_PRIOR)

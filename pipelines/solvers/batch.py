@@ -96,6 +96,7 @@ class Solved:
         levels: of the noises.
         posterior: of the reported numbers, weak directions at their priors.
         second: the second best solution, if it is close.
+        stopped: whether the time limit had passed when it was made.
     """
 
     compiled: Compiled
@@ -103,6 +104,7 @@ class Solved:
     levels: tuple[Level, ...]
     posterior: Posterior
     second: Minimum | None = None
+    stopped: bool = False
 
     @property
     def converged(self) -> bool:
@@ -111,7 +113,7 @@ class Solved:
         Along weak directions the cost varies by chance: where it is least there says nothing.
         """
         constrained = self.posterior.converged and self.posterior.directions.weak.shape[1] > 0
-        return self.solution.converged or (constrained and not deadline.passed())
+        return self.solution.converged or (constrained and not self.stopped)
 
     @property
     def message(self) -> str:
@@ -168,7 +170,8 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
                 solution, start = estimate_noise(rest, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
     posterior = unfinished if deadline.passed() and not solution.converged else constrained_solution
-    return Solved(compiled, solution, start, posterior(compiled, solution.at_inliers()), second)
+    found = posterior(compiled, solution.at_inliers())
+    return Solved(compiled, solution, start, found, second, stopped=deadline.passed())
 
 
 def solve_batch(

@@ -13,6 +13,7 @@ measurements and residuals stay those without the map.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from alidade.factors.chi_square import quantile
 from alidade.factors.error_map import ErrorMapFactor
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.error_map import ErrorMap, FoundMap
-from alidade.pipelines.estimation.problem import Array, Estimate, PosteriorHistory, Problem, SqrtInformation
+from alidade.pipelines.estimation.problem import Array, Estimate, History, PosteriorHistory, Problem, SqrtInformation
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
@@ -31,8 +32,8 @@ from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.posterior import sqrt_information
-from alidade.pipelines.solvers.posterior_history import posterior_history
-from alidade.pipelines.solvers.weak_directions import constrained_solution
+from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
+from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
 # Share of recordings without such errors in which they are found.
 FALSE_ALARMS = 1e-2
@@ -62,6 +63,7 @@ def with_error_map(problem: Problem, engine: Linearization, values: Values, esti
     try:
         return _freed(problem, error_map, estimate, ratio)
     except (IndeterminateStateError, np.linalg.LinAlgError):
+        deadline.passed(_WHAT)
         return estimate
 
 
@@ -74,14 +76,17 @@ def _freed(problem: Problem, error_map: ErrorMap, estimate: Estimate, ratio: flo
         near = replace(estimate, names=information.names, values=information.at)
         compiled, solution, information = _solved(problem, error_map, near)
     if not solution.converged:
+        deadline.passed(_WHAT)
         return estimate
+    posterior = constrained_solution(compiled, solution)
     rows, root = _rows(information, error_map)
     p, own = len(rows) - len(root), _own(information, error_map)
     # Given the map the numbers move by -R_xx^-1 R_xc c; with its prior the information on c is R_cc' R_cc + 1 / p^2.
-    gain = -np.linalg.lstsq(rows[:p, :p], rows[:p, p:-1], rcond=None)[0]
+    gain = np.asarray(-np.linalg.lstsq(rows[:p, :p], rows[:p, p:-1], rcond=None)[0], dtype=float)
+    gain = _along_strong(gain, [name for name in information.names if name not in error_map.names], posterior)
     R = np.concatenate([root[:-1, :-1], np.eye(len(error_map.names)) / error_map.prior])
     spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
-    at = dict(zip(information.names, information.at.tolist(), strict=True))
+    at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
     shift = np.array([at.get(name, value) for name, value in zip(estimate.names, estimate.values, strict=True)])
     columns = np.zeros((len(estimate.names), spread.shape[1]))
     columns[[estimate.names.index(name) for name in information.names if name in estimate.names]] = gain @ spread
@@ -95,7 +100,18 @@ def _freed(problem: Problem, error_map: ErrorMap, estimate: Estimate, ratio: flo
         columns,
     )
     out = replace(found.applied(estimate), error_map=found)
-    return _with_history(out, compiled, solution) if error_map.moves else out
+    return _with_history(out, compiled, posterior) if error_map.moves else out
+
+
+def _along_strong(gain: Array, names: Sequence[str], posterior: Posterior) -> Array:
+    """Moves (n, k) of numbers without their part along weak directions, which stay at their priors."""
+    reported, weak = posterior.reported, posterior.directions.weak
+    if not weak.shape[1]:
+        return gain
+    free = [reported.names[i] for i in reported.free]
+    at = [free.index(name) for name in names]
+    axes, scale = np.linalg.qr(weak[at])[0], reported.scale[at][:, None]
+    return np.asarray(gain - scale * (axes @ (axes.T @ (gain / scale))))
 
 
 def _solved(problem: Problem, error_map: ErrorMap, estimate: Estimate) -> tuple[Compiled, Solution, SqrtInformation]:
@@ -122,15 +138,18 @@ def _rows(information: SqrtInformation, error_map: ErrorMap) -> tuple[Array, Arr
     return rows, rows[-own.sum() - 1 :, -own.sum() - 1 :]
 
 
-def _with_history(estimate: Estimate, compiled: Compiled, solution: Solution) -> Estimate:
-    """The estimate with the history of the solution with the map in place of its own; without it the map changes it."""
-    history = estimate.posterior_history and posterior_history(compiled, constrained_solution(compiled, solution))
-    if history is None:
-        return estimate
+def _with_history(estimate: Estimate, compiled: Compiled, posterior: Posterior) -> Estimate:
+    """The estimate with the histories of the solution with the map in place of its own: without it the map shows."""
     n = len(estimate.names)
+    bias = smoothed(compiled, posterior, posterior.covariance)
+    if bias is not None:
+        bias = History(bias.time, bias.values[:, :n], bias.sigmas[:, :n])
+    history = estimate.posterior_history and posterior_history(compiled, posterior)
+    if history is None:
+        return replace(estimate, smoothed=bias)
     own = PosteriorHistory(history.time, history.values[:, :n], history.covariance[:, :n, :n], history.steady[:n])
     wide = sigma_ratio(np.diag(own.covariance[-1]), np.diag(estimate.covariance))
-    return replace(estimate, posterior_history=own, history=own.history.inflated(wide))
+    return replace(estimate, smoothed=bias, posterior_history=own, history=own.history.inflated(wide))
 
 
 def _tested(root: Array, error_map: ErrorMap, ratio: float) -> tuple[float, int, float]:

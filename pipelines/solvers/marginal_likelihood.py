@@ -802,6 +802,8 @@ def maximise_likelihood(
     """
     _, _, nodes, c, _ = linearization.layout.sizes
     for _ in range(rounds):
+        if deadline.passed():
+            break
         chain = LinearChain.of(linearization, start.values)
         levels = estimate_levels(chain, start.levels, start.widening, start.outliers, from_above).levels
         wide, outliers = widened(chain, levels, start.outliers)

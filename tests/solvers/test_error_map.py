@@ -93,6 +93,15 @@ def test_map_is_drawn_over_where_measurements_were_made() -> None:
     assert any("los_map" in title for title in titles)
 
 
+def test_a_map_moves_nothing_that_the_recording_does_not_determine() -> None:
+    """A carrier that only yaws leaves delta_px to its prior; freed with a map it went to -0.17 rad."""
+    carrier = methods.method("los").settings("los_nominal").model_dump()["carrier"]
+    found = _session("los", 2e-4, 2, 12.0, carrier=carrier | {"pitch": [], "roll": []}).calibrate("batch", report=False)
+    assert found.estimate.error_map is not None
+    assert abs(found.parameters["delta_px"].value) < 0.01
+    assert np.abs(_errors(found)).max() < 3.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rms", [0.0, 3e-5, 1e-4, 3e-4])
 def test_sigmas_are_right_over_seeds_with_los_maps(rms: float) -> None:
