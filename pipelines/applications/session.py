@@ -393,8 +393,7 @@ class Session:
             return ()
         from alidade.pipelines.solvers.freed import freed_information
 
-        ratios = estimate.inflations if estimate.sandwich is None else estimate.inflations * estimate.sandwich
-        ratio = max((r for r, q in zip(ratios.tolist(), quantities, strict=True) if q.judged), default=1.0)
+        ratio = estimate.widest(quantities)
         freed, found = self._freed[1], estimate.error_map
         if found is not None:
             freed, quantities = found.map.added_to(freed), (*quantities, *found.map.parameter.quantities)

@@ -12,6 +12,7 @@ from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import Advise, verdict, weak_directions
 from alidade.pipelines.estimation.disturbances import intervals
+from alidade.pipelines.estimation.error_map import UNIT
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import prior_z_score
@@ -208,7 +209,7 @@ def _error_map(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[F
     effect = {q.name: float(shift) for q, shift in zip(quantities, found.shift, strict=True) if q.required and shift}
     evidence = {
         "name": found.map.name,
-        "unit": found.map.unit,
+        "unit": UNIT,
         "rms": found.rms,
         "prior": found.map.stated,
         "chi_square": found.chi_square,

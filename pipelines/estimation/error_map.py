@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -31,8 +32,8 @@ from alidade.pipelines.estimation.widening import marginalised, widened
 
 # Components of harmonics below this share of the largest one's rms are of high order, or noise.
 _LEAST = 0.01
-# The data sheet that it is on.
-SHEET = "camera.map"
+# The data sheet that it is on, and the unit of its numbers.
+SHEET, UNIT = "camera.map", "rad"
 # Of a variance, in the budget.
 SOURCE = "errors by where measurements are made"
 
@@ -42,7 +43,7 @@ class ErrorMap:
     """A map that measurements of some families may have.
 
     Attributes:
-        name, unit, axes, sheet: of its parameters, which are named after it and the axes, a letter each.
+        name, axes: its parameters are named after it and the axes, a letter each.
         prior: sigma of each, in force.
         stated: that of the data sheet.
         families: of the measurements.
@@ -53,9 +54,7 @@ class ErrorMap:
     """
 
     name: str
-    unit: str
     axes: str
-    sheet: str
     prior: float
     stated: float
     families: tuple[str, ...]
@@ -84,32 +83,19 @@ class ErrorMap:
             return None
         order = np.argsort(time, kind="stable")
         functions, places = U[:, kept] * np.sqrt(len(time)), {place: x[order] for place, x in places.items()}
-        return cls(name, "rad", axes, SHEET, prior, prior, families, time[order], functions[order], places, moves)
+        return cls(name, axes, prior, prior, families, time[order], functions[order], places, moves)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of its parameters, function by function."""
+        return tuple(f"{self.name}_{axis}_{j + 1}" for j in range(self.functions.shape[1]) for axis in self.axes)
 
     @property
     def parameter(self) -> Parameter:
         """Its variable."""
-        names = [f"{self.name}_{axis}_{j + 1}" for j in range(self.functions.shape[1]) for axis in self.axes]
-        return Parameter(
-            int(gtsam.symbol("M", 0)),
-            tuple(
-                Quantity(
-                    name,
-                    self.unit,
-                    self.prior,
-                    self.stated,
-                    math.inf,
-                    group="assumption",
-                    sheet=self.sheet,
-                )
-                for name in names
-            ),
-        )
-
-    @property
-    def names(self) -> list[str]:
-        """Its parameters."""
-        return [q.name for q in self.parameter.quantities]
+        numbers = self.prior, self.stated, math.inf
+        quantities = (Quantity(name, UNIT, *numbers, group="assumption", sheet=SHEET) for name in self.names)
+        return Parameter(int(gtsam.symbol("M", 0)), tuple(quantities))
 
     def functions_at(self, time: Array) -> Array:
         """Functions (m, k) of the measurements at their times (m,), s."""

@@ -662,6 +662,11 @@ class Estimate:
         """Inflation (n,), ones where `inflation` is None."""
         return np.ones(len(self.values)) if self.inflation is None else self.inflation
 
+    def widest(self, quantities: Sequence[Quantity]) -> float:
+        """Largest ratio, at least 1, of a judged quantity's sigma by correlated residuals to that by white noise."""
+        ratios = self.inflations if self.sandwich is None else self.inflations * self.sandwich
+        return float(ratios[[q.judged for q in quantities]].max(initial=1.0))
+
 
 def slow_widening(sandwich: Array | None, n: int) -> Array:
     """Factor (n,) of sigmas for slow errors, given ratios of sandwich to nominal sigma; None: not looked for."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from alidade.factors.chi_square import interval
 from alidade.pipelines.display.figure import AXES, COLORS, PALE, REJECTED, Figure, Plot
 from alidade.pipelines.display.units import human_unit, noise_unit
-from alidade.pipelines.estimation.error_map import FoundMap
+from alidade.pipelines.estimation.error_map import UNIT, FoundMap
 from alidade.pipelines.estimation.problem import Array, History, Quantity, Residuals
 from alidade.pipelines.reports.result import Calibration, quantities_of
 
@@ -57,7 +57,7 @@ def common_plots(calibration: Calibration) -> list[Plot]:
 def _error_map(found: FoundMap) -> Plot:
     """The errors found over each number of where measurements were made."""
     places, figures = list(found.map.places.items()), list[Figure]()
-    unit, factor = noise_unit(found.map.name, found.map.unit)
+    unit, factor = noise_unit(found.map.name, UNIT)
     for i, (place, x) in enumerate(places):
         out = Figure(f"error, {unit}" if i == 0 else "", f"{place}, deg", share=1.0 / len(places), y_shared=i > 0)
         for axis, error in zip(found.map.axes, found.error.T, strict=True):

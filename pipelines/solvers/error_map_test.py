@@ -55,7 +55,7 @@ def with_error_map(problem: Problem, engine: Linearization, values: Values, esti
     if error_map is None or not engine.is_chain or deadline.passed(_WHAT):
         return estimate
     mapped, at = _mapped(engine, values, error_map)
-    k, ratio = len(error_map.names), _ratio(problem, estimate)
+    k, ratio = len(error_map.names), estimate.widest(problem.quantities)
     root = mapped.at(at)[0].eliminate().root
     chi_square, dof, _ = _tested(root[-k - 1 :, -k - 1 :], error_map, ratio)
     if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
@@ -83,20 +83,21 @@ def _freed(problem: Problem, error_map: ErrorMap, estimate: Estimate, ratio: flo
     p, own = len(rows) - len(root), _own(information, error_map)
     # Given the map the numbers move by -R_xx^-1 R_xc c; with its prior the information on c is R_cc' R_cc + 1 / p^2.
     gain = np.asarray(-np.linalg.lstsq(rows[:p, :p], rows[:p, p:-1], rcond=None)[0], dtype=float)
-    gain = _along_strong(gain, [name for name in information.names if name not in error_map.names], posterior)
+    others = [name for name, is_own in zip(information.names, own, strict=True) if not is_own]
+    gain = _along_strong(gain, others, posterior)
     R = np.concatenate([root[:-1, :-1], np.eye(len(error_map.names)) / error_map.prior])
     spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
     at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
-    shift = np.array([at.get(name, value) for name, value in zip(estimate.names, estimate.values, strict=True)])
+    shift = np.array([at[name] for name in estimate.names]) - estimate.values
     columns = np.zeros((len(estimate.names), spread.shape[1]))
-    columns[[estimate.names.index(name) for name in information.names if name in estimate.names]] = gain @ spread
+    columns[[estimate.names.index(name) for name in others]] = gain @ spread
     found = FoundMap(
         error_map,
         error_map.error(information.at[own]),
         chi_square,
         dof,
         estimate.names,
-        shift - estimate.values,
+        shift,
         columns,
     )
     out = replace(found.applied(estimate), error_map=found)
@@ -160,12 +161,6 @@ def _tested(root: Array, error_map: ErrorMap, ratio: float) -> tuple[float, int,
     likely = _SIGMAS[np.argmin((np.log(variances) + squares / variances).sum(axis=1))]
     rms = np.sqrt(error_map.functions.shape[1]) * error_map.prior * likely
     return float(squares[seen].sum()), int(seen.sum()), float(rms)
-
-
-def _ratio(problem: Problem, estimate: Estimate) -> float:
-    """What coloured residuals widen the sigma of a parameter that is judged by, at most."""
-    ratios = estimate.inflations if estimate.sandwich is None else estimate.inflations * estimate.sandwich
-    return float(ratios[[q.judged for q in problem.quantities]].max(initial=1.0))
 
 
 def _mapped(engine: Linearization, values: Values, error_map: ErrorMap) -> tuple[Linearization, Values]:

@@ -37,7 +37,7 @@ def test_the_scale_is_named_first(recording: Path, tmp_path: Path) -> None:
     assert conflicts[0]["parameter"] == "gyro_scale_x"
     assert abs(conflicts[0]["z"]) > 10.0
     assert 0.4 < np.rad2deg(abs(conflicts[0]["effect"]["helmet_mount_y"])) < 0.9
-    # What is said to be contradicted is applied: without it the rates of turns are off by 7 %.
+    # A contradicted parameter is applied: without it the rates of turns are off by 7 %.
     assert {"gyro_scale_x", "gyro_scale_y"} <= set(found.applied)
 
 

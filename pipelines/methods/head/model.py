@@ -283,7 +283,7 @@ def _prepare(
 def _carrier(gyro: GyroPath, force: Array | None) -> GyroPath:
     """The gyro that carries attitudes from keyframes to pictures, its rates at rest by their mean.
 
-    The time offset turns what is seen by the rate: at rest by noise, which tells nothing of it but seems to.
+    The time offset turns what is seen by the rate: at rest by noise, which passes for information about it.
     """
     rate = mean_at_rest(gyro.t, gyro.read, force)
     return gyro if rate is gyro.read else gyro.with_rate(rate)

@@ -224,7 +224,7 @@ class Group:
 
     @property
     def duration(self) -> float:
-        """Length of the group, s."""
+        """Time from the begin of a group of turns to its end, s."""
         return float(self.rates.edges[-1] - self.rates.edges[0])
 
     @property

@@ -171,7 +171,7 @@ class Turning:
         return 0 if self.chain.errors is None else len(self.chain.errors.quantities)
 
     def elapsed(self, time: Array) -> Array:
-        """Time (n,), s, since the first keyframe, at which a and n coincide."""
+        """Times (n,) as s since the first keyframe, where the frames a (inertial) and n (level) coincide."""
         return np.asarray(time - self.chain.time[0])
 
     def aRn(self, time: Array, values: gtsam.Values) -> Array:

@@ -139,7 +139,7 @@ def test_axes_never_turned_are_named() -> None:
 
 
 def test_a_face_never_seen_is_known_as_well_as_it_is_glued() -> None:
-    """How the tag of the lowest id is turned, the others tell."""
+    """A turn of the tag of the lowest id shows in the others."""
     data, _, config = _simulated(9, **NEAR_MODEL, cube=TagCube(hidden=(19,)))
     _, estimate, _ = _solved(data, config.model_copy(update={"priors": FIELD}))
     sigmas = dict(zip(estimate.names, estimate.sigmas, strict=True))
