@@ -650,10 +650,13 @@ class Estimate:
     def sensitivities(self) -> Array:
         """Shift (n, n) of each number, a row, per unit by which another, a column, is shifted; 0 for fixed ones.
 
-        Of the covariance without slow errors: these widen each number by itself.
+        Of the covariance without what only widens sigmas: slow errors, and a map of errors that moves nothing.
         """
+        P, found = self.covariance, self.error_map
+        if found is not None and not found.map.moves:
+            P = P - found.columns @ found.columns.T
         widened = slow_widening(self.sandwich, len(self.values))
-        P = self.covariance / np.outer(widened, widened)
+        P = P / np.outer(widened, widened)
         variances = np.diag(P)
         return P / np.where(variances > 0.0, variances, np.inf)
 
