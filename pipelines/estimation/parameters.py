@@ -217,7 +217,8 @@ def quantities(
             return Quantity(name, spec.unit, prior, spec.prior, require, extra_sigma)
         usual = sheet or spec.prior
         prior = _FREE * usual if prior is None else prior
-        return Quantity(name, spec.unit, prior, usual, require, group="assumption", sheet=spec.data_sheet)
+        figure = "" if name in config.priors else spec.data_sheet
+        return Quantity(name, spec.unit, prior, usual, require, group="assumption", sheet=figure)
 
     return tuple(map(quantity, spec.names))
 

@@ -206,18 +206,21 @@ def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[
 
 
 def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
-    """The `sensors` section that allows for what contradicts its data sheet; empty where nothing does."""
-    figures: dict[str, dict[str, float]] = {}
+    """The config's keys that allow for what contradicts its data sheet or prior; empty where nothing does."""
+    stated: dict[str, dict[str, float]] = {}  # sensor, or none for `priors` -> figure or parameter -> size
     for e in (finding.evidence for finding in findings if finding.kind == "prior_conflict"):
-        sensor, _, figure = quantities[e["parameter"]].sheet.partition(".")
-        if sensor:
-            known = figures.setdefault(sensor, {})
-            known[figure] = max(known.get(figure, 0.0), abs(e["value"] - quantities[e["parameter"]].prior_mean))
-    sections = (
-        f"{sensor}: {{{', '.join(f'{figure}: {size:.1g}' for figure, size in known.items())}}}"
-        for sensor, known in figures.items()
-    )
-    return f"If the device is so, state it: `sensors: {{{', '.join(sections)}}}`." if figures else ""
+        q = quantities[e["parameter"]]
+        if q.group == "assumption":
+            sensor, _, figure = q.sheet.partition(".")
+            known = stated.setdefault(sensor, {})
+            known[figure or q.name] = max(known.get(figure or q.name, 0.0), abs(e["value"] - q.prior_mean))
+    written = {
+        sensor: f"{{{', '.join(f'{name}: {size:.1g}' for name, size in known.items())}}}"
+        for sensor, known in stated.items()
+    }
+    priors = [f"`priors: {written.pop('')}`"] if "" in written else []
+    sensors = [f"`sensors: {{{', '.join(map(': '.join, written.items()))}}}`"] if written else []
+    return f"If the device is so, state it: {' and '.join([*sensors, *priors])}." if stated else ""
 
 
 def _direction(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:

@@ -56,6 +56,8 @@ def test_priors_beat_sheets_beat_the_usual_grade(config: str, prior: float, usua
     assert x.prior_scale == pytest.approx(usual)
     assert x.group == "assumption"
     assert not x.judged
+    # A figure of the data sheet that a prior of its own overrules is none to state.
+    assert x.sheet == ("" if "priors" in config else "gyro.scale")
     sheets = load_config(config.encode()).model_copy(update={"priors": {}})
     assert y == replace(quantities(SCALE, sheets)[1], prior_scale=y.prior_scale)
 

@@ -248,6 +248,13 @@ def test_a_departure_that_is_significant_is_applied_though_its_sigma_is_nearly_t
     assert replace(calibration, problem=known).applied == list(names)
     (note,) = (note for note in sentences.notes(diagnose(estimate, scales), calibration.quantities) if "state" in note)
     assert note == "If the device is so, state it: `sensors: {gyro: {scale: 0.08}}`"
+    # A prior of the config's own goes before the data sheet, which would change nothing.
+    own = replace(problem, parameters=(Parameter(9, (replace(scales[0], sheet=""), *scales[1:])),))
+    priors = replace(calibration, problem=own)
+    (note,) = (
+        note for note in sentences.notes(diagnose(estimate, own.quantities), priors.quantities) if "state" in note
+    )
+    assert note.endswith("state it: `sensors: {gyro: {scale: 0.04}}` and `priors: {gyro_scale_x: 0.08}`")
 
 
 # Parameters that no formula uses, and why.
