@@ -362,11 +362,14 @@ def validate(
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import validation_json
     from alidade.pipelines.reports.validation_report import validation_report, write_validation
+    from alidade.pipelines.reports.whole import require_room
 
+    folder = out or _beside(session, "validation")
+    require_room(folder)
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
         with progress.doing("validating"):
             validated = run(session, calibration, method=method, config=config, strict=strict)
-        written = write_validation(out or _beside(session, "validation"), validated)
+        written = write_validation(folder, validated)
     if as_json:
         print(validation_json(validated))
     else:

@@ -248,10 +248,13 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
         for name in (
             "alidade.pipelines.applications.session.open_session",
             "alidade.pipelines.applications.follow.follow.follow",
+            "alidade.pipelines.applications.validate.validate",
         ):
             patched.setattr(name, worked)
         for command in ("calibrate", "compare", "follow"):
             _refused(alidade(command, session, "--out", out), out, ("no folder to write results to", "file"))
+        validate = ("validate", session, "--calibration", tmp_path / "file", "--out", out)
+        _refused(alidade(*validate), out, ("no folder to write results to", "file"))
         _refused(alidade("demo", "--out", tmp_path / "file"), out, ("no folder to write results to",))
         _refused(alidade("follow", session, "--checkpoint", out / "run.npz"), out, ("no folder to write",))
     for path in (out, tmp_path / "none" / "s.mcap", tmp_path):
