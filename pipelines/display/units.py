@@ -17,7 +17,7 @@ _UNITS: dict[str, tuple[str, float]] = {
     "rad/s": ("deg/s", _DEG),
     "s": ("ms", 1e3),
     "T": ("nT", 1e9),
-    "": ("ppm", 1e6),
+    "": ("%", 100.0),
     "rad/s/K": ("deg/s/K", _DEG),
     "rad/s/(m/s^2)": ("deg/s/g", _DEG * _G),
     "m/s^2": ("m/s²", 1.0),
@@ -29,12 +29,15 @@ _UNITS: dict[str, tuple[str, float]] = {
 }
 # What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
 _FINE = 2e-4
+# A plain number whose usual prior is smaller than this is read in millionths.
+_SMALL, _PPM = 1e-3, ("ppm", 1e6)
 _FINE_UNITS = {**_UNITS, "rad": ("arcsec", _DEG * 3600.0), "rad/s": ("deg/h", _DEG * 3600.0)}
 
 
 def human_unit(quantity: Quantity) -> tuple[str, float]:
     """The unit to show a quantity in, empty for a plain number, and what to multiply its SI number by."""
-    return shown_unit(quantity.unit, quantity.require)
+    small = quantity.unit == "" and quantity.prior_scale < _SMALL
+    return _PPM if small else shown_unit(quantity.unit, quantity.require)
 
 
 def shown_unit(unit: str, require: float | None) -> tuple[str, float]:

@@ -265,7 +265,7 @@ class Report:
         uses: estimate, config, noise used by name (SI) -> uses of a result, with the error that it leaves.
         corrections: topics whose sensors the formulas correct.
         cards: of the report's results: title -> groups of numbers, each with its title, the unit (deg, deg/s, deg/h,
-            ms, %, ppm or µT; empty: the usual one) and the parameters; parameters of no card stand in a last one.
+            ms or µT; any other: the usual one) and the parameters; parameters of no card stand in a last one.
         residual_names: family of measurements -> names of its residuals that are not x, y, z.
     """
 

@@ -24,8 +24,8 @@ from alidade.pipelines.reports.result_json import truth_errors
 
 _G, _DEG = 9.80665, math.degrees(1.0)
 _BIAS_UNITS = {"accel": ("mg", 1e3 / _G), "gyro": ("deg/s", _DEG), "mag": ("µT", 1e6)}
-# Units that a method's cards may name, and what SI numbers are multiplied by.
-CARD_UNITS = {"deg": _DEG, "deg/s": _DEG, "deg/h": 3600.0 * _DEG, "ms": 1e3, "%": 100.0, "ppm": 1e6, "µT": 1e6}
+# Units that a method's cards may name, and what SI numbers are multiplied by; others are shown in their usual unit.
+_CARD_UNITS = {"deg": _DEG, "deg/s": _DEG, "deg/h": 3600.0 * _DEG, "ms": 1e3, "µT": 1e6}
 # Scale errors below this are shown in ppm.
 _PPM = 1e-3
 # A value whose sigma exceeds so many sigmas of its prior is not shown.
@@ -165,9 +165,8 @@ def _rows(card: ResultCard) -> Iterator[Row]:
 
 def _group(c: Calibration, title: str, unit: str, names: Sequence[str]) -> ResultGroup:
     quantities = {q.name: q for q in quantities_of(c.problem, c.estimate)}
-    human, factor = human_unit(quantities[names[0]])
-    if unit:
-        human, factor = unit, CARD_UNITS[unit]
+    known = (unit, _CARD_UNITS[unit]) if unit in _CARD_UNITS else None
+    human, factor = known or human_unit(quantities[names[0]])
     errors = truth_errors(c)
     rows = []
     for name in names:

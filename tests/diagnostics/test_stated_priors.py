@@ -92,7 +92,7 @@ def test_the_score_of_a_fixed_number_is_what_it_is_alone_freed() -> None:
     assert evidence["z"] == pytest.approx(alone[2] / covariance[2, 2] ** 0.5)
     assert evidence["effect"]["a"] == pytest.approx(alone[0] - fixed_at[0])
     text = sentence(found, {q.name: q for q in freed[:2]})
-    assert text.startswith("b is fixed at 0 ppm by the config, and the recording contradicts it")
+    assert text.startswith("b is fixed at 0.0 % by the config, and the recording contradicts it")
 
 
 def test_what_is_fixed_is_freed_and_what_is_tight_with_it() -> None:

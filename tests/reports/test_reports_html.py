@@ -125,6 +125,12 @@ def test_units_people_read(unit: str, require: float, shown: str) -> None:
     assert factor == pytest.approx(factors.get(shown, 1.0))
 
 
+def test_a_share_is_read_in_percent_or_in_ppm_by_its_usual_prior() -> None:
+    """A gyro's scale error and a clock's, in tables and in notes alike."""
+    assert human_unit(Quantity("gyro_scale_x", "", 1e-4, 1e-2, np.inf)) == ("%", 100.0)
+    assert human_unit(Quantity("clock_skew", "", 1e-2, 1e-4, np.inf)) == ("ppm", 1e6)
+
+
 @pytest.mark.parametrize(
     ("value", "sigma", "text"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from dataclasses import replace
 from functools import cache
 from html import unescape
 from pathlib import Path
@@ -14,14 +15,15 @@ import alidade
 from alidade.pipelines.display.figure import Figure
 from alidade.pipelines.display.svg import interval_bar, svg, ticks
 from alidade.pipelines.display.table import Interval
-from alidade.pipelines.display.units import rounded, to_digits_of
-from alidade.pipelines.methods import method, names
+from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.methods import Report, method, names
 from alidade.pipelines.methods.triads import parts_of, sensor_model
 from alidade.pipelines.reports.calibration_report import calibration_report, report_html
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.reports.results_table import CARD_UNITS, result_cards
+from alidade.pipelines.reports.results_table import result_cards
 from alidade.pipelines.reports.terminal import console, print_report
 from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_browser, running
+from tests.support.builders import make_calibration
 from tests.support.pages import Page
 
 # Open content, px, that a report may have at both widths.
@@ -31,9 +33,8 @@ CASES = [pytest.param(name, marks=[pytest.mark.slow] * (name != "tumble")) for n
 
 
 @pytest.mark.parametrize("name", names())
-def test_cards_are_of_parameters_in_units_that_reports_have(name: str) -> None:
+def test_cards_are_of_parameters(name: str) -> None:
     groups = [group for card in method(name).report.cards.values() for group in card]
-    assert {unit for _, unit, _ in groups} <= {"", *CARD_UNITS}
     for parameter in (each for _, _, parameters in groups for each in parameters):
         assert method(name).describe(parameter), parameter
 
@@ -71,6 +72,16 @@ def test_print_to_pdf_has_the_plots_that_are_collapsed_on_the_screen(tmp_path: P
     subprocess.run([str(CHROMIUM), *options, f"--print-to-pdf={pdf}", page], check=True, capture_output=True)
     # An image a canvas; frames, grids and lines are of Bokeh's canvas.
     assert pdf.read_bytes().count(b"/Subtype /Image") >= text.count('class="plot"') > 4
+
+
+def test_a_card_in_a_unit_that_is_not_known_has_that_of_its_numbers() -> None:
+    c = make_calibration()
+    name = next(iter(c.values))
+    cards = {"Own": (("Numbers", "furlong", (name,)),)}
+    own = replace(c, method=replace(c.method, report=Report(cards=cards)))
+    (group,) = result_cards(own)[0].groups
+    unit, factor = human_unit(c.quantities[name])
+    assert (group.unit, group.rows[0].value) == (unit, factor * c.values[name])
 
 
 def test_sections_come_in_the_order_in_which_they_are_asked_for() -> None:

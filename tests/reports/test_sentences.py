@@ -52,8 +52,8 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "prior_conflict",
         INCONSISTENT,
         {**CONFLICT, "inseparable": ("gyro_scale_y",), "effect": {"helmet_mount_z": 7e-3}},
-        "gyro_scale_x contradicts its data sheet (or gyro_scale_y, inseparable from it): 60000 ± 1000 ppm, prior 0 ± "
-        "10000 ppm (z = 6.0); its departure shifts helmet_mount_z by 0.40 deg, 0.7 of its requirement.",
+        "gyro_scale_x contradicts its data sheet (or gyro_scale_y, inseparable from it): 6.00 ± 0.10 %, prior 0 ± "
+        "1.0 % (z = 6.0); its departure shifts helmet_mount_z by 0.40 deg, 0.7 of its requirement.",
     ),
     (
         "prior_conflict",

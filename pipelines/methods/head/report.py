@@ -298,12 +298,12 @@ CARDS = {
     ),
     "Helmet gyro": (
         ("Bias", "deg/s", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
-        ("Scale error", "%", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
+        ("Scale error", "", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
     ),
     "Timing and camera": (
         ("Delay of the pictures", "ms", ("time_offset",)),
-        ("Clock skew", "ppm", ("clock_skew",)),
-        ("Scale of vision's angles", "%", ("vision_scale",)),
+        ("Clock skew", "", ("clock_skew",)),
+        ("Scale of vision's angles", "", ("vision_scale",)),
     ),
 }
 REPORT = Report(

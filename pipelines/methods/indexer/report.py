@@ -237,7 +237,7 @@ CARDS = {
     "IMU on the indexer": (("Mounting", "", ("theta_x", "theta_y", "theta_z")),),
     "Gyro": (
         ("Bias", "", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
-        ("Scale error", "ppm", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
+        ("Scale error", "", ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")),
     ),
 }
 REPORT = Report(

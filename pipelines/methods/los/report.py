@@ -314,7 +314,7 @@ CARDS = {
     ),
     "Gimbal geometry": (
         ("Axes and camera", "deg", ("axis_nonperpendicularity", "collimation", "camera_roll")),
-        ("Scale of the LOS error", "%", ("los_scale",)),
+        ("Scale of the LOS error", "", ("los_scale",)),
     ),
 }
 REPORT = Report(
