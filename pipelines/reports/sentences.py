@@ -223,16 +223,8 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
     return f"If the device is so, state it: {' and '.join([*sensors, *priors])}." if stated else ""
 
 
-def _direction(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
-    return _weak(severity, label(e["weights"]), e["sigma_ratio"], e["advice"])
-
-
 def _weak(severity: Severity, labels: str, sigma_ratio: float, advice: str) -> str:
     return f"{_DIRECTIONS[severity]}: {labels} (sigma {sigma_ratio:.2g} of the prior). {capital(advice)}."
-
-
-def _not_converged(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    return f"No solution: {e['message']}. Do not use the values."
 
 
 def _hypothesis(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
@@ -244,10 +236,6 @@ def _hypothesis(e: Mapping[str, Any], severity: Severity, quantities: Quantities
 def _corrected(e: Mapping[str, Any], _: Severity, __: Quantities) -> tuple[str, str]:
     before, after, dof = (rounded(e[key], 4) for key in ("chi_square_before", "chi_square_after", "dof"))
     return e["label"], f"chi-square {before} -> {after}, dof {dof}"
-
-
-def _prior_conflict(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
-    return f"{': '.join(_conflict(e, severity, quantities))}."
 
 
 def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[str, str]:
@@ -271,10 +259,6 @@ def _shift(effect: Mapping[str, float], name: str, quantities: Quantities, what:
     unit, factor = human_unit(quantities[moved])
     shift = f"{rounded(factor * abs(effect[moved]))} {unit}".rstrip()
     return f"; {what} shifts {moved} by {shift}, {abs(shifts[moved]):.2g} of its requirement"
-
-
-def _contradiction(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
-    return f"{': '.join(_fixed(e, severity, quantities))}."
 
 
 def _fixed(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[str, str]:
@@ -331,10 +315,6 @@ def _noise(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     return f"Noise {e['noise']}: {used} used, {e['factor']:.2g} times the {e['source']}'s value."
 
 
-def _correlation(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    return f"Residuals of {e['family']} are correlated over {100.0 * e['share']:.0f} % of the recording."
-
-
 def _error_map(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
     of = "the gimbal angles" if e["name"] == "los_map" else "the attitude"
     unit, factor = noise_unit(e["name"], e["unit"])
@@ -382,10 +362,6 @@ def _ambiguous_solution(e: Mapping[str, Any], _: Severity, quantities: Quantitie
     return f"A second solution is nearly as likely ({higher}): {', '.join(named)}; whole in second_best of result.json."
 
 
-def _solver_difference(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    return f"The run's own last estimate differed by up to {abs(e['z']):.1f} sigma ({e['parameter']})."
-
-
 def _recording(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
     own: Sequence[Finding] = e["findings"]
     return f"{e['recording']} by itself: {' '.join(_sentences(own, quantities))}"
@@ -398,32 +374,32 @@ def _recordings_disagree(e: Mapping[str, Any], _: Severity, __: Quantities) -> s
     return f"The recordings disagree about the device: {sums}."
 
 
-def _remark(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    return str(e["text"])
-
-
 _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] = {
-    "not_converged": _not_converged,
-    "direction": _direction,
+    "not_converged": lambda e, *_: f"No solution: {e['message']}. Do not use the values.",
+    "direction": lambda e, severity, _: _weak(severity, label(e["weights"]), e["sigma_ratio"], e["advice"]),
     "hypothesis": _hypothesis,
-    "prior_conflict": _prior_conflict,
-    "contradiction": _contradiction,
+    "prior_conflict": lambda *finding: f"{': '.join(_conflict(*finding))}.",
+    "contradiction": lambda *finding: f"{': '.join(_fixed(*finding))}.",
     "change": _change,
     "jump": _jump,
     "device_change": _device_change,
     "rejection": _rejection,
     "disturbance": _disturbance,
     "noise": _noise,
-    "correlation": _correlation,
+    "correlation": lambda e, *_: (
+        f"Residuals of {e['family']} are correlated over {100.0 * e['share']:.0f} % of the recording."
+    ),
     "slow_error": _slow_error,
     "error_map": _error_map,
     "misfit": _misfit,
     "dominant_prior": _dominant_prior,
     "ambiguous_solution": _ambiguous_solution,
-    "solver_difference": _solver_difference,
+    "solver_difference": lambda e, *_: (
+        f"The run's own last estimate differed by up to {abs(e['z']):.1f} sigma ({e['parameter']})."
+    ),
     "recording": _recording,
     "recordings_disagree": _recordings_disagree,
-    "remark": _remark,
+    "remark": lambda e, *_: str(e["text"]),
 }
 
 
