@@ -7,7 +7,7 @@ what a command works with is imported by the command.
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from alidade.pipelines.solvers.window import parse_window
 if TYPE_CHECKING:
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.recording.opening import Where
+    from alidade.pipelines.reports.report import Report
     from alidade.pipelines.reports.result import Calibration
 
 # Errors that are printed in one line, by name: to import the second takes gtsam's quarter of a second.
@@ -198,7 +199,6 @@ def calibrate(
     from alidade.pipelines.applications.joint import calibrate_together
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.recording.opening import describe_recordings, group_recordings, naming_parts
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
@@ -216,7 +216,7 @@ def calibrate(
             raise InputError(f"--engine {engine}: with several recordings each uses the engine that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
-            terminal.say(f"{len(recordings)} recordings of one device: {describe_recordings(recordings)}")
+            _say(f"{len(recordings)} recordings of one device: {describe_recordings(recordings)}")
     require_room(folder)
     with (
         progress.shown(quiet or as_json),
@@ -260,8 +260,8 @@ def compare(
     """
     from alidade.pipelines.applications.comparison import compared
     from alidade.pipelines.applications.session import open_session
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.comparison_report import comparison_report
+    from alidade.pipelines.reports.result_json import results_json
     from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
@@ -270,12 +270,8 @@ def compare(
         opened = open_session(session, method, config, strict, auto_topics=auto_topics, prior=prior)
         comparison = compared(opened, kept, halves=out is not None)
         written = None if out is None else comparison.write(out)
-    if as_json:
-        terminal.show_json(comparison.calibrations)
-    else:
-        terminal.print_report(comparison_report(comparison))
-        if written is not None:
-            terminal.say(f"Comparison in {written}")
+    lines = [] if written is None else [f"Comparison in {written}"]
+    _show(as_json, partial(results_json, comparison.calibrations), partial(comparison_report, comparison), *lines)
     if comparison.answer == "no":
         raise typer.Exit(exit_codes.INCONSISTENT)
 
@@ -359,22 +355,19 @@ def validate(
     Has the device changed, and what error remains? Exit code 0 valid, 2 unusable input, 3 not observable, 4 changed.
     """
     from alidade.pipelines.applications.validate import validate as run
-    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import validation_json
-    from alidade.pipelines.reports.validation_report import validation_report, write_validation
-    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.reports.validation_report import validation_report
+    from alidade.pipelines.reports.whole import require_room, write_whole
 
     folder = out or _beside(session, "validation")
     require_room(folder)
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
         with progress.doing("validating"):
             validated = run(session, calibration, method=method, config=config, strict=strict)
-        written = write_validation(folder, validated)
-    if as_json:
-        print(validation_json(validated))
-    else:
-        terminal.print_report(validation_report(validated))
-        terminal.say(f"Plots in {written}")
+        report = validation_report(validated)
+        (written,) = write_whole(folder, {"validation.html": render_html(report)})
+    _show(as_json, partial(validation_json, validated), lambda: report, f"Plots in {written}")
     raise typer.Exit(exit_codes.OF_VALIDATION[validated.verdict])
 
 
@@ -392,11 +385,10 @@ def simulate(
 ) -> None:
     """Simulate a recording, with its truth."""
     from alidade.pipelines.methods import simulate as run
-    from alidade.pipelines.reports import terminal
 
     with progress.shown(quiet), progress.doing("simulating"):
         run(method, scenario, seed, out, images)
-    terminal.say(f"Wrote {out}")
+    _say(f"Wrote {out}")
 
 
 @app.command()
@@ -453,7 +445,6 @@ def plan(
     Exit code 3 if the motion falls short of the requirements.
     """
     from alidade.pipelines.applications.planning import make_plan, requirements
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import plan_json
     from alidade.pipelines.reports.plan_report import plan_report
@@ -461,18 +452,14 @@ def plan(
 
     with progress.shown(quiet or as_json):
         planned = make_plan(method, scenario, config, requirements(require or []))
+    lines = []
     if out is not None:
         write_file(out, planned.scenario_text)
+        lines.append(f"The better motion is in {out}")
     if page is not None:
         write_file(page, render_html(plan_report(planned)))
-    if as_json:
-        print(plan_json(planned))
-    else:
-        terminal.print_report(plan_report(planned))
-        if out is not None:
-            terminal.say(f"The better motion is in {out}")
-        if page is not None:
-            terminal.say(f"The page is {page}")
+        lines.append(f"The page is {page}")
+    _show(as_json, partial(plan_json, planned), partial(plan_report, planned), *lines)
     raise typer.Exit(exit_codes.OF_STATUS[planned.now.status])
 
 
@@ -525,18 +512,16 @@ def noise(
     Gyros, accelerometers, magnetometers; prints the section `noise` of the config.
     """
     from alidade.pipelines.applications.noise import noise as measured
-    from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.noise_report import noise_json, noise_report, write_noise
+    from alidade.pipelines.reports.html import render_html
+    from alidade.pipelines.reports.noise_report import noise_json, noise_report
+    from alidade.pipelines.reports.whole import write_whole
 
     with progress.shown(quiet), deadline.within(time_limit):
         study = measured(session, config=config, strict=strict, auto_columns=auto_columns)
-    written = () if out is None else write_noise(out, study)
-    if as_json:
-        print(noise_json(study), end="")
-        return
-    terminal.print_report(noise_report(study))
+    lines, report, text = list[str](), noise_report(study), noise_json(study)
     if out is not None:
-        terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
+        lines.append(_results_in(out, write_whole(out, {"noise.html": render_html(report), "noise.json": text})))
+    _show(as_json, lambda: text, lambda: report, *lines)
 
 
 @app.command()
@@ -551,7 +536,6 @@ def demo(
     from alidade.pipelines.applications.comparison import Comparison
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.methods import simulate as simulated
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.comparison_report import comparison_report
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import write_results
@@ -565,8 +549,8 @@ def demo(
         calibrations = open_session(session).calibrations(["published", "batch", "incremental"])
         for calibration in progress.track(calibrations, "writing", len(calibrations)):
             write_results(out / calibration.estimate.solver, calibration)
-    terminal.print_report(comparison_report(Comparison(tuple(calibrations))))
-    terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
+    report = partial(comparison_report, Comparison(tuple(calibrations)))
+    _show(False, str, report, f"Report: {(out / 'batch' / 'report.html').resolve()}")
 
 
 @app.command()
@@ -591,7 +575,6 @@ def montecarlo(
     from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study
     from alidade.pipelines.applications.fleet.pages import study_report
     from alidade.pipelines.applications.fleet.write import write_study
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import study_json
 
     folder = out or Path(f"{method}-montecarlo")
@@ -599,14 +582,10 @@ def montecarlo(
     seeds = range(seed, seed + runs)
     with progress.shown(quiet or as_json):
         study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, parse_window(window))
-    written = write_study(folder, study)
-    if as_json:
-        print(study_json(study))
-    else:
-        report = study_report(study)
-        terminal.say(report.about)
-        terminal.print_report(report)
-        terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    written, report = write_study(folder, study), study_report(study)
+    if not as_json:
+        _say(report.about)
+    _show(as_json, partial(study_json, study), lambda: report, _results_in(folder, written))
     if study.interrupted:
         raise typer.Exit(exit_codes.INTERRUPTED)
 
@@ -634,18 +613,13 @@ def fleet(
     """
     from alidade.pipelines.applications.fleet.fleet import Settings
     from alidade.pipelines.applications.fleet.write import run_fleet
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import fleet_json
 
     settings = Settings.of(method, config, solver, parse_window(window), prior)
     with progress.shown(quiet or as_json):
         found = run_fleet(recordings, settings, out, scheduler, jobs, names)
-    if as_json:
-        print(fleet_json(found.outcome, found.populations, found.histories))
-    else:
-        for line in found.summary:
-            terminal.say(line)
-        terminal.say(f"Results in {out}: {', '.join(p.name for p in found.written)}")
+    text = partial(fleet_json, found.outcome, found.populations, found.histories)
+    _show(as_json, text, None, *found.summary, _results_in(out, found.written))
     if found.outcome.interrupted:
         raise typer.Exit(exit_codes.INTERRUPTED)
 
@@ -666,7 +640,6 @@ def export(
 
     Each in the conventions of that program.
     """
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.calibration import load_calibration
     from alidade.pipelines.reports.export_formats import export as exported
     from alidade.pipelines.reports.plain_json import plain_json
@@ -681,7 +654,7 @@ def export(
     elif out is None:
         print(text, end="")
     else:
-        terminal.say(f"Wrote {out}")
+        _say(f"Wrote {out}")
 
 
 @app.command()
@@ -703,18 +676,14 @@ def apply(
     Gyro, accelerometer, magnetometer: /imu/data becomes /imu/data_calibrated beside it.
     """
     from alidade.pipelines.applications.apply import apply as run
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import applied_json
 
     with progress.shown(quiet or as_json):
         applied = run(
             recording, calibration, out, config=config, suffix=suffix, strict=strict, auto_columns=auto_columns
         )
-    if as_json:
-        print(applied_json(applied))
-        return
-    for line in (f"Wrote {out}", *(topic.text for topic in applied.topics), *applied.notes):
-        terminal.say(line)
+    lines = (f"Wrote {out}", *(topic.text for topic in applied.topics), *applied.notes)
+    _show(as_json, partial(applied_json, applied), None, *lines)
 
 
 @app.command()
@@ -732,13 +701,10 @@ def certificate(
 
     certificate.html for printing, certificate.json for programs.
     """
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.certificate import certificate as write
 
     written, missing = write(results, fields, before=before, out=out, pdf=pdf, dcc=digital)
-    terminal.say(f"Wrote {', '.join(map(str, written))}")
-    if missing:
-        terminal.say(f"not stated: {', '.join(missing)}")
+    _say(f"Wrote {', '.join(map(str, written))}", *([f"not stated: {', '.join(missing)}"] if missing else []))
 
 
 app.command("cube-layout")(cube_layout)
@@ -763,15 +729,37 @@ def _tell(
     calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool, everything: bool = False
 ) -> NoReturn:
     """Show a calibration and where its results are; its status is the exit code."""
-    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.calibration_report import calibration_report, short_report
+    from alidade.pipelines.reports.result_json import results_json
 
-    if as_json:
-        terminal.show_json([calibration])
-    else:
-        terminal.print_report((calibration_report if everything else short_report)(calibration), everything)
-        terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    report = partial(calibration_report if everything else short_report, calibration)
+    _show(as_json, partial(results_json, [calibration]), report, _results_in(folder, written), everything=everything)
     raise typer.Exit(exit_codes.OF_STATUS[calibration.status])
+
+
+def _show(
+    as_json: bool, text: Callable[[], str], report: "Callable[[], Report] | None", *lines: str, everything: bool = False
+) -> None:
+    """Print JSON and nothing else; or a report, if there is one, and lines."""
+    if as_json:
+        print(text().removesuffix("\n"))
+        return
+    if report is not None:
+        from alidade.pipelines.reports.terminal import print_report
+
+        print_report(report(), everything)
+    _say(*lines)
+
+
+def _say(*lines: str) -> None:
+    from alidade.pipelines.reports.terminal import say
+
+    for line in lines:
+        say(line)
+
+
+def _results_in(folder: Path, written: Sequence[Path]) -> str:
+    return f"Results in {folder}: {', '.join(path.name for path in written)}"
 
 
 def _interrupted(error: BaseException | None) -> bool:

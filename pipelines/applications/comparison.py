@@ -77,9 +77,12 @@ class Comparison:
 
     def write(self, folder: str | Path) -> Path:
         """Write compare.html; returns its path. Raises InputError when it cannot be written."""
-        from alidade.pipelines.reports.comparison_report import write_compare
+        from alidade.pipelines.reports.comparison_report import comparison_report
+        from alidade.pipelines.reports.html import render_html
+        from alidade.pipelines.reports.whole import write_whole
 
-        return write_compare(Path(folder), self)
+        (path,) = write_whole(Path(folder), {"compare.html": render_html(comparison_report(self))})
+        return path
 
     def __repr__(self) -> str:
         solved = ", ".join(f"{c.estimate.solver} {c.status}" for c in self.calibrations)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -14,13 +13,11 @@ from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, signed, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports.calibration_report import summary_of
-from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plots import histories
 from alidade.pipelines.reports.report import Block, Bullets, Details, Plots, Report, Section, Summary, Text, Tone
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import truth_errors
 from alidade.pipelines.reports.results_table import result_cards
-from alidade.pipelines.reports.whole import write_whole
 
 # Bars of z end here: a published solver may be hundreds of its sigmas off.
 _MAX_Z = 12.0
@@ -53,12 +50,6 @@ def comparison_report(comparison: Comparison) -> Report:
             Section("Over time", over_time if plots else ()),
         ),
     )
-
-
-def write_compare(out_dir: Path, comparison: Comparison) -> Path:
-    """Write compare.html; returns its path. Raises InputError when it cannot be written."""
-    (path,) = write_whole(out_dir, {"compare.html": render_html(comparison_report(comparison))})
-    return path
 
 
 def _solvers(

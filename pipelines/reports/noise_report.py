@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import cycle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,9 @@ from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
 from alidade.pipelines.display.figure import AXES, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import significant
-from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plain_json import plain_json
 from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
 from alidade.pipelines.reports.result import software_versions
-from alidade.pipelines.reports.whole import write_whole
 
 _TITLES = {"gyro": "gyro", "accel": "accelerometer", "mag": "magnetometer"}
 _COEFFICIENTS = {"N": "white noise", "B": "bias instability", "K": "random walk", "Q": "quantisation"}
@@ -191,11 +188,6 @@ def _summary(study: NoiseStudy) -> Summary:
     )
     longer = "Leave the sensors at rest for longer where the remarks ask for it, if you need the others."
     return Summary(question, "known in part", "warn", text, notes, (*steps, longer))
-
-
-def write_noise(out_dir: Path, study: NoiseStudy) -> tuple[Path, ...]:
-    """Write noise.html and noise.json, whole or not at all; returns their paths. Raises InputError as it cannot."""
-    return write_whole(out_dir, {"noise.html": render_html(noise_report(study)), "noise.json": noise_json(study)})
 
 
 def length(seconds: float) -> str:

@@ -7,7 +7,7 @@ read_result(Path("out/result.json")) # the keys that later commands use
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -427,6 +427,12 @@ def result_json(calibration: Calibration) -> str:
     seldom = ("truth", "second_best", "constants", "recordings", "changes")
     left_out = {name for name in seldom if getattr(model, name) is None}
     return model.model_dump_json(by_alias=True, indent=1, exclude=left_out) + "\n"
+
+
+def results_json(calibrations: Sequence[Calibration]) -> str:
+    """result.json of one calibration; of several a list of them."""
+    texts = [result_json(calibration).rstrip() for calibration in calibrations]
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
 
 
 def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.recording.info import SessionFacts
-    from alidade.pipelines.reports.result import Calibration
 
 # A narrower terminal breaks the lines itself: columns would be left out, and at a width of 0 everything.
 _MIN_WIDTH = 72
@@ -181,14 +180,6 @@ def as_text(report: Report) -> str:
     with console.capture() as capture:
         print_report(report)
     return RichText.from_ansi(capture.get()).plain.rstrip()
-
-
-def show_json(calibrations: Sequence[Calibration]) -> None:
-    """Print result.json of one calibration; of several a list of them."""
-    from alidade.pipelines.reports.result_json import result_json
-
-    texts = [result_json(calibration).rstrip() for calibration in calibrations]
-    print(texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]")
 
 
 def print_facts(

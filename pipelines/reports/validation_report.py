@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,10 +13,8 @@ from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Interval, Table
 from alidade.pipelines.display.units import human_unit, minute, significant, to_digits_of
 from alidade.pipelines.methods import method
-from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.sentences import capital
-from alidade.pipelines.reports.whole import write_whole
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.validate import Validated
@@ -60,12 +57,6 @@ def validation_report(validated: Validated) -> Report:
             Section("Errors over time", (Plots(tuple(map(_plot, validated.applied))),)),
         ),
     )
-
-
-def write_validation(out_dir: Path, validated: Validated) -> Path:
-    """Write validation.html; returns its path. Raises InputError when it cannot be written."""
-    (path,) = write_whole(out_dir, {"validation.html": render_html(validation_report(validated))})
-    return path
 
 
 def _changes(validated: Validated) -> tuple[Block, ...]:

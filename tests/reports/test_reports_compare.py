@@ -15,7 +15,7 @@ from alidade.pipelines.diagnostics.cross_validation import SplitHalf, split_halv
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.trial_fit import TrialFit
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.reports.comparison_report import comparison_report, write_compare
+from alidade.pipelines.reports.comparison_report import comparison_report
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.plots import common_plots
 from alidade.pipelines.reports.result import Calibration
@@ -108,10 +108,10 @@ def test_ellipses_are_drawn_of_correlated_pairs_only() -> None:
 
 
 def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
-    assert write_compare(tmp_path / "new", Comparison(tuple(solvers()))).read_text().startswith("<!doctype html>")
+    assert Comparison(tuple(solvers())).write(tmp_path / "new").read_text().startswith("<!doctype html>")
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="no folder to write results to"):
-        write_compare(tmp_path / "file", Comparison(tuple(solvers())))
+        Comparison(tuple(solvers())).write(tmp_path / "file")
 
 
 @needs_browser
