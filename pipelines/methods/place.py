@@ -60,7 +60,7 @@ def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float 
     """
     given = [config.latitude_deg, config.longitude_deg, config.altitude_m]
     if wanted(recording, config, fix) and None in given:
-        found: list[float | None] = [*_median(recording, config.topic(fix))]
+        found: list[float | None] = [*median_fix(recording, config.topic(fix))]
     else:
         found = [None, None, 0.0]
     latitude, longitude, height = (b if a is None else a for a, b in zip(given, found, strict=True))
@@ -78,7 +78,8 @@ def place_topics(
     return {fix.name: series.FixSeries(np.array([epoch_ns]), *at, frame_id=frame_id)}
 
 
-def _median(recording: Recording, topic: str) -> tuple[float, float, float]:
+def median_fix(recording: Recording, topic: str) -> tuple[float, float, float]:
+    """Median latitude and longitude, deg, and height, m, of a topic's fixes. Raises InputError where none is usable."""
     fixes = recording.fixes(topic)
     good = (fixes.status >= 0) & np.isfinite(fixes.latitude_deg + fixes.longitude_deg + fixes.height)
     if not good.any():

@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.place import median_fix
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds, unit_quaternions
 from alidade.pipelines.recording.recording import Recording
@@ -114,16 +114,6 @@ def indexer_topics(data: IndexerData, _pictures: None = None) -> dict[str, serie
 
 def _latitude(recording: Recording, config: Config) -> float | None:
     """Degrees: from the config, else the median of the fixes, else None."""
-    topic = config.topic(FIX)
-    if config.latitude_deg is not None:
+    if config.latitude_deg is not None or not wanted(recording, config, FIX):
         return config.latitude_deg
-    if not wanted(recording, config, FIX):
-        return None
-    fixes = recording.fixes(topic)
-    good = fixes.latitude_deg[(fixes.status >= 0) & np.isfinite(fixes.latitude_deg)]
-    if not len(good):
-        return None
-    latitude = float(np.median(good))
-    if abs(latitude) > 90.0:
-        raise InputError(f"topic {topic}: latitude of {latitude:g}, beyond 90 degrees; NavSatFix is in degrees")
-    return latitude
+    return median_fix(recording, config.topic(FIX))[0]

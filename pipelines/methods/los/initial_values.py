@@ -112,6 +112,8 @@ def _broken_line(t: Array, values: Array) -> Array:
 
     Its normal equations are tridiagonal: knots and times without the product of their numbers.
     """
+    from scipy.linalg import solveh_banded
+
     count = 2 + int((t[-1] - t[0]) / _SLOW)
     at = np.clip((t - t[0]) / max(t[-1] - t[0], 1e-9) * (count - 1), 0.0, count - 1.0)
     i = np.minimum(at.astype(int), count - 2)
@@ -122,18 +124,10 @@ def _broken_line(t: Array, values: Array) -> Array:
         return np.asarray(np.bincount(i, left, count) + np.bincount(i + 1, right, count), dtype=float)
 
     diagonal = summed(before**2, after**2)
-    beside = np.bincount(i, before * after, count)[:-1]
     right = np.stack([summed(before * column, after * column) for column in values.T], axis=1)
     # A knot that no time is near stays at zero.
-    diagonal += 1e-12 * diagonal.max()
-    for k in range(1, count):
-        share = beside[k - 1] / diagonal[k - 1]
-        diagonal[k] -= share * beside[k - 1]
-        right[k] -= share * right[k - 1]
-    knots = np.zeros_like(right)
-    for k in reversed(range(count)):
-        following = beside[k] * knots[k + 1] if k + 1 < count else 0.0
-        knots[k] = (right[k] - following) / diagonal[k]
+    bands = np.stack([diagonal + 1e-12 * diagonal.max(), np.bincount(i, before * after, count)])
+    knots = solveh_banded(bands, right, lower=True)
     return np.asarray(before[:, None] * knots[i] + after[:, None] * knots[i + 1])
 
 

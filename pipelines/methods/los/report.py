@@ -21,7 +21,7 @@ from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import Correction, Report
-from alidade.pipelines.methods.formula import Formula, apply, axis_angles, gyro_rate, picture_time
+from alidade.pipelines.methods.formula import Formula, apply, axis_angles, gyro_rate, passive, picture_time
 from alidade.pipelines.methods.los.initial_values import (
     camera,
     carried_errors,
@@ -236,17 +236,15 @@ def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float
 
 
 def _carrier_from_gyro(values: Mapping[str, float]) -> Array:
-    """M = Rz(dz) Rx(-gx) Ry(-gy), (4,), passive Rx, Ry, Rz."""
+    """M = Rz(dz) Rx(-gx) Ry(-gy), (4,)."""
     dz = values.get("delta_z", values.get("delta_pz", 0.0) - values.get("delta_gz", 0.0))
     gx, gy = values.get("delta_gx", 0.0), values.get("delta_gy", 0.0)
-    return so3.compose(so3.exp([0.0, 0.0, -dz]), so3.exp([gx, 0.0, 0.0]), so3.exp([0.0, gy, 0.0]))
+    return so3.compose(passive(2, dz), passive(0, -gx), passive(1, -gy))
 
 
 def _camera_attitude(gimbal: Array, px: float) -> Array:
     """cRb = Rx(eps + px) Rz(eta), (n, 4)."""
-    zero = np.zeros(len(gimbal))
-    lift = so3.exp(np.stack([-gimbal[:, 1] - px, zero, zero], axis=1))
-    return so3.multiply(lift, so3.exp(np.stack([zero, zero, -gimbal[:, 0]], axis=1)))
+    return so3.multiply(passive(0, gimbal[:, 1] + px), passive(2, gimbal[:, 0]))
 
 
 def _near_neighbours(error: Array) -> NDArray[np.bool_]:

@@ -148,6 +148,19 @@ def test_fixes_that_never_came_are_none(session: tuple[IndexerData, dict[str, fl
     assert read_indexer(recording, load_config(None)).latitude_deg is None
 
 
+def test_fixes_without_a_position_are_refused(session: tuple[IndexerData, dict[str, float]], tmp_path: Path) -> None:
+    method("indexer").write_data(tmp_path / "s.mcap", session[0])
+    whole = open_recording(tmp_path / "s.mcap")
+    topics: dict[str, series.Topic] = {
+        "/imu": whole.imu("/imu"),
+        INDEXER.name: whole.joints(INDEXER.name, JOINTS),
+        "/fix": replace(whole.fixes("/fix"), status=np.array([-1])),
+    }
+    write_session(tmp_path / "lost.mcap", topics)
+    with pytest.raises(InputError, match=r"topic /fix: none of 1 messages has a position fix"):
+        read_indexer(open_recording(tmp_path / "lost.mcap"), load_config(None))
+
+
 @pytest.mark.parametrize("wrap", [np.pi, 2.0 * np.pi])
 def test_wrapped_and_continuous_encoders_give_the_same(
     session: tuple[IndexerData, dict[str, float]], wrap: float
