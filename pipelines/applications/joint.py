@@ -138,12 +138,6 @@ class Alone:
         """Values that the recording alone gave, by parameter."""
         return {name: p.value for name, p in self.calibration.parameters.items()}
 
-    @property
-    def sigmas(self) -> dict[str, float]:
-        """Sigmas that the recording alone gave, by parameter."""
-        found = self.calibration.parameters
-        return {name: p.sigma for name, p in found.items() if p.sigma > 0.0}
-
     def loaded(self) -> Any:
         """The recording's data, read back from their file."""
         with self.data.open("rb") as stream:

@@ -357,26 +357,23 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
 
     best = np.array([calibration.applied_values.get(name, value) for name, value in calibration.values.items()])
     there = at(best)
-    computed = [formula for formula in calibration.formulas if formula.name in there]
-    rotations = {f.name: f for f in computed if there[f.name].kind == "rotation" and _FRAMES.match(f.description)}
+    rotations = {
+        f.name: named.groups()
+        for f in calibration.formulas
+        if f.name in there and there[f.name].kind == "rotation" and (named := _FRAMES.match(f.description))
+    }
     if not rotations:
         return {}
     ends = [(at(best + step), at(best - step)) for step in _STEP * np.eye(len(estimate.names))]
     found = {}
-    for name, formula in rotations.items():
+    for name, frames in rotations.items():
         turns = [difference(ahead[name], behind[name]) for ahead, behind in ends]
         J = np.array(turns).T / (2.0 * _STEP)
-        child, parent = (word.strip().lower().replace(" ", "_") for word in _frames(formula.description))
+        child, parent = (word.strip().lower().replace(" ", "_") for word in frames)
         w, x, y, z = (_rounded(v) for v in there[name].array.tolist())
         spread = tuple(_rounded(float(v), _FEWER_DIGITS) for v in (J @ covariance @ J.T).ravel())
         found[name] = SavedTransform(parent=parent, child=child, wxyz=(w, x, y, z), covariance=spread)
     return found
-
-
-def _frames(meaning: str) -> tuple[str, str]:
-    match = _FRAMES.match(meaning)
-    assert match is not None
-    return match[1], match[2]
 
 
 def _plain(row: Mapping[str, object]) -> dict[str, object]:

@@ -134,8 +134,10 @@ def certificate(
     """
     path, earlier_path = Path(results), None if before is None else Path(before)
     path = path / "result.json" if path.is_dir() else path
-    result, stated = _read_result(path), Fields() if fields is None else _read_fields(Path(fields))
-    earlier = {} if earlier_path is None else _earlier(earlier_path, result.method)
+    result, stated = read_result(path), Fields() if fields is None else _read_fields(Path(fields))
+    if result.status in ("inconsistent", "unobservable"):
+        raise InputError(f"{path}: is {result.status}, there is nothing to certify: {result.headline}")
+    earlier = {} if earlier_path is None else load_known(earlier_path).of_method(result.method).values
     rows = _rows(result, stated, earlier)
     for name in stated.limits:
         if name not in {row.name for row in rows}:
@@ -155,25 +157,12 @@ def certificate(
     return write_whole(path.parent if out is None else Path(out), files), missing
 
 
-def _read_result(path: Path) -> Result:
-    """A result that can be certified. Raises InputError."""
-    result = read_result(path)
-    if result.status in ("inconsistent", "unobservable"):
-        raise InputError(f"{path}: is {result.status}, there is nothing to certify: {result.headline}")
-    return result
-
-
 def _read_fields(path: Path) -> Fields:
     content = load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path)) or {}
     try:
         return Fields.model_validate(content)
     except ValidationError as error:
         raise InputError(f"{path}: {first_error(error, Fields)[1]}") from error
-
-
-def _earlier(path: Path, method: str) -> dict[str, float]:
-    known = load_known(path).of_method(method)
-    return dict(zip(known.gaussian_prior.names, known.gaussian_prior.mean.tolist(), strict=True))
 
 
 def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[Row]:

@@ -336,15 +336,22 @@ def invalid(path: Path, what: str, error: ValidationError) -> InputError:
     return InputError(f"{path}: not {what}: {where}: {first['msg']}")
 
 
+# Keys that a calibration has by the same name.
+_ITS_OWN = (
+    *("status", "software", "headline", "notes", "innovations", "learning"),
+    *("budget", "sensitivity", "measurements", "applied"),
+)
+
+
 def result(calibration: Calibration) -> Result:
     """result.json as a model. Raises pydantic's ValidationError if a number is not finite."""
     c, second = calibration, calibration.estimate.second
     return Result.model_validate(
         {
+            **{key: getattr(c, key) for key in _ITS_OWN},
             "schema": "alidade.result/1",
             "method": c.problem.method,
             "solver": c.estimate.solver,
-            "status": c.status,
             "parameters": list(c.parameters.values()),
             "covariance": {"order": c.estimate.names, "matrix": c.covariance.tolist()},
             "null_directions": [direction.evidence for direction in c.directions],
@@ -360,19 +367,11 @@ def result(calibration: Calibration) -> Result:
                 "counts": c.counts,
                 "dropped": c.dropped,
             },
-            "software": c.software,
             "timing_s": c.timing,
-            "headline": c.headline,
-            "notes": c.notes,
             "causes": [{"label": label, "evidence": evidence} for label, evidence in c.causes],
-            "innovations": c.innovations,
-            "learning": c.learning,
             "stability": c.stability
             and {**vars(c.stability), "change": c.stability.departures if c.stability.changed else {}},
             "self_check": c.solver_difference and {**vars(c.solver_difference), "difference": c.solver_difference.z},
-            "budget": c.budget,
-            "sensitivity": c.sensitivity,
-            "measurements": c.measurements,
             "findings": [finding_json(finding) for finding in c.findings],
             "tables": {**c.tables, **({"derived": [each._asdict() for each in c.derived]} if c.derived else {})},
             "second_best": second
@@ -395,7 +394,6 @@ def result(calibration: Calibration) -> Result:
                 }
                 for found in c.uses
             ],
-            "applied": c.applied,
             "truth": None if c.truth is None else truth_errors(c),
         }
     )

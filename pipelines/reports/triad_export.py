@@ -180,7 +180,7 @@ def _ros2(saved: SavedCalibration) -> str:
 
     Where noise was measured, the covariance that its messages may state: of one sample, calibrated, by rows.
     """
-    noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
+    noise = _noise_rows(saved)
     parameters: dict[str, dict[str, list[float]]] = {}
     for name, (K, b) in _triads(saved).items():
         parameters[name] = {"gain": [float(x) for x in K.ravel()], "bias": [float(x) for x in b]}
@@ -193,16 +193,17 @@ def _ros2(saved: SavedCalibration) -> str:
     )
 
 
-def _kalibr(saved: SavedCalibration) -> str:
+def _noise_rows(saved: SavedCalibration) -> dict[str, Any]:
+    """Noise that was measured, by sensor."""
+    return {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
+
+
+def _kalibr_noise(saved: SavedCalibration) -> str:
     """Kalibr's imu.yaml: noise of the calibrated sensors, one number for three axes.
 
     Raises InputError when the calibration does not hold the noise.
     """
-    return "\n".join([*_noise_lines(saved), ""])
-
-
-def _noise_lines(saved: SavedCalibration) -> list[str]:
-    noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
+    noise = _noise_rows(saved)
     if not all(min(noise.get(name, {}).get("density", [0.0])) > 0.0 for name in ("accel", "gyro")):
         raise InputError(
             "the calibration does not hold the noise of accelerometer and gyro: let the device rest longer"
@@ -218,7 +219,8 @@ def _noise_lines(saved: SavedCalibration) -> list[str]:
         # With a point in it, else YAML 1.1 takes it for a word.
         lines.append(f"{word}_noise_density: {density:.4e} # {unit}/sqrt(Hz), measured")
         lines.append(f"{word}_random_walk: {row['walk']:.4e} # {unit}/s/sqrt(Hz), {row['walk_source']}")
-    return [*lines, f"rostopic: {noise['gyro']['topic']}", f"update_rate: {noise['gyro']['rate_hz']:.6g}"]
+    gyro = noise["gyro"]
+    return "\n".join([*lines, f"rostopic: {gyro['topic']}", f"update_rate: {gyro['rate_hz']:.6g}", ""])
 
 
 def _openvins(saved: SavedCalibration) -> str:
@@ -229,8 +231,7 @@ def _openvins(saved: SavedCalibration) -> str:
 
     Raises InputError when the calibration holds no noise, a sensor was recorded in counts, or its axes are left-handed.
     """
-    noise = _noise_lines(saved)
-    triads = _imu(saved)
+    noise, triads = _kalibr_noise(saved).splitlines(), _imu(saved)
     lines = ["%YAML:1.0", "", "imu0:", *_matrix("T_i_b", np.eye(4)), *(f"  {line}" for line in noise)]
     lines += ["  time_offset: 0.0", '  model: "kalibr"']
     for name, T, rotation, what in (
@@ -266,7 +267,7 @@ def _oak(saved: SavedCalibration) -> str:
 
     Noise that was not measured is 0, as in a camera that holds none.
     """
-    noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
+    noise = _noise_rows(saved)
     content: dict[str, Any] = {"noise": {"name": ""}}
     for (name, word), (K, b) in zip(_IMU.items(), _imu(saved).values(), strict=True):
         content[word] = np.column_stack([K, b]).tolist()
@@ -311,7 +312,7 @@ FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {
     "betaflight": _betaflight,
     "inav": _inav,
     "ros2": _ros2,
-    "kalibr": _kalibr,
+    "kalibr": _kalibr_noise,
     "openvins": _openvins,
     "realsense": _realsense,
     "oak": _oak,
