@@ -189,25 +189,15 @@ def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tupl
     times = [data.image_t[chain] for chain in good]
     left_out = f"{spoilt} of {len(rows)} LOS errors left out as outliers" if spoilt else ""
     bias = "a gyro bias that has changed since the calibration is still in it"
-    drifting = Validation(
-        "line of sight",
-        "rad",
-        np.concatenate(times),
-        np.concatenate(before),
-        np.concatenate(after),
-        "; ".join(filter(None, [bias, left_out])),
-        micro=True,
-    )
-    steady = Validation(
-        "line of sight, steady drift removed",
-        "rad",
-        np.concatenate(times),
-        np.concatenate([_without_drift(t, e) for t, e in zip(times, before, strict=True)]),
-        np.concatenate([_without_drift(t, e) for t, e in zip(times, after, strict=True)]),
-        left_out,
-        micro=True,
-    )
-    return drifting, steady
+    steady = [[_without_drift(t, e) for t, e in zip(times, errors, strict=True)] for errors in (before, after)]
+    t, found = np.concatenate(times), []
+    for name, (was, now), notes in (
+        ("line of sight", (before, after), (bias, left_out)),
+        ("line of sight, steady drift removed", steady, (left_out,)),
+    ):
+        errors = np.concatenate(was), np.concatenate(now)
+        found.append(Validation(name, "rad", t, *errors, "; ".join(filter(None, notes)), micro=True))
+    return tuple(found)
 
 
 def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float]) -> Array:
