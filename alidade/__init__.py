@@ -18,10 +18,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alidade.pipelines.applications.api import Config, calibrate, compare, fleet, follow, load, open, plan, simulate
+    from alidade.pipelines.applications.api import Config, calibrate, compare, fleet, follow, load, open, simulate
     from alidade.pipelines.applications.apply import apply
     from alidade.pipelines.applications.noise import noise
     from alidade.pipelines.applications.one_liners import hand_eye, imu_static, magcal
+    from alidade.pipelines.applications.planning import plan
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.applications.validate import validate
     from alidade.pipelines.errors import InputError
@@ -72,6 +73,7 @@ _MODULES = {
     "certificate": "alidade.pipelines.reports.certificate",
     "export": "alidade.pipelines.reports.export_formats",
     "noise": "alidade.pipelines.applications.noise",
+    "plan": "alidade.pipelines.applications.planning",
     "validate": "alidade.pipelines.applications.validate",
     **dict.fromkeys(("hand_eye", "imu_static", "magcal"), "alidade.pipelines.applications.one_liners"),
 }

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from alidade.pipelines.applications.comparison import Comparison
     from alidade.pipelines.applications.fleet.write import FleetResult
     from alidade.pipelines.applications.follow.guidance import View
-    from alidade.pipelines.applications.planning import Plan
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration
 
@@ -212,24 +211,6 @@ def simulate(
     _check_seed(seed)
     chosen = methods.method(method)
     return chosen.simulate(_scenario(chosen, scenario, images), seed, images)
-
-
-def plan(
-    method: str,
-    scenario: str | Path | None = None,
-    *,
-    config: Settings = None,
-    require: Mapping[str, float] | None = None,
-) -> Plan:
-    """How well a planned motion would determine each parameter, and a better one: `.now.sigmas`, `.steps`, `.best`.
-
-    Raises:
-        InputError: no such method, scenario or parameter, or the config cannot be used.
-    """
-    from alidade.pipelines.applications.planning import make_plan
-
-    named = None if scenario is None else str(scenario)
-    return make_plan(method, named, config, require)
 
 
 def follow(

@@ -444,14 +444,15 @@ def plan(
 
     Exit code 3 if the motion falls short of the requirements.
     """
-    from alidade.pipelines.applications.planning import make_plan, requirements
+    from alidade.pipelines.applications.planning import plan as planned_motion
+    from alidade.pipelines.applications.planning import requirements
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import plan_json
     from alidade.pipelines.reports.plan_report import plan_report
     from alidade.pipelines.reports.whole import write_file
 
     with progress.shown(quiet or as_json):
-        planned = make_plan(method, scenario, config, requirements(require or []))
+        planned = planned_motion(method, scenario, config=config, require=requirements(require or []))
     lines = []
     if out is not None:
         write_file(out, planned.scenario_text)

@@ -1,7 +1,7 @@
 """Before recording: what a planned motion would determine, what it would leave weak, and a motion that determines more.
 
-    plan = make_plan("los", "my_sway.yaml", None, {"delta_px": 1e-4})
-    plan.now.status, [step.change for step in plan.steps]
+    found = plan("los", "my_sway.yaml", require={"delta_px": 1e-4})
+    found.now.status, [step.change for step in found.steps]
 
 The motion is simulated with the noise that its scenario states and goes through the method's own graph; the joint
 covariance there depends on motion and noise levels, and next to nothing on the noise drawn. Where the motion itself, or
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -127,43 +128,45 @@ class Plan:
         return dump_yaml(model.model_validate(self.best.scenario).model_dump(exclude_defaults=True))
 
 
-def make_plan(
-    method_name: str,
-    scenario: str | None = None,
-    config_file: Settings = None,
+def plan(
+    method: str,
+    scenario: str | Path | None = None,
+    *,
+    config: Settings = None,
     require: Mapping[str, float] | None = None,
     most_steps: int = _MOST_STEPS,
 ) -> Plan:
-    """Predict a planned motion's sigmas and, where they fall short, better it greedily.
+    """How well a planned motion would determine each parameter, and a better one: `.now.sigmas`, `.steps`, `.best`.
+
+    Where sigmas fall short of what is required the motion is bettered greedily.
 
     Args:
-        method_name: los, indexer, ...
+        method: los, indexer, ...
         scenario: YAML file or name; None is the method's nominal one.
-        config_file: a file or a config: overrides key by key the config that the simulated recording brings.
+        config: overrides key by key the config that the simulated recording brings.
         require: parameter -> sigma wanted, over those of the config.
         most_steps: changes at most.
 
     Raises:
-        InputError: no such method, scenario or parameter, or a scenario without usable data.
+        InputError: no such method, scenario or parameter, the config cannot be used, or a scenario without usable data.
     """
-    wanted = dict(require or {})
-    method = methods.method(method_name)
-    settings = method.settings(scenario).model_dump()
+    wanted, chosen = dict(require or {}), methods.method(method)
+    settings = chosen.settings(None if scenario is None else str(scenario)).model_dump()
     made: Made = {}
     with progress.doing("predicting"):
-        now = predict(method_name, settings, config_file, wanted, made=made)
+        now = predict(method, settings, config, wanted, made=made)
     steps: list[Step] = []
     best = now
     while best.missing and len(steps) < most_steps:
-        found = list(progress.track(_candidates(method, best, config_file, wanted, made), "trying other motions"))
+        found = list(progress.track(_candidates(chosen, best, config, wanted, made), "trying other motions"))
         if not found:
             break
         step = max(found, key=lambda each: each.gain)
         if step.gain < _LEAST_GAIN:
             break
-        best = predict(method_name, step.prediction.scenario, config_file, wanted, made=made)
+        best = predict(method, step.prediction.scenario, config, wanted, made=made)
         steps.append(replace(step, prediction=best))
-    return Plan(method_name, now, tuple(steps))
+    return Plan(method, now, tuple(steps))
 
 
 def predict(
@@ -177,7 +180,7 @@ def predict(
     """The sigmas that a recording of this motion would end with, the largest of some draws of what is drawn in it.
 
     Args:
-        method_name, config_file, require: as in `make_plan`.
+        method_name, config_file, require: as in `plan`.
         scenario: the motion.
         seeds: of the draws; None: as many as the method's scenarios need.
         made: predictions of draws, which are not made again; new ones are added. All else has to be the same.

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from alidade.pipelines.applications.planning import Prediction, make_plan, predict, requirements
+import alidade
+from alidade.pipelines.applications.planning import Prediction, predict, requirements
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
@@ -87,7 +88,7 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
         "{duration_s: 12, image_rate_hz: 5, gyro_rate_hz: 50, gimbal_rate_hz: 50, azimuth_deg: 20, elevation_deg: 0,"
         " carrier: {roll: [{amplitude_deg: 6, frequency_hz: 0.21}], pitch: [{amplitude_deg: 5, frequency_hz: 0.17}]}}",
     )
-    plan = make_plan("los", weak, require={"delta_px": 5e-4}, most_steps=2)
+    plan = alidade.plan("los", weak, require={"delta_px": 5e-4}, most_steps=2)
     told = json.loads(plan_json(plan))
     status = plan.now.status
     assert (told["schema"], told["status"], len(told["changes"])) == ("alidade.plan/1", status, len(plan.steps))
@@ -108,7 +109,7 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
 
 def test_a_motion_that_tells_everything_is_left_as_it_is(tmp_path: Path) -> None:
     motion = "duration_s: 12, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100"
-    plan = make_plan("los", scenario_file(tmp_path, f"{{{motion}, sensors: ideal}}"))
+    plan = alidade.plan("los", scenario_file(tmp_path, f"{{{motion}, sensors: ideal}}"))
     assert plan.now.status == "calibrated"
     assert plan.steps == ()
     assert plan.best is plan.now
@@ -119,7 +120,7 @@ def test_what_no_motion_can_tell_gets_no_change(tmp_path: Path) -> None:
     asked = tmp_path / "config.yaml"
     asked.write_text("priors: {delta_pz: 0.1, delta_gz: 0.1}\n")
     good = scenario_file(tmp_path, "{duration_s: 6, image_rate_hz: 5, gyro_rate_hz: 50, gimbal_rate_hz: 50}")
-    plan = make_plan("los", good, asked)
+    plan = alidade.plan("los", good, config=asked)
     assert plan.now.status == "unobservable"
     for name in ("delta_pz", "delta_gz"):
         assert plan.best.missing[name] == pytest.approx(plan.now.missing[name], rel=0.01)
@@ -131,7 +132,7 @@ def test_the_next_best_poses_of_a_cube_are_named_and_mend_the_plan(tmp_path: Pat
     few = scenario_file(
         tmp_path, "{poses: 3, static_s: 1.5, turn_rad_s: 1.5, camera: {rate_hz: 2}, magnetometer: null}"
     )
-    plan = make_plan("cube", few, most_steps=1)
+    plan = alidade.plan("cube", few, most_steps=1)
     assert plan.now.status == "unobservable"
     (step,) = plan.steps
     assert re.match(r"(one|6) more poses?: [+-][xyz] \(tag (1[6-9]|2[01])\) up, [+-][xyz] to the north", step.change)
@@ -167,9 +168,9 @@ def test_requirements_are_read_and_checked() -> None:
         with pytest.raises(InputError, match="NAME=SIGMA"):
             requirements([wrong])
     with pytest.raises(InputError, match="nearest known key is delta_px"):
-        make_plan("los", require={"deltapx": 1.0})
+        alidade.plan("los", require={"deltapx": 1.0})
     with pytest.raises(InputError, match="no method 'gimbal'"):
-        make_plan("gimbal")
+        alidade.plan("gimbal")
 
 
 def test_a_drawn_motion_is_promised_no_more_than_other_draws_keep() -> None:

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import alidade
 from alidade.factors import so3
 from alidade.factors.chi_square import quantile
 from alidade.factors.ellipsoid import DipFactor, StrengthFactor, sagitta
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
 from alidade.factors.turned import FieldFactor, UpFactor
-from alidade.pipelines.applications.planning import make_plan
 from alidade.pipelines.applications.session import Session, resolve_method
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
@@ -608,7 +608,7 @@ def test_whoever_turns_it_is_told_where_to() -> None:
 
 def test_a_plan_that_falls_short_turns_it_upside_down(tmp_path: Path) -> None:
     (tmp_path / "narrow.yaml").write_text("{attitudes: 20, tilt_deg: 25.0, magnetometer: {rate_hz: 10.0}}")
-    plan = make_plan("tumble", str(tmp_path / "narrow.yaml"), most_steps=1)
+    plan = alidade.plan("tumble", str(tmp_path / "narrow.yaml"), most_steps=1)
     assert plan.now.missing
     assert [step.change for step in plan.steps] == ["turned upside down too"]
     assert not plan.best.missing
