@@ -18,8 +18,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alidade.pipelines.applications.api import Config, calibrate, compare, fleet, follow, load, open, simulate
+    from alidade.pipelines.applications.api import Config, calibrate, compare, follow, load, open, simulate
     from alidade.pipelines.applications.apply import apply
+    from alidade.pipelines.applications.fleet.write import fleet
     from alidade.pipelines.applications.noise import noise
     from alidade.pipelines.applications.one_liners import hand_eye, imu_static, magcal
     from alidade.pipelines.applications.planning import plan
@@ -72,6 +73,7 @@ _MODULES = {
     "apply": "alidade.pipelines.applications.apply",
     "certificate": "alidade.pipelines.reports.certificate",
     "export": "alidade.pipelines.reports.export_formats",
+    "fleet": "alidade.pipelines.applications.fleet.write",
     "noise": "alidade.pipelines.applications.noise",
     "plan": "alidade.pipelines.applications.planning",
     "validate": "alidade.pipelines.applications.validate",

@@ -40,7 +40,6 @@ from alidade.pipelines.simulation.scenario import Simulated
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.comparison import Comparison
-    from alidade.pipelines.applications.fleet.write import FleetResult
     from alidade.pipelines.applications.follow.guidance import View
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration
@@ -253,30 +252,6 @@ def compare(
     from alidade.pipelines.applications.comparison import compared
 
     return compared(open(source, method, config), window)
-
-
-def fleet(
-    recordings: Sequence[str | Path],
-    out: str | Path,
-    *,
-    method: str | None = None,
-    config: str | Path | None = None,
-    solver: str = "batch",
-    window: float | None = 1.0,
-    names: str | None = None,
-    prior: str | None = None,
-    jobs: int | None = None,
-) -> FleetResult:
-    """Calibrate recordings of many units (paths or patterns); writes fleet.html and tables to `out` and resumes there.
-
-    Raises:
-        InputError: a pattern matches nothing, or a setting cannot be used.
-    """
-    from alidade.pipelines.applications.fleet.fleet import Settings as FleetSettings
-    from alidade.pipelines.applications.fleet.write import run_fleet
-
-    settings = FleetSettings.of(method, None if config is None else Path(config), solver, window, prior)
-    return run_fleet([str(each) for each in recordings], settings, Path(out), None, jobs, names)
 
 
 def _check_seed(seed: object) -> None:

@@ -612,13 +612,12 @@ def fleet(
 
     The same command resumes after an interruption.
     """
-    from alidade.pipelines.applications.fleet.fleet import Settings
-    from alidade.pipelines.applications.fleet.write import run_fleet
+    from alidade.pipelines.applications.fleet.write import fleet as run
     from alidade.pipelines.reports.plain_json import fleet_json
 
-    settings = Settings.of(method, config, solver, parse_window(window), prior)
+    work = partial(run, recordings, out, method=method, config=config, solver=solver, window=parse_window(window))
     with progress.shown(quiet or as_json):
-        found = run_fleet(recordings, settings, out, scheduler, jobs, names)
+        found = work(names=names, prior=prior, scheduler=scheduler, jobs=jobs)
     text = partial(fleet_json, found.outcome, found.populations, found.histories)
     _show(as_json, text, None, *found.summary, _results_in(out, found.written))
     if found.outcome.interrupted:

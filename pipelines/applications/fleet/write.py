@@ -45,19 +45,26 @@ class FleetResult:
         return f"<FleetResult: {self.outcome.summary[0]}>"
 
 
-def run_fleet(
-    recordings: Sequence[str],
-    settings: Settings,
-    out: Path,
+def fleet(
+    recordings: Sequence[str | Path],
+    out: str | Path,
+    *,
+    method: str | None = None,
+    config: str | Path | None = None,
+    solver: str = "batch",
+    window: float | None = 1.0,
+    names: str | None = None,
+    prior: str | None = None,
     scheduler: str | None = None,
     jobs: int | None = None,
-    names: str | None = None,
 ) -> FleetResult:
-    """Calibrate the recordings of these patterns, compare them, and write what was found.
+    """Calibrate recordings of many units (paths or patterns); writes fleet.html and tables to `out` and resumes there.
 
-    Arguments and exceptions as `find` and `calibrate_fleet` have them.
+    Raises:
+        InputError: a pattern matches nothing, or a setting cannot be used.
     """
-    outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
+    settings, out = Settings.of(method, None if config is None else Path(config), solver, window, prior), Path(out)
+    outcome = calibrate_fleet(find([str(each) for each in recordings]), settings, out, scheduler, jobs, names)
     several = histories(outcome.results, {name: counting(result) for name, result in outcome.results.items()})
     found = populations(outcome.results, several)
     return FleetResult(outcome, found, several, write_fleet(out, outcome, found, several))
