@@ -18,8 +18,6 @@ from typer.core import TyperGroup
 
 from alidade.pipelines import deadline, parallel, progress
 from alidade.pipelines.applications import exit_codes
-from alidade.pipelines.applications.cube_commands import cube_layout, cube_print
-from alidade.pipelines.applications.options import ConfigFile, Json, Quiet, RecordingPath, RecordingPaths
 from alidade.pipelines.errors import InputError, nearest_three, printable
 from alidade.pipelines.solvers.window import parse_window
 
@@ -92,6 +90,15 @@ _Solver = Annotated[
 ]
 
 
+_WHAT = "File, bag folder, or pattern in quotes, 'run_*.mcap'."
+_RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help=_WHAT)]
+_RecordingPaths = Annotated[
+    list[Path],
+    typer.Argument(metavar="RECORDING...", help=f"{_WHAT} Several: one device, solved jointly."),
+]
+_ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML config; overrides the recording's own.")]
+_Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print JSON only.")]
 _METHODS = (
     "What is calibrated: los (gimballed camera), indexer (rotation table), head (tracked helmet), cube (AprilTags or "
     "static poses), tumble (turned by hand), or a plug-in"
@@ -163,9 +170,9 @@ def _options(version: _Version = False, verbose: _Verbose = False) -> None:  # n
 
 @app.command()
 def calibrate(
-    sessions: RecordingPaths,
+    sessions: _RecordingPaths,
     method: _MethodName = None,
-    config: ConfigFile = None,
+    config: _ConfigFile = None,
     solver: _Solver = "batch",
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for the results [default: RECORDING-SOLVER].")] = None,
@@ -187,8 +194,8 @@ def calibrate(
     everything: Annotated[
         bool, typer.Option("--all", help="Print all tables of the report: parameters by name, findings, diagnostics.")
     ] = False,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Calibrate one recording, or several of one device.
 
@@ -240,9 +247,9 @@ def calibrate(
 
 @app.command()
 def compare(
-    session: RecordingPath,
+    session: _RecordingPath,
     method: _MethodName = None,
-    config: ConfigFile = None,
+    config: _ConfigFile = None,
     window: _Window = "1",
     prior: _Prior = None,
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html; compares both halves too.")] = None,
@@ -250,8 +257,8 @@ def compare(
     auto_topics: _AutoTopics = False,
     jobs: _OwnJobs = None,
     time_limit: _TimeLimit = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Compare the published, batch and incremental solver.
 
@@ -283,7 +290,7 @@ def follow(
         typer.Argument(metavar="SOURCE", help="File or folder being written, ws://host:port, or - (standard input)."),
     ] = None,
     method: _MethodName = None,
-    config: ConfigFile = None,
+    config: _ConfigFile = None,
     window: _Window = "1",
     patience: Annotated[
         float, typer.Option(help="Seconds without new data after which an unfinished file ends.", min=0.0)
@@ -312,7 +319,7 @@ def follow(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results [default: SOURCE-incremental].")] = None,
     no_check: _NoCheck = False,
-    as_json: Json = False,
+    as_json: _Json = False,
 ) -> None:
     """Calibrate while recording.
 
@@ -339,16 +346,16 @@ def follow(
 
 @app.command()
 def validate(
-    session: RecordingPath,
+    session: _RecordingPath,
     calibration: Annotated[Path, typer.Option(help="calibration.yaml or result.json to test.")],
     method: _MethodName = None,
-    config: ConfigFile = None,
+    config: _ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page [default: RECORDING-validation].")] = None,
     strict: _Strict = False,
     jobs: _OwnJobs = None,
     time_limit: _TimeLimit = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Test a calibration on another recording.
 
@@ -381,7 +388,7 @@ def simulate(
         bool,
         typer.Option("--images", help="Write camera pictures in place of attitudes, LOS errors or tag detections."),
     ] = False,
-    quiet: Quiet = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Simulate a recording, with its truth."""
     from alidade.pipelines.methods import simulate as run
@@ -397,7 +404,7 @@ def scenarios(
         str | None,
         typer.Argument(help="A scenario, to print its YAML; or a method.", autocompletion=_complete_scenario),
     ] = None,
-    as_json: Json = False,
+    as_json: _Json = False,
 ) -> None:
     """List scenarios, or print one as YAML to edit.
 
@@ -433,12 +440,12 @@ def scenarios(
 def plan(
     method: _OfMethod,
     scenario: _Scenario = None,
-    config: ConfigFile = None,
+    config: _ConfigFile = None,
     require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA required, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
     page: Annotated[Path | None, typer.Option(help="HTML file for the plan.")] = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Predict the accuracy of a motion; propose a better one.
 
@@ -466,11 +473,11 @@ def plan(
 
 @app.command()
 def info(
-    session: RecordingPath,
-    config: ConfigFile = None,
+    session: _RecordingPath,
+    config: _ConfigFile = None,
     strict: _Strict = False,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Show what a recording can calibrate.
 
@@ -499,14 +506,14 @@ def info(
 
 @app.command()
 def noise(
-    session: RecordingPath,
+    session: _RecordingPath,
     config: Annotated[Path | None, typer.Option(help="YAML with `topics` and `columns` of the recording.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json only.")] = False,
     strict: _Strict = False,
     auto_columns: _AutoColumns = False,
     time_limit: _TimeLimit = None,
-    quiet: Quiet = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Measure sensor noise at rest (Allan deviation).
 
@@ -528,7 +535,7 @@ def noise(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the recording and its results.")] = Path("alidade-demo"),
-    quiet: Quiet = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Simulate and calibrate a helmet tracker.
 
@@ -565,8 +572,8 @@ def montecarlo(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results [default: METHOD-montecarlo].")] = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Monte Carlo study: are the sigmas consistent?
 
@@ -595,7 +602,7 @@ def montecarlo(
 def fleet(
     recordings: Annotated[list[str], typer.Argument(metavar="FILES", help="Paths or patterns, 'recordings/*.mcap'.")],
     method: _MethodName = None,
-    config: ConfigFile = None,
+    config: _ConfigFile = None,
     solver: _Solver = "batch",
     window: _Window = "1",
     names: Annotated[str | None, typer.Option(help="Unit and date in the file names, '{unit}_{date}*'.")] = None,
@@ -605,8 +612,8 @@ def fleet(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Calibrate many recordings; compare units and dates.
 
@@ -634,7 +641,7 @@ def export(
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="File to write [default: printed].")] = None,
-    as_json: Json = False,
+    as_json: _Json = False,
 ) -> None:
     """Export to flight controllers, cameras, ROS 2, URDF, Kalibr.
 
@@ -659,17 +666,17 @@ def export(
 
 @app.command()
 def apply(
-    recording: RecordingPath,
+    recording: _RecordingPath,
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
     out: Annotated[Path, typer.Option(help="MCAP file to write.")],
     suffix: Annotated[
         str, typer.Option(help="Added to a topic's name for that of the corrected topic.")
     ] = "_calibrated",
-    config: ConfigFile = None,
+    config: _ConfigFile = None,
     strict: _Strict = False,
     auto_columns: _AutoColumns = False,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Copy a recording with corrected topics added.
 
@@ -707,8 +714,55 @@ def certificate(
     _say(f"Wrote {', '.join(map(str, written))}", *([f"not stated: {', '.join(missing)}"] if missing else []))
 
 
-app.command("cube-layout")(cube_layout)
-app.command("cube-print")(cube_print)
+@app.command("cube-layout")
+def cube_layout(
+    sessions: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of one or several cameras.")
+    ],
+    out: Annotated[Path, typer.Option(help="Config to write, with the located tags; its page is beside it, .html.")],
+    config: _ConfigFile = None,
+    refine_camera: Annotated[
+        bool, typer.Option("--refine-camera", help="Estimate focal length, centre and distortion too.")
+    ] = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
+) -> None:
+    """Locate the AprilTags of a cube.
+
+    From pictures of all sides; ids and sizes come from the config.
+    """
+    from alidade.pipelines.config import configured
+    from alidade.pipelines.methods.cube.layout import cube_layout as estimate
+    from alidade.pipelines.methods.cube.layout import layout_yaml
+    from alidade.pipelines.methods.cube.layout_page import layout_json, layout_report
+    from alidade.pipelines.recording.recording import open_recording
+    from alidade.pipelines.reports.html import render_html
+    from alidade.pipelines.reports.whole import write_file
+
+    page = out.with_suffix(".html")
+    if page == out:
+        raise InputError(f"{out}: --out names the config, and its page takes the name with .html; call it .yaml")
+    with progress.shown(quiet), progress.doing("finding where the tags are"):
+        layout = estimate([configured(open_recording(session), config) for session in sessions], refine_camera)
+    write_file(out, layout_yaml(layout))
+    report = layout_report(layout, [session.name for session in sessions])
+    write_file(page, render_html(report))
+    _show(as_json, partial(layout_json, layout), lambda: report, f"Wrote {out} for calibrate --config, and {page}")
+
+
+@app.command("cube-print")
+def cube_print(
+    edge: Annotated[float, typer.Option(help="Edge of the cube, m.")],
+    out: Annotated[Path, typer.Option(help="PDF to write; the config of the tags is beside it, .yaml.")],
+    first_id: Annotated[int, typer.Option(help="Id of the tag on the top face; the others follow.")] = 16,
+) -> None:
+    """Print the six faces of an AprilTag cube, true to scale."""
+    from alidade.pipelines.methods.cube.printing import print_cube
+
+    print_cube(out, edge, first_id)
+    config = out.with_suffix(".yaml")
+    _say(f"Wrote {out}: print at 100 % and check the ruler")
+    _say(f"Wrote {config}: ids and sizes for cube-layout --config; of a cube as drawn all tags")
 
 
 def _beside(session: Path, what: str) -> Path:
