@@ -298,9 +298,8 @@ class _Deferred:
         return getattr(self._target, name)
 
 
-def deferred(reference: str) -> Any:
-    """The object "package.module:name", imported when first used: commands start fast."""
-    return _Deferred(reference)
+# The object "package.module:name", imported when first used, in place of what it is: commands start fast.
+deferred: Callable[[str], Any] = _Deferred
 
 
 _BUILT_IN = ("los", "indexer", "head", "cube", "tumble")

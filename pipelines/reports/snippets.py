@@ -10,6 +10,7 @@ import ast
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -297,12 +298,11 @@ def _c_numbers(value: Array) -> str:
     if value.ndim == 0:
         return repr(_digits(float(value)))
     # A struct around its array.
-    inner = ", ".join(_c_numbers(each) if each.ndim == 0 else _c_row(each) for each in value)
-    return f"{{{{{inner}}}}}"
+    return f"{{{_c_list(value.tolist())}}}"
 
 
-def _c_row(row: Array) -> str:
-    return "{" + ", ".join(repr(_digits(float(x))) for x in row) + "}"
+def _c_list(value: Any) -> str:
+    return f"{{{', '.join(map(_c_list, value))}}}" if isinstance(value, list) else repr(_digits(value))
 
 
 def _digits(value: float) -> float:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import model_validator
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.simulation.scenario import ScenarioPart
-
-Array = NDArray[np.float64]
 
 _HALF = float(np.sqrt(0.5))
 # id -> (bodyRtag, normal), the faces of the cube.

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem, Residuals
@@ -24,8 +25,6 @@ from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, local
 from alidade.pipelines.methods.cube.static_poses import StaticPoses, static_poses
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.settings import Config
-
-Array = NDArray[np.float64]
 
 # Twelve unknowns, three equations a pose.
 _FEWEST_POSES = 4

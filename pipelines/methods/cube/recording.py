@@ -6,7 +6,7 @@ import datetime
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
-from typing import TYPE_CHECKING, Annotated, ClassVar, Self, TypeVar, cast
+from typing import Annotated, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,6 @@ from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_s
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, TEMPERATURE, Need, Setting, Topic, wanted
 from alidade.pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
 from alidade.pipelines.vision.camera import Camera
-
-if TYPE_CHECKING:
-    from alidade.pipelines.vision.camera import Camera
-
 
 REFERENCE_FIX = Topic("reference_fix", "/reference/fix", (messages.NAV_SAT_FIX,))
 REFERENCE_IMU = Topic("reference_imu", "/reference/imu", (messages.IMU,))
@@ -280,6 +276,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     check_overlap(spans)
 
     latitude, longitude, height = read_place(recording, config, REFERENCE_FIX)
+    has_camera = any(wanted(recording, config, topic) for topic in (IMAGE, TAG_DETECTIONS))
     data = CubeData(
         epoch_ns=reader.epoch_ns,
         imu_t=imu.t,
@@ -293,7 +290,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         latitude=latitude,
         longitude=longitude,
         height=height,
-        camera=read_camera(recording, config) if _has_camera(recording, config) else None,
+        camera=read_camera(recording, config) if has_camera else None,
         gyro_density=gyro_density,
         accel_density=accel_density,
         mag_density=mag_density,
@@ -305,10 +302,6 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     whole = replace(data, sightings=read_sightings(recording, data, config, reader.dropped))
     whole.computed.update(data.computed)  # the static intervals do not depend on what the camera saw
     return whole
-
-
-def _has_camera(recording: Recording, config: Config) -> bool:
-    return any(wanted(recording, config, topic) for topic in (IMAGE, TAG_DETECTIONS))
 
 
 def _reference(reader: StreamReader, topic: str) -> tuple[Array, Array, Array | None]:

@@ -16,6 +16,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate, gravity, magnetic_field
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import stated
@@ -50,7 +51,6 @@ from alidade.pipelines.simulation.scenario import EPOCH_NS, YEAR, Simulated
 from alidade.pipelines.simulation.sensors import by_axis, drift, measured, sample_times, strength_measured, true_values
 from alidade.pipelines.vision.camera import Camera
 
-Array = NDArray[np.float64]
 _PARTS = 8
 _SQUARE = 0.5 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 # A tag is read when the cosine between its normal and the way to the camera is more than this.

@@ -11,15 +11,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
-
-Array = NDArray[np.float64]
 
 # The Euler rates divide by cos(pitch). Nearer than this to pitch +-90 deg (rad) they divide by the cosine held here.
 _NEAREST_TO_VERTICAL = np.deg2rad(5.0)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import Simulator
@@ -41,8 +42,6 @@ from alidade.pipelines.simulation.sensors import (
     true_values,
 )
 from alidade.pipelines.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 Fraction = Annotated[float, Field(ge=0.0, lt=1.0)]
 Vector = tuple[float, float, float]
@@ -290,7 +289,7 @@ def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array
     for start, end in scenario.vision_outages_s:
         seen &= (t < start) | (t >= end)
     t = t[seen]
-    cRb, vRh = _mount(scenario.camera_mount_deg), _mount(scenario.helmet_mount_deg)
+    cRb, vRh = so3.exp(np.deg2rad([scenario.camera_mount_deg, scenario.helmet_mount_deg]))
     at = exposures(t, scenario.time_offset_s, effects["clock_skew"])
     filtered = so3.exp(effects["vision_filter"] * _acceleration(scenario, at))
     cRh = so3.compose(cRb, scenario.head.attitude(at), filtered, vRh)
@@ -320,10 +319,6 @@ def _vision(
     is_outlier = rng.random(n) < scenario.outlier_fraction
     jump = so3.exp(axis * (np.deg2rad(scenario.outlier_deg) * is_outlier)[:, None])
     return t, so3.compose(cRh, error, jump)
-
-
-def _mount(rotation_vector_deg: Vector) -> Array:
-    return so3.exp(np.deg2rad(rotation_vector_deg))
 
 
 def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:

@@ -11,14 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import ChiSquare, Estimate, History, Problem, Residuals
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
-
-Array = NDArray[np.float64]
 
 NAMES = ("delta_px", "delta_gx", "delta_gy", "delta_z")
 

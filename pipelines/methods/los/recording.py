@@ -8,8 +8,8 @@ from itertools import pairwise, product
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.recording import messages, series
@@ -30,9 +30,6 @@ JOINTS = ("azimuth", "elevation")
 
 TOPICS = (IMU, GIMBAL, LOS_ERROR, IMAGE, CAMERA_INFO, TEMPERATURE)
 REQUIREMENTS: tuple[Need, ...] = (((IMU,),), ((GIMBAL,),), ((LOS_ERROR,), (IMAGE, CAMERA_INFO)))
-
-
-Array = NDArray[np.float64]
 
 # Beyond this elevation the azimuth axis would have to turn sec(elevation) > 5.8 times as fast as the sway.
 _STEEPEST = np.deg2rad(80.0)

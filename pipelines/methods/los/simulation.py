@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import Simulator
@@ -44,9 +45,6 @@ from alidade.pipelines.simulation.sensors import (
     smooth_map,
     true_values,
 )
-
-Array = NDArray[np.float64]
-
 
 # Gyro samples that are simulated at once.
 _BLOCK = 100_000
