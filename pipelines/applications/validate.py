@@ -139,10 +139,11 @@ def validate(
         return Validated(known, path.name, validations, True, opened.notes)
     session = Session(chosen, data, settings, opened)
     with session.usual_time():
-        held, estimate, own = _held(session, known)
+        found = _held(session, known)
         lost = (*opened.notes, *filter(None, [deadline.stopped()]))
-    if held is None or estimate is None:
+    if found is None:
         return Validated(known, path.name, validations, False, lost)
+    held, estimate, own = found
     of_device = walks(chosen, settings, [name for name in own if name in known.parameters])
     fixed = {name: values[name] for name in of_device if name in values}
     device = chosen.report.validate(data, settings, own | _conditioned(estimate, fixed))
@@ -160,28 +161,24 @@ def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float
     return dict(zip(estimate.names, (estimate.values + scale * (correlation @ weights)).tolist(), strict=True)) | fixed
 
 
-def _held(
-    session: Session, known: SavedCalibration
-) -> tuple[CalibrationCheck | None, Estimate | None, dict[str, float]]:
-    """What the recording says of the calibration, and its own estimate; neither where it cannot be solved."""
+def _held(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Estimate, dict[str, float]] | None:
+    """What the recording says of the calibration, its own estimate and numbers; None where it cannot be solved."""
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError
 
     if known.solver == "published":
-        return None, None, {}
-    problem = session.problem().near(
-        dict(zip(known.gaussian_prior.names, known.gaussian_prior.mean.tolist(), strict=True))
-    )
+        return None
+    problem = session.problem().near({name: p.value for name, p in known.parameters.items()})
     device = walks(session.method, session.config, [q.name for q in problem.quantities])
     gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:
         with progress.doing("solving"):
             estimate = solve_batch(problem, device=device)
     except IndeterminateError:
-        return None, None, {}
+        return None
     own = problem.numbers(estimate)
     if not estimate.converged or estimate.sqrt_info is None:
         deadline.passed("the solution of this recording")
-        return None, None, {}
+        return None
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
     return check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, inflations), estimate, own

@@ -588,7 +588,7 @@ def _effect(quantity: Quantity, shift: float, sigma: float) -> str:
 
 def _influential_measurements(c: Calibration) -> tuple[Block, ...]:
     columns: Columns = ("family", "time, s", Column("moves most", "text", wide=True), "in its sigmas")
-    rows = tuple((m.family, f"{m.time_s:.2f}", m.parameter, signed(m.pull, 2)) for m in c.measurements or ())
+    rows = tuple((m.family, f"{m.time:.2f}", m.parameter, signed(m.sigmas, 2)) for m in c.estimate.strongest or ())
     caption = "Shift of the parameter if the measurement is left out, in sigmas. Undetected outliers rank first."
     return (Table("", caption, columns, rows, "measurements", "short-rows", 0),) if rows else ()
 

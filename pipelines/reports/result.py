@@ -41,13 +41,7 @@ from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.reports import sentences
-from alidade.pipelines.reports.result_json import (
-    MeasurementResult,
-    NoiseResult,
-    ParameterResult,
-    PartResult,
-    SensitivityResult,
-)
+from alidade.pipelines.reports.result_json import NoiseResult, ParameterResult, PartResult, SensitivityResult
 from alidade.pipelines.reports.values import Application, SensorValues
 from alidade.pipelines.settings import Config
 
@@ -222,16 +216,6 @@ class Calibration(SensorValues):
                 by_unit = {name: moves[name] / exact.step for name in self._calibrated if name in moves}
                 found[exact.name] = SensitivityResult(unit=exact.unit, step=exact.step, parameters=by_unit)
         return found
-
-    @property
-    def measurements(self) -> list[MeasurementResult] | None:
-        """The most influential measurements; None if the solver has none."""
-        if self.estimate.strongest is None:
-            return None
-        return [
-            MeasurementResult(family=p.family, time_s=p.time, parameter=p.parameter, pull=p.sigmas)
-            for p in self.estimate.strongest
-        ]
 
     @property
     def _calibrated(self) -> list[str]:

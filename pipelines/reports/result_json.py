@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
+    AliasChoices,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -185,9 +186,9 @@ class MeasurementResult(_Record):
     """An influential measurement and the parameter that it shifts most, in sigmas."""
 
     family: str  # of measurements
-    time_s: float  # s from the start
+    time_s: float = Field(validation_alias=AliasChoices("time_s", "time"))  # s from the start
     parameter: str  # that it shifts most
-    pull: float  # shift in sigmas
+    pull: float = Field(validation_alias=AliasChoices("pull", "sigmas"))  # shift in sigmas
 
 
 class SelfCheckResult(_Record):
@@ -337,10 +338,7 @@ def invalid(path: Path, what: str, error: ValidationError) -> InputError:
 
 
 # Keys that a calibration has by the same name.
-_ITS_OWN = (
-    *("status", "software", "headline", "notes", "innovations", "learning"),
-    *("budget", "sensitivity", "measurements", "applied"),
-)
+_ITS_OWN = ("status", "software", "headline", "notes", "innovations", "learning", "budget", "sensitivity", "applied")
 
 
 def result(calibration: Calibration) -> Result:
@@ -372,6 +370,7 @@ def result(calibration: Calibration) -> Result:
             "stability": c.stability
             and {**vars(c.stability), "change": c.stability.departures if c.stability.changed else {}},
             "self_check": c.solver_difference and {**vars(c.solver_difference), "difference": c.solver_difference.z},
+            "measurements": c.estimate.strongest,
             "findings": [finding_json(finding) for finding in c.findings],
             "tables": {**c.tables, **({"derived": [each._asdict() for each in c.derived]} if c.derived else {})},
             "second_best": second

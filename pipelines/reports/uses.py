@@ -47,34 +47,26 @@ def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
 
 def posterior_of(c: Calibration) -> Posterior:
     """The estimate with what the formulas apply of it."""
-    quantities, names = quantities_of(c.problem, c.estimate), c.estimate.names
-    others = {**c.problem.constants, **dict.fromkeys((q.name for q in c.problem.quantities), 0.0)}
-    gains = [name for name in names if len(name) > 4 and name[-4:-2] == "_k"]
-    units = {q.name: q for q in quantities}
-    plain = all(units[name].unit in ("", "1") for name in gains)
+    quantities, known = quantities_of(c.problem, c.estimate), c.application()
+    gains = {q.name: q for q in quantities if len(q.name) > 4 and q.name[-4:-2] == "_k"}
+    plain = all(q.unit in ("", "1") for q in gains.values())
     nominal = {
         q.name: (float(q.name[-1] == q.name[-2]) if q.name in gains else 0.0) if plain else q.prior_mean
         for q in quantities
-        if q.group is None
+        if q.group is None and q.name in known.values
     }
-
-    def formulas(known: Sequence[str], values: Mapping[str, float]) -> AppliedFormulas:
-        kept = {name: values[name] for name in known if name in values}
-        return AppliedFormulas(c.method.report.formulas(list(known), c.config), kept, others)
-
-    everything = [q.name for q in c.problem.quantities]
     truth = None
     if c.truth is not None:
-        known = {name: value for name, value in c.truth.items() if isinstance(value, int | float)}
-        truth = np.array([known.get(name, value) for name, value in c.values.items()], dtype=float)
+        stated = {name: value for name, value in c.truth.items() if isinstance(value, int | float)}
+        truth = np.array([stated.get(name, value) for name, value in c.values.items()], dtype=float)
     require = [q.require if q.judged and np.isfinite(q.require) else 0.0 for q in quantities]
     return Posterior(
-        names=names,
+        names=c.estimate.names,
         x=c.estimate.values,
         P=c.covariance,
         require=np.array(require),
-        applied=formulas(c.applied, c.applied_values),
-        nominal=formulas(c.applied, nominal),
-        whole=formulas(everything, c.values),
+        applied=AppliedFormulas(known.formulas, known.values, known.constants),
+        nominal=AppliedFormulas(known.formulas, nominal, known.constants),
+        whole=AppliedFormulas(known.whole, c.values, known.constants),
         truth=truth,
     )
