@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import permutations
 
 import numpy as np
 
@@ -29,7 +28,6 @@ from alidade.pipelines.simulation.scenario import YEAR
 
 # Poses that determine the twelve numbers of a triad, and those of published practice: each of six faces thrice.
 _FEWEST_POSES, _POSES_A_FACE = 4, 3
-_FACES: tuple[Side, ...] = tuple(SIDES)
 
 
 def checklist(data: CubeData, config: Config) -> Sequence[ChecklistItem]:
@@ -37,7 +35,7 @@ def checklist(data: CubeData, config: Config) -> Sequence[ChecklistItem]:
     poses = static_poses(data, config)
     up = poses.accel / np.linalg.norm(poses.accel, axis=1, keepdims=True)
     faces = np.argmax(up @ np.array(list(SIDES.values())).T, axis=1)
-    count = {face: int((faces == k).sum()) for k, face in enumerate(_FACES)}
+    count = {face: int((faces == k).sum()) for k, face in enumerate(SIDES)}
     few = [face for face, n in count.items() if n < _POSES_A_FACE]
     tags = sorted({int(tag) for seen in poses.tags if seen is not None for tag in seen.ids})
     wanted = f"at least {_FEWEST_POSES}" if len(up) < _FEWEST_POSES else ""
@@ -65,36 +63,23 @@ def next_pose(up: Array, mag: Array | None) -> Motion:
     What a pose with nominal vector n adds to what a triad's twelve numbers are known by is x'N^-1x, x = (n, 1), N the
     sum of xx' over the poses there are.
     """
-    field, dip = None, 0.0  # directions of the earth's field, and the sine of its angle above the horizon
-    if mag is not None and np.isfinite(mag).all(axis=1).any():
-        seen = np.isfinite(mag).all(axis=1)
-        field = mag[seen] / np.linalg.norm(mag[seen], axis=1, keepdims=True)
-        dip = float(np.median((field * up[seen]).sum(axis=1)))
-    known = _information(up)
-    known_field = None if field is None else _information(field)
-    best, most = Motion(""), -1.0
-    axes = [sign * unit for unit in np.eye(3) for sign in (1.0, -1.0)]
-    for (i, above), (k, north) in permutations(enumerate(axes), 2):
-        if i // 2 == k // 2:
-            continue
-        gain = _gain(known, above)
-        if known_field is not None:
-            gain += _gain(known_field, dip * above + np.sqrt(max(1.0 - dip**2, 0.0)) * north)
-        if gain > most * (1.0 + 1e-9):
-            ahead = f" and {_FACES[k]} to the north" if known_field is not None else ""
-            picture = rested(_FACES[i], None if known_field is None else _FACES[k])
-            best, most = Motion(f"rest the cube with {_FACES[i]} up{ahead}", picture), gain
-    return best
+    known, field = _FisherInformation(_information(up), None, _REGULARISER * np.eye(3), None), None
+    if mag is not None and (seen := np.isfinite(mag).all(axis=1)).any():
+        measured = mag[seen] / np.linalg.norm(mag[seen], axis=1, keepdims=True)
+        dip = float(np.median((measured * up[seen]).sum(axis=1)))  # sine of the field's angle above the horizon
+        field = np.array([0.0, np.sqrt(max(1.0 - dip**2, 0.0)), dip])
+        known = replace(known, mag=_information(measured))
+    choices = _choices((0.0,))
+    gains = np.expm1(_gains(known, choices, field)).sum(axis=1)
+    best = choices[int(np.argmax(gains > gains.max() * (1.0 - 1e-9)))]
+    north = None if field is None else best.north
+    ahead = "" if north is None else f" and {north} to the north"
+    return Motion(f"rest the cube with {best.up} up{ahead}", rested(best.up, north))
 
 
 def _information(vectors: Array) -> Array:
     rows = np.column_stack([vectors, np.ones(len(vectors))])
-    return np.asarray(rows.T @ rows + 1e-3 * np.eye(4))
-
-
-def _gain(information: Array, vector: Array) -> float:
-    row = np.append(vector, 1.0)
-    return float(row @ np.linalg.solve(information, row))
+    return np.asarray(rows.T @ rows + _REGULARISER * np.eye(4))
 
 
 # Poses that are proposed together, and the seed of their simulation.
@@ -216,13 +201,7 @@ def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[R
     )
     for nRb in attitudes(scenario, seed):
         known = _after(known, nRb, field)
-    choices = [
-        Resting(up=up, north=north, lean_deg=lean)
-        for up in SIDES
-        for north in SIDES
-        for lean in _LEANS
-        if up[1] != north[1]
-    ]
+    choices = _choices(_LEANS)
     gains = _gains(known, choices, field)
     single = [choices[int(np.argmax(column))] for column in [gains.sum(axis=1), *gains.T]]
     series: list[Resting] = []
@@ -230,6 +209,12 @@ def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[R
         series.append(choices[int(np.argmax(_gains(known, choices, field).sum(axis=1)))])
         known = _after(known, series[-1].nRb, field)
     return list(dict.fromkeys(single)), series
+
+
+def _choices(leans: Sequence[float]) -> list[Resting]:
+    """Attitudes along the axes, each with its top leaned by these angles, deg."""
+    sides = [(up, north) for up in SIDES for north in SIDES if up[1] != north[1]]
+    return [Resting(up=up, north=north, lean_deg=lean) for up, north in sides for lean in leans]
 
 
 def _rows(known: _FisherInformation, nRb: Array, field: Array | None) -> list[tuple[Array, Array]]:
