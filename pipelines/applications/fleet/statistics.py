@@ -223,13 +223,11 @@ def varies(z: Array) -> bool:
 
 def _excess(squares: Array, variances: Array) -> float:
     """tau with median(squares / (tau^2 + variances)) = the median of chi-square; 0 if the variances suffice."""
-    low, high = 0.0, float(squares.max()) / _MEDIAN
-    if float(np.median(squares / variances)) <= _MEDIAN:
+    from scipy.optimize import brentq
+
+    def over(excess: float) -> float:
+        return float(np.median(squares / (excess + variances))) - _MEDIAN
+
+    if over(0.0) <= 0.0:
         return 0.0
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        if float(np.median(squares / (middle + variances))) > _MEDIAN:
-            low = middle
-        else:
-            high = middle
-    return math.sqrt(high)
+    return math.sqrt(brentq(over, 0.0, float(squares.max()) / _MEDIAN, xtol=np.finfo(float).tiny))
