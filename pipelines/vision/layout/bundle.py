@@ -163,14 +163,16 @@ def normal_equations(
     """Normal equations of weighted errors; tag number `fixed` stays, Levenberg's damping is relative."""
     f = len(bundle.cRb)
     own, gradient, At = of_pictures(sights, rows, weights, f)
-    information, vector, across = _of_tags(bundle, sights, rows, weights, At)
-    free = np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6)
-    if additional.free.any():
-        information, vector, across = _with_additional(
-            bundle, sights, rows, weights, additional, (information, vector, across)
-        )
-        free = np.concatenate([free, additional.free])
-    information, vector, across = information[np.ix_(free, free)], vector[free], across[..., free]
+    J = shared_rows(bundle, sights, rows, additional)
+    free = np.concatenate([np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6), additional.free])[: J.shape[2]]
+    J = J[..., free]
+    across = sights.by_picture(At @ J, f)
+    flat, weighted = J.reshape(-1, J.shape[2]), (weights[:, None, None] * J).reshape(-1, J.shape[2])
+    information, vector = weighted.T @ flat, weighted.T @ rows.miss.ravel()
+    priors = np.arange(J.shape[2] - additional.free.sum(), J.shape[2])
+    precision = additional.sigma[additional.free] ** -2.0
+    information[priors, priors] += precision
+    vector[priors] += precision * additional.off(bundle)[additional.free]
     own[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping
     diagonal = np.diag_indices_from(information)
     # A tag of which nothing is left stays where it is.
@@ -187,53 +189,8 @@ def normal_equations(
 def of_pictures(sights: Sights, rows: Rows, weights: Array, f: int) -> tuple[Array, Array, Array]:
     """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses, and the weighted Jacobians' transposes."""
     At = np.swapaxes(rows.by_picture, 1, 2) * weights[:, None, None]
-    own, gradient = np.zeros((f, 6, 6)), np.zeros((f, 6))
-    np.add.at(own, sights.picture, At @ rows.by_picture)
-    np.add.at(gradient, sights.picture, (At @ rows.miss[..., None])[..., 0])
-    return own, gradient, At
-
-
-def _of_tags(bundle: Bundle, sights: Sights, rows: Rows, weights: Array, At: Array) -> tuple[Array, Array, Array]:
-    """The tags' information, gradient and what they share with pictures, before these are eliminated."""
-    f, tags = len(bundle.cRb), len(bundle.body.ids)
-    Bt = np.swapaxes(rows.by_tag, 1, 2) * weights[:, None, None]
-    blocks, gradient, across = np.zeros((tags, 6, 6)), np.zeros((tags, 6)), np.zeros((f, tags, 6, 6))
-    np.add.at(blocks, sights.tag, Bt @ rows.by_tag)
-    np.add.at(gradient, sights.tag, (Bt @ rows.miss[..., None])[..., 0])
-    np.add.at(across, (sights.picture, sights.tag), At @ rows.by_tag)
-    information = np.zeros((tags, 6, tags, 6))
-    information[np.arange(tags), :, np.arange(tags)] = blocks
-    n = 6 * tags
-    return information.reshape(n, n), gradient.ravel(), across.transpose(0, 2, 1, 3).reshape(f, 6, n)
-
-
-def _with_additional(
-    bundle: Bundle,
-    sights: Sights,
-    rows: Rows,
-    weights: Array,
-    additional: Additional,
-    tags: tuple[Array, Array, Array],
-) -> tuple[Array, Array, Array]:
-    """What `_of_tags` gives, with the additional parameters and their priors after the tags'."""
-    information, gradient, across = tags
-    C = additional.rows(bundle, sights, rows)
-    f, n = len(bundle.cRb), C.shape[2]
-    weighted = C * weights[:, None, None]
-    Ct = np.swapaxes(weighted, 1, 2)
-    with_pictures, with_tags = np.zeros((f, n, 6)), np.zeros((len(bundle.body.ids), n, 6))
-    np.add.at(with_pictures, sights.picture, Ct @ rows.by_picture)
-    np.add.at(with_tags, sights.tag, Ct @ rows.by_tag)
-    mixed = with_tags.transpose(1, 0, 2).reshape(n, -1)
-    precision = np.where(additional.free, additional.sigma, 1.0) ** -2.0
-    flat = weighted.reshape(-1, n).T
-    own = flat @ C.reshape(-1, n) + np.diag(precision)
-    right = flat @ rows.miss.ravel() + precision * additional.off(bundle)
-    return (
-        np.block([[information, mixed.T], [mixed, own]]),
-        np.concatenate([gradient, right]),
-        np.concatenate([across, with_pictures.transpose(0, 2, 1)], axis=2),
-    )
+    gradient = sights.by_picture((At @ rows.miss[..., None])[..., 0], f)
+    return sights.by_picture(At @ rows.by_picture, f), gradient, At
 
 
 def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional) -> Bundle:

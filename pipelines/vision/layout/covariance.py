@@ -68,19 +68,6 @@ DEFORMATIONS = _deformations()
 
 
 @dataclass(frozen=True, eq=False)
-class Bending:
-    """Effect of deformed tags on a layout.
-
-    Attributes:
-        level: sigma of a corner, each way, as a share of the tag's size.
-        spread: (q, q) covariance that this brings to all that pictures share.
-    """
-
-    level: float
-    spread: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Covariance:
     """Covariance of a layout and of the additional parameters adjusted with it.
 
@@ -114,8 +101,8 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
     information = normal_equations(bundle, sights, rows, curved, fixed, fit.additional).information
     white: Array = np.asarray(np.linalg.inv(information), dtype=float)
     own, by_deformation = _eliminated(fit, fixed)
-    deformation = bending(rows.miss, by_deformation, own, white)
-    found = _sandwich(fit, own, view, white) + deformation.spread
+    bend, spread = bending(rows.miss, by_deformation, own, white)
+    found = _sandwich(fit, own, view, white) + spread
     correction = None
     free = fit.additional.free
     if free.any():
@@ -130,7 +117,7 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
         inflation[tag] = np.sqrt(np.trace(np.linalg.solve(white[at, at], found[at, at])) / 6.0)
     sigma = np.zeros(len(free))
     sigma[free] = np.sqrt(np.diag(found)[tags:])
-    return Covariance(found[:tags, :tags], found, sigma, inflation, deformation.level, correction)
+    return Covariance(found[:tags, :tags], found, sigma, inflation, bend, correction)
 
 
 def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
@@ -167,8 +154,7 @@ def _eliminated(fit: Fit, fixed: int) -> tuple[Array, Array]:
     of_tags = np.zeros((m, 8, tags, len(DEFORMATIONS)))
     of_tags[np.arange(m), :, sights.tag] = bend_rows(bundle, sights, rows)
     deformed = of_tags.reshape(m, 8, -1)
-    across = np.zeros((len(bundle.cRb), 6, deformed.shape[2]))
-    np.add.at(across, sights.picture, np.swapaxes(rows.by_picture, 1, 2) @ deformed)
+    across = sights.by_picture(np.swapaxes(rows.by_picture, 1, 2) @ deformed, len(bundle.cRb))
     return (
         shared - rows.by_picture @ (normal.inverse @ normal.across)[sights.picture],
         deformed - rows.by_picture @ (normal.inverse @ across)[sights.picture],
@@ -264,8 +250,8 @@ def bend_rows(bundle: Bundle, sights: Sights, rows: Rows) -> Array:
     return by_deformation.reshape(m, 8, len(DEFORMATIONS))
 
 
-def bending(miss: Array, by_deformation: Array, own: Array, white: Array) -> Bending:
-    """The most likely level, and its effect.
+def bending(miss: Array, by_deformation: Array, own: Array, white: Array) -> tuple[float, Array]:
+    """The most likely sigma of a corner, each way, as a share of a tag's size, and the (q, q) covariance it brings.
 
     Errors are linear in the deformations x, and x in their gradient g = J x, J the information on x with all else
     eliminated: along the axes of J a component of g has the variance l + l^2 level^2, l its information.
@@ -285,4 +271,4 @@ def bending(miss: Array, by_deformation: Array, own: Array, white: Array) -> Ben
     variance = information[known] + (information[known] * _LEVELS[:, None]) ** 2
     unlikely = (np.log(variance) + gradient[known] ** 2 / variance).sum(axis=1)
     level = float(_LEVELS[(unlikely + (np.log(_LEVELS / _PAPER) / _ROUGHLY) ** 2).argmin()])
-    return Bending(level, level**2 * np.asarray(moved @ moved.T))
+    return level, level**2 * np.asarray(moved @ moved.T)

@@ -20,7 +20,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.layout.bundle import adjusted, loss, nothing, refined_pictures
 from alidade.pipelines.vision.layout.robust import Fit, fitted
 from alidade.pipelines.vision.layout.sights import Bundle, Gathered, Index, Sights, linearized
-from alidade.pipelines.vision.pose import TagBody, part, planar_solutions
+from alidade.pipelines.vision.pose import TagBody, planar_solutions
 
 # Sum of squares of a tag in a picture, eight numbers in sigmas, beyond which it counts less and less.
 FAR = 8.0 * 4.0**2
@@ -45,17 +45,6 @@ _HEARD = 40
 
 
 @dataclass(frozen=True, eq=False)
-class Flips:
-    """Both poses of each tag in each picture: cRt (m, 2, 4), place in c (m, 2, 3) m."""
-
-    cRt: Array
-    place: Array
-
-    def __getitem__(self, keep: Index) -> Flips:
-        return Flips(self.cRt[keep], self.place[keep])
-
-
-@dataclass(frozen=True, eq=False)
 class Sides:
     """The two poses that each picture may have, the better first.
 
@@ -77,17 +66,15 @@ def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
     Raises:
         InputError: the pictures do not distinguish the layout from its mirror image.
     """
-    sights = views.sights
-    found = flips(views.start, sights)
-    sights = replace(sights, sigma=sights.sigma * lone_scale(views.start, sights, found))
+    sights = with_flips(views.start, views.sights)
+    sights = replace(sights, sigma=sights.sigma * lone_scale(views.start, sights))
     if body is None:
-        few = _decisive(sights, views.view)
-        body = _in_frame(grown(views.start, sights[few], found[few]), views.start.body)
-    body = _right_side_out(replace(views.start, body=body), sights, found)
+        body = _in_frame(grown(views.start, sights[_decisive(sights, views.view)]), views.start.body)
+    body = _right_side_out(replace(views.start, body=body), sights)
     start = replace(views.start, body=body)
-    poses = sides(start, sights, found, FAR)
+    poses = sides(start, sights)
     decided = poses.cost[:, 1] - poses.cost[:, 0] > _DECIDED
-    whole = np.flatnonzero(together(sights) & decided[sights.picture])
+    whole = np.flatnonzero(sights.together & decided[sights.picture])
     if not len(whole):
         raise InputError(
             "no picture distinguishes its tags' poses from their planar flips; take pictures from nearer, or that "
@@ -104,8 +91,7 @@ def _decisive(sights: Sights, view: Index) -> Index:
         ties = joint(sights, int(sights.tag.max()) + 1)
         a, b = pairs(sights.picture)
         rare = np.unique(sights.picture[a[ties[sights.tag[a], sights.tag[b]] <= _RARE]])
-        even = first[np.linspace(0, len(first) - 1, _MOST).round().astype(np.intp)]
-        first = np.union1d(even, np.intersect1d(rare, first))
+        first = np.union1d(_some(first, _MOST), np.intersect1d(rare, first))
     return np.flatnonzero(np.isin(sights.picture, first))
 
 
@@ -116,17 +102,17 @@ def _in_frame(body: TagBody, given: TagBody) -> TagBody:
     return replace(body, bRt=so3.multiply(turn, body.bRt), position=position)
 
 
-def _right_side_out(start: Bundle, sights: Sights, found: Flips) -> TagBody:
+def _right_side_out(start: Bundle, sights: Sights) -> TagBody:
     """The body or its mirror image, whichever the pictures fit.
 
     Raises:
         InputError: both fit.
     """
     bodies, costs = [], []
-    seen = sights[together(sights)]
+    seen = sights[sights.together]
     for body in (start.body, mirrored(start.body, 0)):
         there = replace(start, body=body)
-        there = with_pictures(there, sides(there, sights, found, FAR))
+        there = with_pictures(there, sides(there, sights))
         after, rows = adjusted(there, seen, 0, nothing(start), FAR)
         bodies.append(after.body)
         costs.append(float(loss(rows.squares, FAR).sum()))
@@ -147,12 +133,9 @@ def flip_told(fit: Fit, view: Index, tag: int) -> bool:
     """
     mine = np.flatnonzero(fit.sights.tag == tag)
     mine = mine[np.unique(view[fit.sights.picture[mine]], return_index=True)[1]]
-    mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), _HEARD)).round().astype(np.intp)]
-    pictures = fit.sights.picture[mine]
-    others = fit.sights[np.isin(fit.sights.picture, pictures) & (fit.sights.tag != tag)]
-    poses = sides(fit.bundle, others, flips(fit.bundle, others), FAR)
-    seen = fit.sights[mine]
-    bRt, _, cost = vote(fit.bundle, seen, flips(fit.bundle, seen), poses)
+    seen = fit.sights[_some(mine, _HEARD)]
+    others = fit.sights[np.isin(fit.sights.picture, seen.picture) & (fit.sights.tag != tag)]
+    bRt, _, cost = vote(fit.bundle, seen, sides(fit.bundle, others))
     now = _angles(bRt, fit.bundle.body.bRt[tag]) < _SAME
     return bool(now.any() and (now.all() or cost[~now].min() - cost[now].min() > _DECIDED))
 
@@ -161,25 +144,27 @@ def _angles(p: Array, q: Array) -> Array:
     return np.asarray(np.linalg.norm(so3.log(so3.multiply(so3.inverse(p), q)), axis=-1))
 
 
-def grown(bundle: Bundle, sights: Sights, found: Flips) -> TagBody:
+def grown(bundle: Bundle, sights: Sights) -> TagBody:
     """The body with all its tags placed, in the frame of the one that is seen most with others.
 
     Args:
         bundle: cameras, sizes; no pose in it is looked at.
         sights: of tags that pictures tie together.
-        found: of the same sights.
     """
     n = len(bundle.body.ids)
     body = replace(bundle.body, bRt=so3.identity(n), position=np.zeros((n, 3)))
     shared = joint(sights, n)
     seed = int((shared.sum(axis=1) - np.diag(shared)).argmax())
     bundle, placed = replace(bundle, body=body), np.arange(n) == seed
-    poses = _sides(bundle, sights, found, placed)
+    poses = sides(bundle, sights[placed[sights.tag]])
     while (tag := _next(sights, placed)) is not None:
-        bundle = _placed(bundle, sights, found, poses, tag)
+        bundle = _placed(bundle, sights, poses, tag)
         placed[tag] = True
-        bundle = _settled(bundle, sights, _sides(bundle, sights, found, placed), placed, seed)
-        poses = _sides(bundle, sights, found, placed)
+        seen = sights[placed[sights.tag]]
+        start = with_pictures(bundle, sides(bundle, seen))
+        # A few steps; tags that are not placed yet stay where they are.
+        bundle, _ = adjusted(start, seen[seen.together], seed, nothing(start), FAR, _ON_THE_WAY)
+        poses = sides(bundle, seen)
     return bundle.body
 
 
@@ -197,11 +182,6 @@ def with_pictures(bundle: Bundle, poses: Sides) -> Bundle:
     return replace(bundle, cRb=poses.cRb[:, 0], position=poses.position[:, 0])
 
 
-def together(sights: Sights) -> NDArray[np.bool_]:
-    """Mask (m,) of sights in pictures that show two tags or more."""
-    return np.asarray(np.bincount(sights.picture)[sights.picture] > 1)
-
-
 def joint(sights: Sights, tags: int) -> Array:
     """Number (n, n) of pictures that show two tags together."""
     a, b = pairs(sights.picture)
@@ -217,28 +197,10 @@ def _next(sights: Sights, placed: NDArray[np.bool_]) -> int | None:
     return int(np.bincount(sights.tag[rows]).argmax()) if rows.any() else None
 
 
-def _sides(bundle: Bundle, sights: Sights, found: Flips, placed: NDArray[np.bool_]) -> Sides:
-    keep = np.flatnonzero(placed[sights.tag])
-    return sides(bundle, sights[keep], found[keep], FAR)
-
-
-def _settled(bundle: Bundle, sights: Sights, poses: Sides, placed: NDArray[np.bool_], seed: int) -> Bundle:
-    """A few steps of adjustment of what is placed."""
-    seen = sights[placed[sights.tag]]
-    seen = seen[together(seen)]
-    number = np.cumsum(placed) - 1
-    start = with_pictures(replace(bundle, body=part(bundle.body, placed)), poses)
-    seen = replace(seen, tag=number[seen.tag])
-    after, _ = adjusted(start, seen, int(number[seed]), nothing(start), FAR, _ON_THE_WAY)
-    bRt, position = bundle.body.bRt.copy(), bundle.body.position.copy()
-    bRt[placed], position[placed] = after.body.bRt, after.body.position
-    return replace(bundle, body=replace(bundle.body, bRt=bRt, position=position))
-
-
-def _placed(bundle: Bundle, sights: Sights, found: Flips, poses: Sides, tag: int) -> Bundle:
+def _placed(bundle: Bundle, sights: Sights, poses: Sides, tag: int) -> Bundle:
     """The bundle with one more tag where most pictures agree that it is."""
     rows = np.flatnonzero((sights.tag == tag) & np.isfinite(poses.cost[sights.picture, 0]))
-    bRt, position, _ = vote(bundle, sights[_some(rows, _PICTURES)], found[_some(rows, _PICTURES)], poses)
+    bRt, position, _ = vote(bundle, sights[_some(rows, _PICTURES)], poses)
     turned, places = bundle.body.bRt.copy(), bundle.body.position.copy()
     turned[tag], places[tag] = bRt[0], position[0]
     return replace(bundle, body=replace(bundle.body, bRt=turned, position=places))
@@ -251,7 +213,7 @@ def _some(rows: Index, most: int) -> Index:
     return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]
 
 
-def vote(bundle: Bundle, sights: Sights, found: Flips, poses: Sides) -> tuple[Array, Array, Array]:
+def vote(bundle: Bundle, sights: Sights, poses: Sides) -> tuple[Array, Array, Array]:
     """Proposals for the pose of one tag, refined: bRt (h, 4), position (h, 3) and cost (h,), by ascending cost.
 
     The error of a picture's own pose is part of a corner's: its covariance is that of both.
@@ -259,14 +221,13 @@ def vote(bundle: Bundle, sights: Sights, found: Flips, poses: Sides) -> tuple[Ar
     Args:
         bundle: cameras and body.
         sights: of this tag, in pictures whose poses others determine.
-        found: of the same sights.
         poses: of all pictures.
     """
     cRb, position = poses.cRb[sights.picture], poses.position[sights.picture]
     there = np.isfinite(poses.cost[sights.picture])
     bRc = so3.inverse(cRb)[:, :, None]
-    proposals = so3.multiply(bRc, found.cRt[:, None]).reshape(-1, 4)
-    places = so3.rotate(bRc, found.place[:, None] - position[:, :, None]).reshape(-1, 3)
+    proposals = so3.multiply(bRc, sights.cRt[:, None]).reshape(-1, 4)
+    places = so3.rotate(bRc, sights.place[:, None] - position[:, :, None]).reshape(-1, 3)
     keep = _some(np.flatnonzero(np.repeat(there.ravel(), 2)), _PROPOSALS)
     bRt, place = proposals[keep], places[keep]
     known = poses.information[sights.picture] + 1e-12 * np.eye(6)
@@ -312,7 +273,7 @@ def _against(
     proposal, sight, side = (a.ravel() for a in np.indices(shape))
     body = TagBody(np.arange(h), np.full(h, bundle.body.size[sights.tag[0]]), bRt, place, bundle.body.family)
     camera = bundle.camera[sights.picture][sight]
-    seen = Sights(np.arange(len(sight)), proposal, sights.corners[sight], sights.sigma[sight])
+    seen = replace(sights[sight], picture=np.arange(len(sight)), tag=proposal)
     rows = linearized(Bundle.of(bundle.cameras, camera, body, cRb[sight, side], position[sight, side]), seen)
     A, B, miss = rows.by_picture, rows.by_tag, rows.miss[..., None]
     At, Bt = np.swapaxes(A, 1, 2), np.swapaxes(B, 1, 2)
@@ -324,31 +285,29 @@ def _against(
     return squares.reshape(shape), gradient.reshape(*shape, 6), (Bt @ B - taken[..., 1:]).reshape(*shape, 6, 6)
 
 
-def flips(bundle: Bundle, sights: Sights) -> Flips:
-    """Both poses of each tag by itself, as they minimise its reprojection error."""
+def with_flips(bundle: Bundle, sights: Sights) -> Sights:
+    """The sights with both poses of each tag by itself."""
     m = len(sights)
     cRt, place = np.zeros((m, 2, 4)), np.zeros((m, 2, 3))
     size = bundle.body.size[sights.tag]
     for k, camera in enumerate(bundle.cameras):
         mine = np.flatnonzero(bundle.camera[sights.picture] == k)
         cRt[mine], place[mine] = planar_solutions(camera, size[mine], sights.corners[mine])
-    return Flips(cRt, place)
+    return replace(sights, cRt=cRt, place=place)
 
 
-def lone_scale(bundle: Bundle, sights: Sights, found: Flips) -> float:
+def lone_scale(bundle: Bundle, sights: Sights) -> float:
     """Ratio of the corners' errors to those stated, from each tag by itself: eight numbers for a pose of six."""
-    m = len(sights)
-    body = replace(bundle.body, bRt=so3.identity(len(bundle.body.ids)), position=np.zeros((len(bundle.body.ids), 3)))
-    alone = Sights(np.arange(m), sights.tag, sights.corners, sights.sigma)
-    costs = []
-    for k in range(2):
-        start = Bundle.of(bundle.cameras, bundle.camera[sights.picture], body, found.cRt[:, k], found.place[:, k])
-        costs.append(refined_pictures(start, alone)[1])
+    n, camera = len(bundle.body.ids), bundle.camera[sights.picture]
+    body = replace(bundle.body, bRt=so3.identity(n), position=np.zeros((n, 3)))
+    alone = replace(sights, picture=np.arange(len(sights)))
+    starts = (Bundle.of(bundle.cameras, camera, body, sights.cRt[:, k], sights.place[:, k]) for k in range(2))
+    costs = [refined_pictures(start, alone)[1] for start in starts]
     # The median of a chi-square of two degrees of freedom is 2 ln 2.
     return float(np.sqrt(np.median(np.minimum(*costs)) / (2.0 * np.log(2.0))))
 
 
-def sides(bundle: Bundle, sights: Sights, found: Flips, far: float) -> Sides:
+def sides(bundle: Bundle, sights: Sights) -> Sides:
     """The two poses of each picture with the tags where the bundle's body has them.
 
     Every pose of every tag in a picture is a start; the best is refined, and the best of those on the other side of
@@ -357,45 +316,33 @@ def sides(bundle: Bundle, sights: Sights, found: Flips, far: float) -> Sides:
     Args:
         bundle: cameras and body; its pictures' poses are not looked at.
         sights: of the tags that are placed.
-        found: of the same sights.
-        far: see `adjusted`.
     """
     f = len(bundle.cRb)
     bRt, place = bundle.body.bRt[sights.tag][:, None], bundle.body.position[sights.tag][:, None]
-    cRb = so3.multiply(found.cRt, so3.inverse(bRt))
-    position = found.place - so3.rotate(cRb, place)
-    costs = _start_costs(bundle, sights, cRb, position, far)
+    cRb = so3.multiply(sights.cRt, so3.inverse(bRt))
+    position = sights.place - so3.rotate(cRb, place)
+    costs = _start_costs(bundle, sights, cRb, position)
     picture = np.repeat(sights.picture, 2)
     cRb, position = cRb.reshape(-1, 4), position.reshape(-1, 3)
-    first = _refined(bundle, sights, _best(picture, costs.ravel(), f), cRb, position, far)
-    away = np.linalg.norm(so3.log(so3.multiply(so3.inverse(first[0].cRb[picture]), cRb)), axis=1).reshape(-1, 2)
+    first = _refined(bundle, sights, _best(picture, costs.ravel(), f), cRb, position)
+    away = _angles(first.cRb[picture], cRb).reshape(-1, 2)
     other = np.where(away < away[:, ::-1], np.inf, costs)
-    second = _refined(bundle, sights, _best(picture, other.ravel(), f), cRb, position, far)
-    turn = np.linalg.norm(so3.log(so3.multiply(so3.inverse(first[0].cRb), second[0].cRb)), axis=1)
-    second[1][turn < _ONE_POSE] = np.inf
-    order = np.argsort(np.stack([first[1], second[1]], axis=1), axis=1)
-    rows = np.arange(f)[:, None]
-
-    def sorted_(a: Array, b: Array) -> Array:
-        return np.asarray(np.stack([a, b], axis=1)[rows, order])
-
-    return Sides(
-        sorted_(first[0].cRb, second[0].cRb),
-        sorted_(first[0].position, second[0].position),
-        sorted_(first[1], second[1]),
-        sorted_(first[2], second[2]),
-    )
+    second = _refined(bundle, sights, _best(picture, other.ravel(), f), cRb, position)
+    second.cost[_angles(first.cRb, second.cRb) < _ONE_POSE] = np.inf
+    order = np.argsort(np.stack([first.cost, second.cost], axis=1), axis=1)
+    both = (np.stack(pair, axis=1) for pair in zip(vars(first).values(), vars(second).values(), strict=True))
+    return Sides(*(pair[np.arange(f)[:, None], order] for pair in both))
 
 
-def _start_costs(bundle: Bundle, sights: Sights, cRb: Array, position: Array, far: float) -> Array:
+def _start_costs(bundle: Bundle, sights: Sights, cRb: Array, position: Array) -> Array:
     """(m, 2) cost of all sights in a picture, were the picture's pose that of each start."""
     a, b = pairs(sights.picture)
     costs = []
     for k in range(2):
         start = Bundle.of(bundle.cameras, bundle.camera[sights.picture], bundle.body, cRb[:, k], position[:, k])
         # Each start is a picture of its own, which sees what the picture sees.
-        seen = Sights(a, sights.tag[b], sights.corners[b], sights.sigma[b])
-        costs.append(np.bincount(a, loss(linearized(start, seen).squares, 100.0 * far), len(sights)))
+        squares = linearized(start, replace(sights[b], picture=a)).squares
+        costs.append(np.bincount(a, loss(squares, 100.0 * FAR), len(sights)))
     return np.stack(costs, axis=1)
 
 
@@ -418,14 +365,13 @@ def _best(picture: Index, costs: Array, f: int) -> Index:
     return out
 
 
-def _refined(
-    bundle: Bundle, sights: Sights, start: Index, cRb: Array, position: Array, far: float
-) -> tuple[Bundle, Array, Array]:
+def _refined(bundle: Bundle, sights: Sights, start: Index, cRb: Array, position: Array) -> Sides:
+    """One pose of each picture, without the axis of the two, from its start (f,): -1 where there is none."""
     got = start >= 0
     there = replace(
         bundle,
         cRb=np.where(got[:, None], cRb[start], so3.identity()),
         position=np.where(got[:, None], position[start], [0.0, 0.0, 1.0]),
     )
-    there, cost, information = refined_pictures(there, sights[got[sights.picture]], far)
-    return there, np.where(got, cost, np.inf), information
+    there, cost, information = refined_pictures(there, sights[got[sights.picture]], FAR)
+    return Sides(there.cRb, there.position, np.where(got, cost, np.inf), information)

@@ -56,15 +56,10 @@ class Fit:
     additional: Additional
 
     @property
-    def freedom(self) -> Array:
-        """Degrees of freedom (f,) of a picture beyond the six of its pose."""
-        return freedom(self.sights, len(self.weight))
-
-    @property
     def curvature(self) -> Array:
         """Share (f,) of a picture's information that its weight leaves: less, since the weight follows the errors."""
         squares = np.bincount(self.sights.picture, self.rows.squares, len(self.weight))
-        free = np.maximum(self.freedom, 1.0)
+        free = np.maximum(freedom(self.sights, len(self.weight)), 1.0)
         return np.asarray(np.maximum(1.0 - 2.0 * squares / ((_NU + free) * free), 0.1))
 
     @property
@@ -95,7 +90,7 @@ def fitted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -
         if sigma is not None and not false.any():
             break
         used[np.flatnonzero(used)[false]] = False
-        used[np.flatnonzero(used)[~_with_others(sights[used])]] = False
+        used[np.flatnonzero(used)[~sights[used].together]] = False
         fit = _reweighted(bundle, sights[used], fixed, additional)
         bundle, sigma = fit.bundle, fit.sigma
         squares = fit.rows.squares * (sigma**2 / fit.weight[fit.sights.picture])
@@ -114,10 +109,6 @@ def _false(sights: Sights, squares: Array, sigma: float | None) -> NDArray[np.bo
     return np.asarray(squares > 8.0 * _FAR**2 * variance)
 
 
-def _with_others(sights: Sights) -> NDArray[np.bool_]:
-    return np.asarray(np.bincount(sights.picture)[sights.picture] > 1)
-
-
 def _reweighted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -> Fit:
     f, tags = len(bundle.cRb), len(bundle.body.ids)
     free = freedom(sights, f)
@@ -127,7 +118,9 @@ def _reweighted(bundle: Bundle, sights: Sights, fixed: int, additional: Addition
     sigma, weight = 1.0, np.ones(f)
     for _ in range(_ROUNDS):
         scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
-        bundle, rows = adjusted(_moving(bundle, sights, additional), scaled, fixed, additional)
+        if additional.line_time.any():
+            bundle = with_motion(bundle, np.unique(sights.picture))
+        bundle, rows = adjusted(bundle, scaled, fixed, additional)
         squares = np.bincount(sights.picture, rows.squares, f) * sigma**2 / weight
         before, (sigma, weight) = sigma, _scale(squares, free)
         if abs(sigma / before - 1.0) < _SETTLED:
@@ -136,11 +129,6 @@ def _reweighted(bundle: Bundle, sights: Sights, fixed: int, additional: Addition
     bundle, rows = adjusted(bundle, scaled, fixed, additional)
     sigma_px = sigma * float(np.median(sights.sigma))
     return Fit(bundle, scaled, rows, weight, sigma, sigma_px, np.arange(len(sights)), additional)
-
-
-def _moving(bundle: Bundle, sights: Sights, additional: Additional) -> Bundle:
-    """The bundle with the motion that its pictures show, if a shutter may roll."""
-    return with_motion(bundle, np.unique(sights.picture)) if additional.line_time.any() else bundle
 
 
 def freedom(sights: Sights, pictures: int) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ _STILL = 2.0
 _LEAST_PX = 0.03
 # Directions this near to the camera's own plane (cosine) are of no use.
 _FORWARD = 0.05
+_LATER: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +42,34 @@ class Sights:
         picture, tag: (m,) indices.
         corners: (m, 4, 2) px.
         sigma: (m,) of a corner, px per axis.
+        cRt, place: (m, 2, 4), (m, 2, 3) m, both poses of each tag by itself; None before `placing.with_flips`.
     """
 
     picture: Index
     tag: Index
     corners: Array
     sigma: Array
+    cRt: Array = _LATER
+    place: Array = _LATER
 
     def __len__(self) -> int:
         return len(self.picture)
 
     def __getitem__(self, keep: Index | NDArray[np.bool_]) -> Sights:
-        return Sights(self.picture[keep], self.tag[keep], self.corners[keep], self.sigma[keep])
+        columns: list[Any] = [column if column is None else column[keep] for column in vars(self).values()]
+        return Sights(*columns)
+
+    @property
+    def together(self) -> NDArray[np.bool_]:
+        """Mask (m,) of sights in pictures that show two tags or more."""
+        return np.asarray(np.bincount(self.picture)[self.picture] > 1)
+
+    def by_picture(self, values: Array, pictures: int) -> Array:
+        """Sums (pictures, ...) of values (m, ...) over the sights of each picture."""
+        out = np.zeros((pictures, *values.shape[1:]))
+        seen, first = np.unique(self.picture, return_index=True)
+        out[seen] = np.add.reduceat(values, first, axis=0)
+        return out
 
 
 @dataclass(frozen=True, eq=False)
