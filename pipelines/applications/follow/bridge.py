@@ -7,12 +7,11 @@ Messages that are none are refused and counted, and cost nothing else.
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mcap.writer import Writer
 
@@ -50,8 +49,14 @@ _GLANCE, _FLUSH = 0.1, 0.01
 _LARGEST = 1 << 26
 # Channels that are written down: more than any device has sensors.
 MAX_CHANNELS = 1000
-# What describes a channel as the protocol has it; all are text.
-_DESCRIPTION = ("topic", "encoding", "schemaName", "schemaEncoding", "schema")
+
+
+class _Topic(NamedTuple):
+    """A channel as a bridge describes it, whatever its number."""
+
+    name: str
+    encoding: str
+    schema: Schema
 
 
 class Bridge(Stream):
@@ -102,7 +107,7 @@ class Bridge(Stream):
 
     def _listen(self, connection: Any, record: _Record) -> None:
         """Take what one connection brings, until it closes."""
-        wanted: dict[int, dict[str, str]] = {}  # by subscription, which are numbered as the bridge's channels
+        wanted: dict[int, _Topic] = {}  # by subscription, which are numbered as the bridge's channels
         while not self._over.is_set():
             try:
                 data = connection.recv(_GLANCE)
@@ -112,9 +117,7 @@ class Bridge(Stream):
             if isinstance(data, bytes):
                 self._take(data, wanted, record)
                 continue
-            for number in self._unadvertised(data):
-                wanted.pop(number, None)
-            new = {number: one for number, one in self._advertised(data) if number not in wanted}
+            new = self._announced(data, wanted)
             if new and len(wanted) + len(new) <= MAX_CHANNELS:
                 wanted |= new
                 subscriptions = [{"id": number, "channelId": number} for number in new]
@@ -122,7 +125,7 @@ class Bridge(Stream):
             elif new:
                 self._refuse(f"more than {MAX_CHANNELS} channels")
 
-    def _take(self, data: bytes, wanted: dict[int, dict[str, str]], record: _Record) -> None:
+    def _take(self, data: bytes, wanted: dict[int, _Topic], record: _Record) -> None:
         if len(data) < MESSAGE_HEAD.size or data[0] != MESSAGE_DATA:
             return
         _, subscription, log_ns = MESSAGE_HEAD.unpack_from(data)
@@ -133,33 +136,28 @@ class Bridge(Stream):
         except RefusedError as error:
             self._refuse(str(error))
 
-    def _unadvertised(self, text: str) -> list[int]:
-        """Channels that the bridge has withdrawn: their subscriptions end, and their ids may be used again."""
-        try:
-            content = read_message(text)
-            ids = content.get("channelIds") if content.get("op") == "unadvertise" else []
-            return [read_id(number) for number in ids] if isinstance(ids, list) else []
-        except RefusedError:
-            return []  # counted by `_advertised`, which reads every text
-
-    def _advertised(self, text: str) -> list[tuple[int, dict[str, str]]]:
-        """The channels that a bridge advertises in a message and that are of use, with its numbers."""
-        found = []
+    def _announced(self, text: str, wanted: dict[int, _Topic]) -> dict[int, _Topic]:
+        """New channels of use that a message advertises. Those that it withdraws are wanted no more: ids are reused."""
+        found: dict[int, _Topic] = {}
         try:
             message = read_message(text)
             channels = message.get("channels") if message.get("op") == "advertise" else []
-            if not isinstance(channels, list):
+            withdrawn = message.get("channelIds") if message.get("op") == "unadvertise" else []
+            if not isinstance(channels, list) or not isinstance(withdrawn, list):
                 raise RefusedError("channels that are no list")
+            for number in map(read_id, withdrawn):
+                wanted.pop(number, None)
         except RefusedError as error:
             self._refuse(str(error))
-            return []
+            return found
         for channel in channels:
             try:
-                number, described = _described(channel)
-                if _is_of_use(described):
-                    found.append((number, described))
+                number, topic = _described(channel)
             except RefusedError as error:
                 self._refuse(str(error))
+                continue
+            if number not in wanted and _is_of_use(topic):
+                found[number] = topic
         return found
 
     def _refuse(self, why: str) -> None:
@@ -173,27 +171,27 @@ class _Record:
 
     def __init__(self, out: Spool) -> None:
         self._out, self._writer = out, Writer(out, use_chunking=False)  # type: ignore[arg-type]
-        self._channels: dict[tuple[str, ...], int] = {}
+        self._channels: dict[_Topic, int] = {}
         self._types: dict[str, tuple[str, ...]] = {}  # by topic: a recording in which they change is of no use
         self._flushed = time.monotonic()
 
-    def add(self, channel: dict[str, str], log_ns: int, data: bytes) -> None:
-        """A message of a channel as the bridge describes it. Raises RefusedError when its topic had another type."""
+    def add(self, topic: _Topic, log_ns: int, data: bytes) -> None:
+        """A message of a topic. Raises RefusedError when its topic had another type."""
         if self._out.is_full:
             self.flush()
         if self._out.is_full:
             self._out.drop()
             return
-        key = tuple(channel[name] for name in _DESCRIPTION)
         if not self._channels:
             self._writer.start("", "alidade")
-        if key not in self._channels:
-            kind = channel["encoding"], channel["schemaEncoding"], channel["schemaName"]
-            if self._types.setdefault(channel["topic"], kind) != kind or len(self._channels) >= MAX_CHANNELS:
-                raise RefusedError(f"topic {printable(channel['topic'])} with messages of another type")
-            schema = self._writer.register_schema(channel["schemaName"], channel["schemaEncoding"], _schema(channel))
-            self._channels[key] = self._writer.register_channel(channel["topic"], channel["encoding"], schema)
-        self._writer.add_message(self._channels[key], log_ns, data, log_ns)
+        if topic not in self._channels:
+            schema = topic.schema
+            kind = topic.encoding, schema.encoding, schema.name
+            if self._types.setdefault(topic.name, kind) != kind or len(self._channels) >= MAX_CHANNELS:
+                raise RefusedError(f"topic {printable(topic.name)} with messages of another type")
+            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._channels[topic] = self._writer.register_channel(topic.name, topic.encoding, number)
+        self._writer.add_message(self._channels[topic], log_ns, data, log_ns)
         if time.monotonic() - self._flushed > _FLUSH:
             self.flush()
 
@@ -209,27 +207,23 @@ class _Record:
         self._out.flush()
 
 
-def _described(channel: Any) -> tuple[int, dict[str, str]]:
+def _described(channel: Any) -> tuple[int, _Topic]:
     """A channel's number and description, with what a bridge may leave out. Raises RefusedError."""
     if not isinstance(channel, dict):
         raise RefusedError("a channel that is no object")
-    given = {name: channel[name] for name in _DESCRIPTION if channel.get(name)}
-    if not all(isinstance(value, str) for value in given.values()) or not {"topic", "encoding"} <= given.keys():
+    given = [channel.get(name) or "" for name in ("topic", "encoding", "schemaName", "schemaEncoding", "schema")]
+    if not all(isinstance(value, str) for value in given) or not (given[0] and given[1]):
         raise RefusedError("a channel without topic or encoding, or whose description is no text")
-    usual = {"schema": "", "schemaName": "", "schemaEncoding": _SCHEMAS.get(given["encoding"], given["encoding"])}
-    return read_id(channel.get("id")), usual | given
-
-
-def _schema(channel: dict[str, str]) -> bytes:
-    text = channel["schema"]
-    return base64.b64decode(text, validate=True) if channel["schemaEncoding"] in _BYTES else text.encode()
-
-
-def _is_of_use(channel: dict[str, str]) -> bool:
-    """Whether the messages are a sensor's, and can be read. Raises RefusedError."""
+    topic, encoding, name, language, text = given
+    language = language or _SCHEMAS.get(encoding, encoding)
     try:
-        schema = Schema(1, channel["schemaName"], channel["schemaEncoding"], _schema(channel))
-    except (binascii.Error, ValueError) as error:
+        data = base64.b64decode(text, validate=True) if language in _BYTES else text.encode()
+    except ValueError as error:
         raise RefusedError("a schema that is no base64") from error
-    form = MessageFormat(Channel(1, channel["topic"], channel["encoding"], 1), schema)
+    return read_id(channel.get("id")), _Topic(topic, encoding, Schema(1, name, language, data))
+
+
+def _is_of_use(topic: _Topic) -> bool:
+    """Whether the messages are a sensor's, and can be read."""
+    form = MessageFormat(Channel(1, topic.name, topic.encoding, 1), topic.schema)
     return form.is_readable and form.type in SENSORS
