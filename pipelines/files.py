@@ -14,7 +14,7 @@ import stat
 import sys
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from alidade.pipelines.errors import InputError
 
@@ -55,6 +55,14 @@ def read_bytes(path: Path, most: int) -> bytes:
     if len(data) > most:
         raise InputError(f"{path}: over {most} bytes, which is more than any file of its kind has")
     return data
+
+
+def open_binary(path: Path, named: Path | None = None) -> BinaryIO:
+    """A file, open for reading; the InputError where that fails names it as `named`."""
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise _cannot_open(named or path, error) from error
 
 
 def dump_yaml(content: object, width: int = 80, is_sorted: bool = True) -> str:

@@ -17,15 +17,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.array import Array
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.container import (
-    Channel,
-    Container,
-    DataLoss,
-    MessageBlock,
-    Schema,
-    combined_sha256,
-    file_sha256,
-)
+from alidade.pipelines.recording.container import Channel, Container, MessageBlock, Schema, combined_sha256, file_sha256
 from alidade.pipelines.recording.messages import Definition, definition_text, known
 
 # Messages of a block; those of varying size may be pictures.
@@ -141,10 +133,8 @@ class ArrayContainer(Container):
         data: Path | None = None,
         files: Sequence[Path] = (),
     ) -> None:
-        super().__init__(path)
-        self.data, self.assumptions, self._files = data or path, tuple(assumptions), files
-        self.losses: list[DataLoss] = []
-        self.channels, self.schemas, self.counts = {}, {}, {}
+        super().__init__(path, data)
+        self.assumptions, self._files = tuple(assumptions), files
         self._topics = dict(enumerate(topics.values(), start=1))
         for number, (name, topic) in enumerate(topics.items(), start=1):
             kind = encode_series(topic).definition.name

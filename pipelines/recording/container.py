@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import zstandard
@@ -26,6 +27,7 @@ MAX_TIME_OUTSIDE_S = 3600.0
 # Channel and schema ids of part i of a recording are offset by i times this.
 _ID_RANGE = 1 << 32
 
+_Key = TypeVar("_Key", int, str)
 LossKind = Literal["cut", "damage", "summary", "definition", "attachment"]
 
 
@@ -112,19 +114,18 @@ class Container(ABC):
         temporary: temporary files that live as long as the container.
     """
 
-    data: Path
-    channels: Mapping[int, Channel]
-    schemas: Mapping[int, Schema]
-    counts: Mapping[int, int]
-    losses: Sequence[DataLoss]
     size = 0
     assumptions: Sequence[str] = ()
     incomplete: Sequence[str] = ()
     message_compression = False
     temporary: object = None
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, data: Path | None = None) -> None:
+        self.path, self.data = path, data or path
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.counts: dict[int, int] = {}
+        self.losses: list[DataLoss] = []
         self.lost_messages: dict[int, int] = {}  # channel -> messages known to be lost
 
     @abstractmethod
@@ -153,15 +154,18 @@ class Container(ABC):
         """Whether a channel has a topic and a definition of its messages, or needs none."""
         return channel in self.channels and self.channels[channel].schema_id in {0, *self.schemas}
 
+    def set_counts(self, counts: Mapping[int, int]) -> None:
+        """Count the messages of defined channels as readable, those of others as lost."""
+        self.counts = {number: n for number, n in counts.items() if self.is_defined(number)}
+        undefined = sum(counts.values()) - sum(self.counts.values())
+        if undefined:
+            self.losses.append(DataLoss("definition", 0, undefined))
+
     @property
     def missing(self) -> dict[str, int]:
         """Number of messages known to be lost, by topic."""
-        missing: dict[str, int] = {}
-        for number, n in self.lost_messages.items():
-            if n > 0 and self.is_defined(number):
-                topic = self.channels[number].topic
-                missing[topic] = missing.get(topic, 0) + n
-        return missing
+        lost = ((number, n) for number, n in self.lost_messages.items() if n > 0 and self.is_defined(number))
+        return total({self.channels[number].topic: n} for number, n in lost)
 
     def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
         """Sentences about what is lost, one a kind, and when in a session that starts at start_ns, Unix ns.
@@ -251,9 +255,8 @@ class MultiPartContainer(Container):
         parts: containers, in any order; they are read in the order of their first messages.
     """
 
-    def __init__(self, path: Path, parts: Sequence[Container]) -> None:
-        super().__init__(path)
-        self.data = path
+    def __init__(self, path: Path, parts: Sequence[Container]) -> None:  # counts and losses are those of the parts
+        self.path = self.data = path
         self.parts = sorted(parts, key=lambda part: part.first_log_ns)
         self.assumptions = self._named("assumptions")
         self.incomplete = self._named("incomplete")
@@ -283,11 +286,7 @@ class MultiPartContainer(Container):
     @property
     def missing(self) -> dict[str, int]:
         """Number of messages known to be lost, by topic."""
-        missing: dict[str, int] = {}
-        for part in self.parts:
-            for topic, n in part.missing.items():
-                missing[topic] = missing.get(topic, 0) + n
-        return missing
+        return total(part.missing for part in self.parts)
 
     @property
     def attachments(self) -> tuple[str, ...]:
@@ -318,6 +317,14 @@ class MultiPartContainer(Container):
 
     def _named(self, attribute: str) -> tuple[str, ...]:
         return tuple(f"{part.path.name}: {sentence}" for part in self.parts for sentence in getattr(part, attribute))
+
+
+def total(counts: Iterable[Mapping[_Key, int]]) -> dict[_Key, int]:
+    """Sum of several counts by the same keys."""
+    found = Counter[_Key]()
+    for each in counts:
+        found.update(each)
+    return dict(found)
 
 
 def file_sha256(path: Path) -> str:

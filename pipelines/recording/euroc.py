@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, open_binary, read_bytes
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.camera_files import camera
@@ -85,10 +85,8 @@ class _Pictures:
 
     def __iter__(self) -> Iterator[bytes]:
         for file in self._files:
-            try:
-                yield file.read_bytes()
-            except OSError as error:
-                raise InputError(f"{file}: cannot be opened ({error.strerror})") from error
+            with open_binary(file) as stream:
+                yield stream.read()
 
 
 def _camera_info(table: Path, t_ns: int, sensor: Mapping[str, Any]) -> series.CameraInfo:

@@ -9,7 +9,8 @@ from typing import BinaryIO
 import numpy as np
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.container import Container, MessageBlock, MultiPartContainer, byte_windows
+from alidade.pipelines.files import open_binary
+from alidade.pipelines.recording.container import Container, MessageBlock, MultiPartContainer, byte_windows, total
 from alidade.pipelines.recording.mcap_file import Block, McapFile
 from alidade.pipelines.recording.mcap_records import MAGIC
 from alidade.pipelines.recording.opening import open_container
@@ -36,7 +37,7 @@ class GrowingMcap(McapFile):
 
     def refresh(self, since_ns: int | None) -> None:
         """Walk what is new; read from now on what was logged since a time, Unix ns, a little before included."""
-        with self._open() as stream:
+        with open_binary(self.data, self.path) as stream:
             self._walk_new(stream)
             # The last block's message index may not have been written yet.
             self._verify_unindexed(stream, self._blocks[max(0, self._checked - 1) :])
@@ -47,11 +48,13 @@ class GrowingMcap(McapFile):
             first -= 1
         self._view = self._blocks[first:]
         self._kept = {block.start: self._kept[block.start] for block in self._view if block.start in self._kept}
-        self.counts = {number: n for number, n in self._count(self._view).items() if self.is_defined(number)}
+        self.counts = {
+            number: n for number, n in total(block.counts for block in self._view).items() if self.is_defined(number)
+        }
 
     def last_log_ns(self) -> int | None:
         """Log time of the last message written by now, as its block states it, Unix ns; None without one."""
-        with self._open() as stream:
+        with open_binary(self.data, self.path) as stream:
             self._walk_new(stream)
         return next((block.log_span_ns[1] for block in reversed(self._blocks) if block.log_span_ns is not None), None)
 
@@ -71,7 +74,7 @@ class GrowingMcap(McapFile):
         """
         found: dict[int, list[MessageBlock]] = {}
         large: set[int] = set()
-        with self._open() as stream:
+        with open_binary(self.data, self.path) as stream:
             for block in self._view:
                 wanted = channels & block.counts.keys()
                 end, kept = self._kept.get(block.start, (block.end, {}))

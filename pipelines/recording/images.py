@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import open_binary
 
 Pixels = NDArray[Any]
 
@@ -28,11 +29,12 @@ _COLOURS = {
     "bgra8": (4, [2, 1, 0]),
     "8UC3": (3, [2, 1, 0]),
 }
-_GREY = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+# Bytes of a pixel.
+_GREY = {"mono8": 1, "8UC1": 1, "mono16": 2, "16UC1": 2}
 # Two pixels in four bytes; which of them are brightness.
 _YUV = {"yuv422": 1, "uyvy": 1, "UYVY": 1, "yuv422_yuy2": 0, "yuyv": 0, "YUYV": 0}
-# Where red is in a square of four pixels, row and column.
-_RED = {"rggb": (0, 0), "bggr": (1, 1), "gbrg": (1, 0), "grbg": (0, 1)}
+# OpenCV names a pattern by the square that begins at the second row and column.
+_OPENCV_BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 _BAYER = re.compile("bayer_(?P<pattern>rggb|bggr|gbrg|grbg)(?P<bits>8|16)")
 MAX_PICTURE_BYTES = 1 << 28
 # Formats of messages -> ending of a file that FFmpeg takes for that form.
@@ -57,10 +59,7 @@ def netpbm(image: Any) -> bytes:
     encoding, data = str(image.encoding), np.asarray(image.data, np.uint8)
     height, width, step = int(image.height), int(image.width), int(image.step)
     if encoding in _GREY:
-        pixels = _used_bytes(data, height, width * np.dtype(_GREY[encoding]).itemsize, step)
-        if _GREY[encoding] == "u2":
-            return _file(_eight_bits(pixels.view(">u2" if image.is_bigendian else "<u2")))
-        return _file(pixels)
+        return _file(_eight_bits(_used_bytes(data, height, width * _GREY[encoding], step), width, image))
     if encoding in _COLOURS:
         channels, order = _COLOURS[encoding]
         pixels = _used_bytes(data, height, width * channels, step).reshape(height, width, channels)
@@ -70,11 +69,10 @@ def netpbm(image: Any) -> bytes:
     bayer = _BAYER.fullmatch(encoding)
     if bayer is None:
         raise ValueError(f"the encoding {encoding!r} is not one of mono, rgb, bgr, rgba, bgra, bayer, yuv422")
-    is_wide = bayer["bits"] == "16"
-    pixels = _used_bytes(data, height, width * (2 if is_wide else 1), step)
-    if is_wide:
-        pixels = _eight_bits(pixels.view(">u2" if image.is_bigendian else "<u2"))
-    return _file(_colours(pixels, _RED[bayer["pattern"]]))
+    import cv2
+
+    pixels = _eight_bits(_used_bytes(data, height, width * int(bayer["bits"]) // 8, step), width, image)
+    return _file(np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_Bayer{_OPENCV_BAYER[bayer['pattern']]}2RGB"))))
 
 
 def colour_file(rgb: Pixels) -> bytes:
@@ -89,24 +87,13 @@ def _used_bytes(data: NDArray[np.uint8], height: int, used: int, step: int) -> N
     return np.ascontiguousarray(data.reshape(height, step)[:, :used])
 
 
-def _eight_bits(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """The upper 8 bits of those that the picture uses: cameras with 10 or 12 bits leave the highest ones zero."""
+def _eight_bits(rows: NDArray[np.uint8], width: int, image: Any) -> NDArray[np.uint8]:
+    """Pixels of 8 bits as they are; of 16 bits the upper 8 that are used: 10 or 12 bits leave the highest ones zero."""
+    if rows.shape[1] == width:
+        return rows
+    pixels = rows.view(">u2" if image.is_bigendian else "<u2")
     shift = max(0, int(pixels.max()).bit_length() - 8)
     return (pixels >> shift).astype(np.uint8)
-
-
-def _colours(pixels: NDArray[np.uint8], red: tuple[int, int]) -> Pixels:
-    """Red, green and blue of a Bayer picture, with red at (row, column) of each square of four."""
-    import cv2
-
-    # OpenCV names a pattern by the square that begins at the second row and column.
-    codes = {
-        (0, 0): cv2.COLOR_BayerBG2RGB,
-        (1, 1): cv2.COLOR_BayerRG2RGB,
-        (1, 0): cv2.COLOR_BayerGR2RGB,
-        (0, 1): cv2.COLOR_BayerGB2RGB,
-    }
-    return np.asarray(cv2.cvtColor(pixels, codes[red]))
 
 
 def _file(pixels: Pixels) -> bytes:
@@ -172,13 +159,9 @@ class VideoFile:
 
     def __init__(self, path: Path, count: int) -> None:
         self.path, self._count = path, count
-        try:
-            with path.open("rb") as stream:
-                start = stream.read(12)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
-        if not is_video(start):
-            raise InputError(f"{path}: neither an MP4 nor an AVI file")
+        with open_binary(path) as stream:
+            if not is_video(stream.read(12)):
+                raise InputError(f"{path}: neither an MP4 nor an AVI file")
 
     def __iter__(self) -> Iterator[bytes]:
         try:

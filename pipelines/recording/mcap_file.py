@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +24,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError, NotARecordingError
+from alidade.pipelines.files import open_binary
 from alidade.pipelines.recording import mcap_records as records
 from alidade.pipelines.recording.container import (
     Channel,
@@ -34,6 +34,7 @@ from alidade.pipelines.recording.container import (
     MessageBlock,
     Schema,
     byte_windows,
+    total,
 )
 from alidade.pipelines.recording.mcap_records import AFTER_LENGTH, HEAD, MAGIC, MESSAGE_HEAD, DamagedError
 
@@ -102,12 +103,7 @@ class McapFile(Container):
     """
 
     def __init__(self, path: Path, data: Path | None = None) -> None:
-        super().__init__(path)
-        self.data = data or path
-        self.channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
-        self.counts: dict[int, int] = {}
-        self.losses: list[DataLoss] = []
+        super().__init__(path, data)
         self._blocks: list[Block] = []
         self._attachment_offsets: dict[str, int] = {}
         self._stated: dict[int, int] | None = None  # channel -> messages, by a summary whose checksum holds
@@ -115,7 +111,7 @@ class McapFile(Container):
         self._chunk: Block | None = None  # whose message indexes come next
         self._data_end: tuple[int, int] | None = None  # byte and checksum
         self._walked = len(MAGIC)  # up to this byte
-        with self._open() as stream:
+        with open_binary(self.data, self.path) as stream:
             self._check_magic(stream)
             self._read_index(stream)
 
@@ -126,15 +122,11 @@ class McapFile(Container):
         self._walk(stream, self.size if end is None else end)
         self._check_end(stream, is_closed=end is not None)
         self._verify_unindexed(stream, self._blocks)
-        if self.losses or self._count(self._blocks) != self._stated:
+        if self.losses or total(block.counts for block in self._blocks) != self._stated:
             for block in self._blocks:
                 if not block.is_damaged:
                     self._verify(stream, block)
-        counts = self._count(self._blocks)
-        undefined = sum(n for number, n in counts.items() if not self.is_defined(number))
-        if undefined:
-            self.losses.append(DataLoss("definition", 0, undefined))
-        self.counts = {number: n for number, n in counts.items() if self.is_defined(number)}
+        self.set_counts(total(block.counts for block in self._blocks))
 
     @property
     def missing(self) -> dict[str, int]:
@@ -145,7 +137,7 @@ class McapFile(Container):
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
         """Messages of these channels in file order, checksums verified; damaged chunks are left out and noted."""
-        with self._open() as stream:
+        with open_binary(self.data, self.path) as stream:
             for block in self._blocks:
                 yield from self._messages(stream, block, channels & block.counts.keys())
 
@@ -162,7 +154,7 @@ class McapFile(Container):
         at = self._attachment_offsets.get(name)
         if at is None:
             return None
-        with self._open() as stream:
+        with open_binary(self.data, self.path) as stream:
             stream.seek(at)
             opcode, length = HEAD.unpack(stream.read(HEAD.size).ljust(HEAD.size, b"\0"))
             record = stream.read(min(length, MAX_ATTACHMENT_BYTES))
@@ -182,12 +174,6 @@ class McapFile(Container):
                 self.losses.append(loss)
             return None
 
-    def _open(self) -> BinaryIO:
-        try:
-            return self.data.open("rb")
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be opened ({error.strerror})") from error
-
     def _check_magic(self, stream: BinaryIO) -> None:
         start = stream.read(len(MAGIC))
         if not start:
@@ -196,14 +182,6 @@ class McapFile(Container):
             raise NotARecordingError(f"{self.path}: not an MCAP file, nor any other recording that is known")
 
     # -- the messages of a block
-
-    @staticmethod
-    def _count(blocks: Iterable[Block]) -> dict[int, int]:
-        """Channel -> messages."""
-        counts = Counter[int]()
-        for block in blocks:
-            counts.update(block.counts)
-        return dict(counts)
 
     def _load(self, stream: BinaryIO, block: Block) -> NDArray[np.uint8]:
         """Records of a block, of a chunk decompressed and verified. Raises DamagedError."""

@@ -15,7 +15,7 @@ from typing import Any
 import zstandard
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes, require_regular
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, open_binary, read_bytes, require_regular
 from alidade.pipelines.recording import ros1_bag
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.camera_files import SUFFIXES, CameraFile, read_cameras
@@ -131,11 +131,8 @@ def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
 def _file(path: Path) -> Container:
     """One file, by what it begins with."""
     require_regular(path)
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(16)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
+    with open_binary(path) as stream:
+        start = stream.read(16)
     container = _decompressed(path) if start.startswith(_ZSTD) else _by_content(path, path)
     container.require_readable()
     return container

@@ -17,7 +17,7 @@ import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema
+from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema, total
 from alidade.pipelines.recording.mcap_records import DamagedError
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -52,11 +52,7 @@ class Ros1Bag(Container):
     """
 
     def __init__(self, path: Path, data: Path | None = None) -> None:
-        super().__init__(path)
-        self.data = data or path
-        self.channels: dict[int, Channel] = {}
-        self.schemas: dict[int, Schema] = {}
-        self.losses: list[DataLoss] = []
+        super().__init__(path, data)
         self._chunks: list[_Chunk] = []
         self.size = self.data.stat().st_size
         with self.data.open("rb") as stream:
@@ -64,14 +60,7 @@ class Ros1Bag(Container):
             for chunk in self._chunks:
                 if not chunk.counts or not chunk.counts.keys() <= self.channels.keys():
                     self._verify(stream, chunk)
-        self.counts: dict[int, int] = {}
-        for chunk in self._chunks:
-            for number, n in chunk.counts.items():
-                self.counts[number] = self.counts.get(number, 0) + n
-        undefined = sum(n for number, n in self.counts.items() if number not in self.channels)
-        if undefined:
-            self.losses.append(DataLoss("definition", 0, undefined))
-            self.counts = {number: n for number, n in self.counts.items() if number in self.channels}
+        self.set_counts(total(chunk.counts for chunk in self._chunks))
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
         """The messages of these connections, chunk by chunk."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sqlite3
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -39,16 +40,14 @@ class SqliteFile(Container):
     """
 
     def __init__(self, path: Path, data: Path | None = None) -> None:
-        super().__init__(path)
-        self.data = data or path
-        self.losses: list[DataLoss] = []
+        super().__init__(path, data)
         self._keep_whole_pages()
         self._idle = 0  # instructions since the last row
         try:
             with self._open() as database:
                 self._check_tables(database)
                 self.channels, self.schemas = self._definitions(database)
-                self.counts = self._counted(database)
+                self._count(database)
         except (sqlite3.Error, ValueError, OverflowError, MemoryError) as error:
             raise InputError(f"{path}: not a recording, or damaged: SQLite says: {error}") from error
         if not self.counts and not self.channels and not self.losses:
@@ -173,19 +172,16 @@ class SqliteFile(Container):
             channels[number] = Channel(number, str(topic), str(form), i)
         return channels, schemas
 
-    def _counted(self, database: sqlite3.Connection) -> dict[int, int]:
+    def _count(self, database: sqlite3.Connection) -> None:
         """Messages of each channel; of a damaged file those that SQLite comes to."""
-        counts: dict[int, int] = {}
+        counts = Counter[int]()
         try:
             for (number,) in database.execute("SELECT topic_id FROM messages ORDER BY rowid"):
                 self._idle = 0
-                counts[number] = counts.get(number, 0) + 1
+                counts[number] += 1
         except sqlite3.Error as error:
             self.losses.append(DataLoss("damage", 0, 0, reason=f"SQLite says: {error}"))
-        undefined = sum(n for number, n in counts.items() if number not in self.channels)
-        if undefined:
-            self.losses.append(DataLoss("definition", 0, undefined))
-        return {number: n for number, n in counts.items() if number in self.channels}
+        self.set_counts(counts)
 
     def _lose(self, left: dict[int, int], reason: str) -> None:
         self.lost_messages |= left

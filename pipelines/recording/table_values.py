@@ -18,36 +18,17 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.checks import likely_time_unit
 
-# SI of a unit.
-UNITS = {
-    "rad/s": 1.0,
-    "deg/s": math.pi / 180.0,
-    "mdeg/s": math.pi / 180e3,
-    "m/s^2": 1.0,
-    "g": 9.80665,
-    "mg": 9.80665e-3,
-    "T": 1.0,
-    "mT": 1e-3,
-    "uT": 1e-6,
-    "nT": 1e-9,
-    "G": 1e-4,
-    "mG": 1e-7,
-    "rad": 1.0,
-    "deg": math.pi / 180.0,
-    "mrad": 1e-3,
-    "m": 1.0,
-    "mm": 1e-3,
+# SI unit of a quantity -> its units, in SI.
+COMPATIBLE = {
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "mdeg/s": math.pi / 180e3},
+    "m/s^2": {"m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3},
+    "T": {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "G": 1e-4, "mG": 1e-7},
+    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3},
+    "m": {"m": 1.0, "mm": 1e-3},
 }
+UNITS = {unit: size for units in COMPATIBLE.values() for unit, size in units.items()}
 # Nanoseconds of a unit of time.
 TIME_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
-# Units of a quantity, by its SI unit.
-COMPATIBLE = {
-    "rad/s": ("rad/s", "deg/s", "mdeg/s"),
-    "m/s^2": ("m/s^2", "g", "mg"),
-    "T": ("T", "mT", "uT", "nT", "G", "mG"),
-    "rad": ("rad", "deg", "mrad"),
-    "m": ("m", "mm"),
-}
 # Other spellings, lower case, without blanks: `_plain` has made u of a micro sign and deg of a degree sign.
 _SPELLINGS = {
     "rad/s": "rad/sec rads radps rads^-1 rad*s^-1 rads-1 radian/s radians/s rad_s rad.s^-1",
