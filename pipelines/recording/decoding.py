@@ -7,9 +7,9 @@ a topic has none; where only few messages lack one (sent before a clock was ther
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +21,6 @@ from alidade.pipelines.recording.container import Channel, MessageBlock, Schema,
 from alidade.pipelines.recording.messages import Definition, Language, Layout, Leaf, MessageError, Wire, at
 from alidade.pipelines.recording.translation import Translation, is_foxglove, ros_type
 
-# Indexes of the numbers of a field that are meant, given the message; None if it does not have them.
-Order = Callable[[Any], Sequence[int] | None]
 # Stamps and log times (N,), Unix ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
 Stamps = NDArray[np.int64]
@@ -96,7 +94,7 @@ class ColumnTable:
         joints: of a sensor_msgs/JointState those whose positions are read.
 
     Attributes:
-        fields: column -> path of the field in a message, and the order of its numbers or None.
+        fields: column -> path of the field in a message.
         joint_names: names of joints met in the messages.
         filled: (count,) rows that have values.
         count: rows added: rows beyond them are messages of damaged chunks.
@@ -105,13 +103,11 @@ class ColumnTable:
 
     def __init__(self, kind: str, count: int, joints: Sequence[str] = ()) -> None:
         self.joint_names: dict[str, None] = {}
-        self.fields: dict[str, tuple[str, Order | None]]
-        if kind == messages.JOINT_STATE:
-            self._shapes: dict[str, tuple[int, ...]] = {"position": (len(joints),)}
-            self.fields = {"position": ("position", partial(self._joint_order, joints))}
-        else:
-            self._shapes = {name: column.shape for name, column in _COLUMNS[kind].items()}
-            self.fields = {name: (column.path, _constant(column.order)) for name, column in _COLUMNS[kind].items()}
+        self._joints = joints if kind == messages.JOINT_STATE else None
+        columns = _COLUMNS.get(kind, {"position": series.Column("position", (len(joints),))})
+        self._shapes = {name: column.shape for name, column in columns.items()}
+        self._orders = {name: column.order or slice(None) for name, column in columns.items()}
+        self.fields = {name: column.path for name, column in columns.items()}
         self.filled = np.zeros(count, dtype=bool)
         self.count = 0
         self.plans: dict[int, list[_Plan]] = {}
@@ -121,6 +117,15 @@ class ColumnTable:
         self._frames: dict[str, int] = {}
         self._constant: dict[str, Array] = {}
         self._varying: dict[str, Array] = {}
+
+    def orders(self, message: Any) -> Mapping[str, Any] | None:
+        """Column -> indexes of the numbers of its field that are meant; None for a message that lacks a joint."""
+        if self._joints is None:
+            return self._orders
+        self.joint_names.update(dict.fromkeys(map(str, message.name)))
+        if not set(self._joints) <= set(message.name) or len(message.position) != len(message.name):
+            return None
+        return {"position": [message.name.index(name) for name in self._joints]}
 
     def add_rows(self, log_ns: Stamps, t_ns: Stamps) -> NDArray[np.int64]:
         """Add messages with these log times and stamps (0: none), Unix ns. Returns their row numbers."""
@@ -184,12 +189,6 @@ class ColumnTable:
             self._varying[name] = np.empty((len(self.filled), width))
             self._varying[name][:] = constant
         self._varying[name][rows] = values
-
-    def _joint_order(self, joints: Sequence[str], message: Any) -> list[int] | None:
-        self.joint_names.update(dict.fromkeys(map(str, message.name)))
-        if not set(joints) <= set(message.name) or len(message.position) != len(message.name):
-            return None
-        return [message.name.index(name) for name in joints]
 
 
 class MessageFormat:
@@ -259,9 +258,11 @@ class MessageFormat:
         for i in left.tolist():
             with at_log_time(int(block.log_ns[i])):
                 message = self.definition.decode(block.message(i))
-                values = self._values(message, table)
-            if values is not None:
-                table.fill(rows[i : i + 1], values, _frame(message))
+                orders = table.orders(message)
+                if orders is None:
+                    continue
+                found = {name: self.definition.numbers(at(message, path)) for name, path in table.fields.items()}
+            table.fill(rows[i : i + 1], {name: found[name][None, orders[name]] for name in found}, _frame(message))
 
     def decode(self, block: MessageBlock) -> Iterator[DecodedMessage]:
         """Messages one by one. Raises MessageError."""
@@ -316,20 +317,11 @@ class MessageFormat:
         if layout is None:
             return _Plan(None, {})
         message = self.definition.decode(data)
-        orders = {name: order(message) if order else slice(None) for name, (_, order) in table.fields.items()}
-        if None in orders.values():
+        orders = table.orders(message)
+        if orders is None:
             return _Plan(None, {})
-        runs = {name: (layout.run(path), orders[name]) for name, (path, _) in table.fields.items()}
+        runs = {name: (layout.run(path), orders[name]) for name, path in table.fields.items()}
         return _Plan(layout, runs, _frame(message))
-
-    def _values(self, message: Any, table: ColumnTable) -> dict[str, NDArray[Any]] | None:
-        values = {}
-        for name, (path, order) in table.fields.items():
-            chosen = order(message) if order else slice(None)
-            if chosen is None:
-                return None
-            values[name] = self.definition.numbers(at(message, path))[None, chosen]
-        return values
 
 
 @contextmanager
@@ -398,10 +390,6 @@ def _append_alike(
 def _frame(message: Any) -> str:
     """Frame in a message's header, empty where it has none."""
     return str(getattr(getattr(message, "header", None), "frame_id", "")).lstrip("/")
-
-
-def _constant(order: tuple[int, ...] | None) -> Order | None:
-    return (lambda _: order) if order else None
 
 
 def _ros2_name(name: str) -> str:

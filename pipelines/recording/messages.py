@@ -171,7 +171,9 @@ class Definition:
                 kind: (constants, [(field.lower(), what) for field, what in fields])
                 for kind, (constants, fields) in (_ROS1_TIMES | self._types).items()
             }
-        self.has_header = has_header(text) if language == "msg" else self._first_field == (Nodetype.NAME, _HEADER)
+        _, fields = self._types.get(name, ((), ()))
+        begins_so = next((what for _, what in fields), None) == (Nodetype.NAME, _HEADER)
+        self.has_header = has_header(text) if language == "msg" else begins_so
 
     def check(self) -> None:
         """Raise MessageError if no messages can be read with the definition."""
@@ -226,12 +228,6 @@ class Definition:
             return None
         return Layout(data, tuple(walk.leaves), (*([(0, 2)] if self.wire == "cdr" else []), *walk.fixed))
 
-    @property
-    def _first_field(self) -> Any:
-        """First field in rosbags' description; None if there is none."""
-        _, fields = self._types.get(self.name, ((), ()))
-        return next((what for _, what in fields), None)
-
     @cached_property
     def _store(self) -> Any:
         store = get_typestore(Stores.EMPTY)
@@ -262,10 +258,8 @@ class Definition:
         return [""] * count if name[0] == "string" else np.zeros(count, _CODES.get(name[0], name[0]))
 
 
-@lru_cache(maxsize=64)
-def definition(name: str, text: str, wire: Wire = "cdr", language: Language = "msg") -> Definition:
-    """The definition of a type in the text of a recording. Raises MessageError."""
-    return Definition(name, text, wire, language)
+# Definitions by the texts of recordings, made once.
+definition = lru_cache(maxsize=64)(Definition)
 
 
 def _types_of_idl(text: str) -> Any:

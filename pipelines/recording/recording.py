@@ -30,6 +30,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages, series, single_messages
@@ -82,14 +83,6 @@ class TopicInfo:
     is_readable: bool
 
 
-@dataclass(frozen=True)
-class _StampFacts:
-    """Facts about a topic's stamps: least delay of the log times, ns (None without messages), and sentences."""
-
-    delay_ns: int | None
-    notes: tuple[str, ...]
-
-
 def open_recording(where: Where, strict: bool = False) -> Recording:
     """The recording in a file, a folder of parts, files named by a pattern or a list; see docs/reference/messages.md.
 
@@ -135,7 +128,8 @@ class Recording:
         self._transforms: dict[str, dict[tuple[str, str], series.PoseSeries]] = {}
         self._times: dict[str, Times] = {}
         self._unstamped: dict[str, int] = {}  # topic -> messages without a stamp that were left out
-        self._stamp_facts: dict[str, _StampFacts] = {}
+        # Topic -> least delay of the log times after the stamps, ns (None without messages), and sentences about these.
+        self._stamp_facts: dict[str, tuple[int | None, tuple[str, ...]]] = {}
 
     def with_config(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic] | None = None) -> Recording:
         """The recording with other derived topics and, if there are any, other described columns of its tables.
@@ -195,8 +189,7 @@ class Recording:
     @property
     def delay_ns(self) -> int:
         """Least delay of the log times after the stamps, ns, in the topics read by now."""
-        delays = [facts.delay_ns for facts in self._all_stamp_facts().values() if facts.delay_ns is not None]
-        return min(delays, default=0)
+        return min((delay for delay, _ in self._all_stamp_facts().values() if delay is not None), default=0)
 
     @property
     def times(self) -> Mapping[str, Times]:
@@ -262,10 +255,7 @@ class Recording:
             return self._derived_imu(topic, self._sources[topic])
         if self._require(topic, *messages.RATES).type in messages.IMUS:
             return self._series(series.ImuSeries, topic, frame)
-        rate = self._series(series.VectorSeries, topic, frame)
-        return series.ImuSeries(
-            rate.t_ns, rate.vector, np.full(3, np.nan), stamped_by_log=rate.stamped_by_log, frame_id=rate.frame_id
-        )
+        return joined(self._series(series.VectorSeries, topic, frame), None)
 
     def magnetic(self, topic: str) -> series.MagneticSeries:
         """A sensor_msgs/MagneticField topic."""
@@ -322,9 +312,7 @@ class Recording:
                 f"{self.path}: topic {topic} has no message with positions of the joints {', '.join(names)}; "
                 f"its joints: {', '.join(table.joint_names) or 'none'}"
             )
-        check_clock(topic, *table.times(), self.epoch_ns)
-        t_ns, from_log, numbers = table.sorted()
-        self._note_unstamped(topic, t_ns, from_log)
+        t_ns, from_log, numbers = self._sorted(topic, table)
         without = table.count - int(np.count_nonzero(table.filled))
         return series.JointSeries(t_ns, numbers["position"], tuple(names), from_log, without)
 
@@ -518,13 +506,10 @@ class Recording:
             raise InputError(f"{self.path}: topic {topic}: the messages have no usable field ({error})") from error
 
     def _series(self, kind: type[AnySeries], topic: str, frame: str | None = None) -> AnySeries:
-        info = self._require(topic, kind.TYPE, *kind.OTHERS)
+        self._require(topic, kind.TYPE, *kind.OTHERS)
         table = self._table(topic)
         self._choose_frame(topic, table, frame)
-        if info.type in SENSOR_STAMPED_TYPES:
-            check_clock(topic, *table.times(), self.epoch_ns)
-        t_ns, from_log, columns = table.sorted()
-        self._note_unstamped(topic, t_ns, from_log)
+        t_ns, from_log, columns = self._sorted(topic, table)
         for name in _COUNTED.get(kind, ()):
             if bits := wrapped_bits(columns[name]):
                 columns[name] = to_signed(columns[name], bits)
@@ -533,6 +518,14 @@ class Recording:
                     "written as unsigned, read as signed"
                 )
         return kind(t_ns, stamped_by_log=from_log, frame_id=next(iter(table.frames()), ""), **columns)
+
+    def _sorted(self, topic: str, table: ColumnTable) -> tuple[NDArray[np.int64], int, dict[str, Array]]:
+        """Stamps, the number of them that are log times, and columns, by log time, of a clock that was not set."""
+        if self.recorded[topic].type in SENSOR_STAMPED_TYPES:
+            check_clock(topic, *table.times(), self.epoch_ns)
+        t_ns, from_log, columns = table.sorted()
+        self._note_unstamped(topic, t_ns, from_log)
+        return t_ns, from_log, columns
 
     def _choose_frame(self, topic: str, table: ColumnTable, frame: str | None) -> None:
         """Keep the messages of a frame. Raises InputError where it has none, and where none is given of several.
@@ -564,14 +557,14 @@ class Recording:
             f"topic {name}: {n} messages without a stamp, among others that have one, are left out"
             for name, n in self._unstamped.items()
         )
-        return (*left_out, *(note for name in self.recorded if name in facts for note in facts[name].notes))
+        return (*left_out, *(note for name in self.recorded if name in facts for note in facts[name][1]))
 
-    def _all_stamp_facts(self) -> Mapping[str, _StampFacts]:
+    def _all_stamp_facts(self) -> Mapping[str, tuple[int | None, tuple[str, ...]]]:
         for name in self._times.keys() - self._stamp_facts.keys():
             t_ns, log_ns = self._times[name]
             is_sensor = name in self.recorded and self.recorded[name].type in SENSOR_STAMPED_TYPES
             delay = int((log_ns - t_ns).min()) if len(t_ns) else None
-            self._stamp_facts[name] = _StampFacts(delay, stamp_notes(name, t_ns, log_ns) if is_sensor else ())
+            self._stamp_facts[name] = delay, stamp_notes(name, t_ns, log_ns) if is_sensor else ()
         return self._stamp_facts
 
     def _note_unstamped(self, topic: str, t_ns: NDArray[np.int64], from_log: int) -> None:

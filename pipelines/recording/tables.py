@@ -23,7 +23,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
-from alidade.pipelines.recording.table_values import unit_in, unit_named
+from alidade.pipelines.recording.table_values import nanoseconds, unit_in, unit_named
 
 Stamps = NDArray[np.int64]
 
@@ -93,17 +93,14 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
     if not form.width:
         # A file that grows may still have one.
         raise InputError(str(_unknown(path, ": no line of numbers in it")))
-    if _is_trajectory(path, data, form):
-        return ArrayContainer(path, {"/trajectory": _trajectory(path, data, form)})
+    if (poses := _trajectory(path, data, form)) is not None:
+        return ArrayContainer(path, {"/trajectory": poses})
     columns = ", ".join(form.names[:40])
-    return CsvFile(path, data, [f"a table with the columns {columns}; `columns:` in the config says which is what"])
+    return CsvFile(path, {}, [f"a table with the columns {columns}; `columns:` in the config says which is what"], data)
 
 
 class CsvFile(ArrayContainer):
     """A table; without topics until `table_topics.described` says which column is what."""
-
-    def __init__(self, path: Path, data: Path, assumptions: Sequence[str] = ()) -> None:
-        super().__init__(path, {}, assumptions, data)
 
 
 def _unknown(path: Path, why: str = "") -> NotARecordingError:
@@ -336,21 +333,16 @@ def _is_value(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None or _CLOCK.fullmatch(cell) is not None
 
 
-def _is_trajectory(path: Path, data: Path, form: TableForm) -> bool:
-    """Whether the table is a trajectory in TUM's form: eight columns by blanks, the last four a unit quaternion."""
+def _trajectory(path: Path, data: Path, form: TableForm) -> series.PoseSeries | None:
+    """A trajectory in TUM's form: eight columns by blanks, the last four a unit quaternion; None for other tables."""
     if form.delimiter != " " or len(form.names) != len(_TUM):
-        return False
-    for _, row in _rows(path, data, form):
-        try:
-            return len(row) == len(_TUM) and abs(float(np.linalg.norm([float(x) for x in row[4:]])) - 1.0) < 0.01
-        except ValueError:
-            return False
-    return False
-
-
-def _trajectory(path: Path, data: Path, form: TableForm) -> series.PoseSeries:
-    from alidade.pipelines.recording.table_values import nanoseconds
-
+        return None
+    _, first = next(_rows(path, data, form), (0, []))
+    try:
+        if len(first) != len(_TUM) or not abs(float(np.linalg.norm([float(x) for x in first[4:]])) - 1.0) < 0.01:
+            return None
+    except ValueError:
+        return None
     rows, _ = _whole_rows(path, data, form, range(len(_TUM)))
     columns: dict[str, Any] = dict(zip(_TUM, np.array(rows, dtype=np.str_).T, strict=True))
     xyzw = numbers(path, columns, _TUM[4:])

@@ -166,7 +166,7 @@ def inverted(poses: series.PoseSeries) -> series.PoseSeries:
 def joined(gyro: series.VectorSeries, accel: series.VectorSeries | None) -> series.ImuSeries:
     """Rates with the accelerations at their stamps, between samples by straight lines; NaN outside of them."""
     if accel is None or len(accel) == 0:
-        values: Array = np.full((len(gyro), 3), np.nan)
+        values: Array = np.full(3, np.nan)
     elif np.array_equal(gyro.t_ns, accel.t_ns):
         values = accel.vector
     else:
