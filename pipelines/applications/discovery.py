@@ -68,9 +68,10 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
     pairings: dict[tuple[str, str], Pairing | None] = {}
     for name in methods.names() if only is None else only:
         if lacking(methods.method(name).requirements, recording, config):
-            made = _suggestion(name, recording, config, pairings)
+            made = _Search(recording, config, name, pairings).suggestion()
             if made.topics and made.missing and config.method is None:
-                by_name = _suggestion(name, recording, config.model_copy(update={"method": name}), pairings)
+                asked = config.model_copy(update={"method": name})
+                by_name = _Search(recording, asked, name, pairings).suggestion()
                 made = replace(by_name, has_to_be_asked_for=True) if not by_name.missing else made
             if made.topics or made.reasons:
                 found.append(made)
@@ -128,7 +129,8 @@ def unused(recording: Recording, config: Config) -> tuple[str, ...]:
 def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     """Sentences about topics that a method could read as another of its sensors, and does not."""
     chosen = methods.method(method)
-    read = {part for topic in chosen.topics for part in _recorded_as(config, topic)}
+    sources = (config.topics.get(topic.key, TopicSource(topic=topic.name)) for topic in chosen.topics)
+    read = {part for source in sources for part in source.parts}
     read |= {source.name for source in config.topics.values()}
     sentences = []
     for topic in chosen.topics:
@@ -151,151 +153,187 @@ def empty(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     return tuple(f"topic {name} has no messages: it counts as not recorded" for name in there)
 
 
-def _recorded_as(config: Config, topic: Topic) -> tuple[str, ...]:
-    """The recorded topics that a topic of a method is taken from."""
-    source = config.topics.get(topic.key)
-    return (topic.name,) if source is None else source.parts
+class _Search:
+    """Search of a recording for the topics of one method.
 
+    Args:
+        recording, config: what there is, and what of it is named.
+        method: its name.
+        pairings: (gyro, attitude) -> how they turn together, shared by all searches of a recording.
+    """
 
-def _suggestion(
-    method: str, recording: Recording, config: Config, pairings: dict[tuple[str, str], Pairing | None]
-) -> Suggestion:
-    chosen = methods.method(method)
-    needed = [one for need in chosen.requirements for group in need for one in group if not isinstance(one, Setting)]
-    taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
-    taken |= {part for topic in chosen.topics if topic.key in config.topics for part in config.topics[topic.key].parts}
-    topics: dict[str, TopicSource] = {}
-    reasons: list[str] = []
-    doubtful: set[str] = set()
-    attitudes = [topic for topic in needed if _is_attitude(topic)]
-    gyros = [topic for topic in needed if messages.IMU in topic.types and not _is_attitude(topic)]
-    for attitude in attitudes:
-        for gyro in gyros:
-            free = [_candidates(recording, config, topic, taken) for topic in (attitude, gyro)]
-            doubtful |= _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons)
-    for topic in dict.fromkeys([*needed, *chosen.topics]):
-        if topic.key in topics or config.topic(topic) in recording.topics or topic.key in config.topics:
-            continue
-        if topic.key in doubtful or (topic not in needed and not topics):
-            continue
-        used = taken | {part for source in topics.values() for part in (source.name, *source.parts)}
-        split = _split_imu(recording, used) if messages.IMU in topic.types and not _is_attitude(topic) else None
-        if split is not None and topic in needed:
-            topics[topic.key] = split
-            reasons.append(
+    def __init__(
+        self, recording: Recording, config: Config, method: str, pairings: dict[tuple[str, str], Pairing | None]
+    ) -> None:
+        self._recording, self._config, self._pairings = recording, config, pairings
+        self._method = chosen = methods.method(method)
+        every = (one for need in chosen.requirements for group in need for one in group)
+        self._needed = [one for one in every if not isinstance(one, Setting)]
+        self._attitudes = [topic for topic in self._needed if _is_attitude(topic)]
+        self._gyros = [topic for topic in self._needed if _is_gyro(topic)]
+        self._taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
+        named = [config.topics[topic.key] for topic in chosen.topics if topic.key in config.topics]
+        self._taken |= {part for source in named for part in source.parts}
+        self._topics: dict[str, TopicSource] = {}
+        self._reasons: list[str] = []
+
+    def suggestion(self) -> Suggestion:
+        """The topics that were found, and what would still be missing."""
+        config, there = self._config, self._recording.topics
+        doubtful: set[str] = set()
+        for attitude in self._attitudes:
+            for gyro in self._gyros:
+                doubtful |= self._pair_up(attitude, gyro)
+        for topic in dict.fromkeys([*self._needed, *self._method.topics]):
+            is_known = topic.key in self._topics or config.topic(topic) in there or topic.key in config.topics
+            is_needed = topic in self._needed
+            if not is_known and topic.key not in doubtful and (is_needed or self._topics):
+                self._propose(topic, is_needed)
+        more = config.model_copy(update={"topics": {**config.topics, **self._topics}})
+        missing = lacking(self._method.requirements, self._recording.with_config(more.topics.values()), more)
+        return Suggestion(self._method.name, self._topics, tuple(self._reasons), missing)
+
+    def _propose(self, topic: Topic, is_needed: bool) -> None:
+        """Find a topic by its type and its name."""
+        used = self._taken | {part for source in self._topics.values() for part in (source.name, *source.parts)}
+        split = self._split_imu(used) if is_needed and _is_gyro(topic) else None
+        if split is not None:
+            self._topics[topic.key] = split
+            self._reasons.append(
                 f"{split.gyro} has rates alone, {split.accel} accelerations: together they are the {topic.key}"
             )
-            continue
-        named = _by_name(recording, topic, used, is_needed=topic in needed)
-        if named is None and topic in needed and len(several := _of_type(recording, topic, used)) > 1:
-            reasons.append(_to_choose(topic, several))
-        if named is not None and topic not in needed and messages.IMU in topic.types and not _is_attitude(topic):
-            sources = {each.key: TopicSource(topic=each.name) for each in (*gyros, *attitudes)} | config.topics | topics
-            twins = [
-                sources[gyro.key].name
-                for gyro in gyros
-                for attitude in attitudes
-                if _turns_as(recording, named, sources[gyro.key].name, sources[attitude.key], pairings)
-            ]
-            if twins:
-                reasons.append(f"{named} turns as {twins[0]} does: not proposed as {topic.key}")
-                continue
-        if named is not None:
-            topics[topic.key] = TopicSource(topic=named)
-            reasons.append(f"{named} ({_short(recording, named)}) proposed as {topic.key}")
-    more = config.model_copy(update={"topics": {**config.topics, **topics}})
-    missing = lacking(chosen.requirements, recording.with_config(more.topics.values()), more)
-    return Suggestion(method, topics, tuple(reasons), missing)
+            return
+        there = self._of_type(topic, used)
+        named = _by_name(topic, there, is_needed)
+        if named is None:
+            if is_needed and len(there) > 1:
+                self._reasons.append(_to_choose(topic, there))
+            return
+        twin = None if is_needed or not _is_gyro(topic) else self._twin(named)
+        if twin is not None:
+            self._reasons.append(f"{named} turns as {twin} does: not proposed as {topic.key}")
+            return
+        found = self._recording.topics[named]
+        self._topics[topic.key] = TopicSource(topic=named)
+        self._reasons.append(
+            f"{named} ({found.type.rpartition('/')[2]}, {found.count} messages) proposed as {topic.key}"
+        )
+
+    def _pair_up(self, attitude: Topic, gyro: Topic) -> set[str]:
+        """The gyro and the attitude that turn together most alike, of those that may serve.
+
+        Returns the keys that people have to choose a topic for: several turn alike, or an attitude fits in a way only
+        that is not taken without being asked for.
+        """
+        fitting = [
+            (found, g, a)
+            for a in self._candidates(attitude)
+            for g in self._candidates(gyro)
+            if a.name != g.name
+            if (found := self._pairing(g.name, a)) is not None and found.correlation > _BELONGS
+        ]
+        if not fitting:
+            return set()
+        found, g, a = max(fitting, key=lambda one: one[0].correlation)
+        least = self._as_high(found.correlation)
+        alike = [one for one in fitting if one[0].correlation >= least]
+        named = {
+            gyro: list(dict.fromkeys(g.name for _, g, _ in alike)),
+            attitude: list(dict.fromkeys(a.name for _, _, a in alike)),
+        }
+        several = {topic: names for topic, names in named.items() if len(names) > 1}
+        to_choose = {topic.key for topic in several}
+        self._reasons.extend(f"{_to_choose(topic, names)}; they turn alike" for topic, names in several.items())
+        if found.order != (0, 1, 2, 3) or (found.inverted and found.angle > MAX_MOUNT):
+            fits = "inverted, far from its mount" if found.inverted else "in another order of its components"
+            self._reasons.append(
+                f"{a.name} turns with {g.name}, but {fits}: are they x, y, z, w where w, x, y, z is meant? Not taken "
+                "by itself: mend the order, or say invert in the config"
+            )
+            return {attitude.key, *to_choose}
+        if self._config.topic(gyro) != g.name and gyro.key not in to_choose:
+            self._topics[gyro.key] = g
+        if (self._config.topic(attitude) != a.name or found.inverted) and attitude.key not in to_choose:
+            self._topics[attitude.key] = a.model_copy(update={"invert": a.invert != found.inverted})
+        if not to_choose:
+            way = ", inverted" if found.inverted else ""
+            offset = f", time offset {1e3 * found.offset_s:+.0f} ms" if abs(found.offset_s) > _DELAY else ""
+            self._reasons.append(f"{a.name} matches {g.name}: rate correlation {found.correlation:.2f}{offset}{way}")
+        return to_choose
+
+    def _twin(self, gyro: str) -> str | None:
+        """The gyro of the method with which another one turns, which is then on the same body; None without one."""
+        named = {each.key: TopicSource(topic=each.name) for each in (*self._gyros, *self._attitudes)}
+        sources = named | self._config.topics | self._topics
+        for own in self._gyros:
+            for attitude in self._attitudes:
+                name, seen = sources[own.key].name, sources[attitude.key]
+                ours, theirs = self._pairing(gyro, seen), self._pairing(name, seen)
+                if ours and theirs and ours.correlation >= self._as_high(theirs.correlation):
+                    return name
+        return None
+
+    def _as_high(self, correlation: float) -> float:
+        """The least correlation not lower by more than chance: three sigmas of Fisher's z of independent samples."""
+        sigma = np.sqrt(2.0 * INTERVAL / max(self._recording.duration_s, INTERVAL))
+        return float(np.tanh(np.arctanh(min(correlation, _HIGHEST)) - 3.0 * sigma))
+
+    def _candidates(self, topic: Topic) -> list[TopicSource]:
+        """Recorded topics of a type of the topic that serve nothing else: the one the config names, if it is there.
+
+        An attitude may be between any two frames of a TFMessage.
+        """
+        recording, own = self._recording, self._config.topic(topic)
+        if own in recording.topics:
+            return [self._config.topics.get(topic.key, TopicSource(topic=own))]
+        there = [(n, t) for n, t in recording.topics.items() if t.count and t.is_readable and n not in self._taken]
+        found = [TopicSource(topic=n) for n, t in there if t.type in topic.types]
+        if _is_attitude(topic):
+            for name in (n for n, t in there if t.type == messages.TF):
+                found += [TopicSource(topic=name, frames=pair) for pair in _moving_pairs(recording, name)]
+        return found
+
+    def _pairing(self, gyro: str, attitude: TopicSource) -> Pairing | None:
+        key = gyro, attitude.name
+        if key not in self._pairings:
+            self._pairings[key] = _paired(self._recording, gyro, attitude)
+        return self._pairings[key]
+
+    def _split_imu(self, used: set[str]) -> TopicSource | None:
+        """A gyro and an accelerometer on two topics, as some drivers publish them; None where there are not both."""
+        recording = self._recording
+        free = [n for n, t in recording.topics.items() if t.type in messages.IMUS and t.count and n not in used]
+        there = {name: imu for name in free if (imu := _rates(recording, name)) is not None} if len(free) > 1 else {}
+        gyros = [n for n, imu in there.items() if _has(imu, "gyro") and not _has(imu, "accel")]
+        accels = [n for n, imu in there.items() if _has(imu, "accel") and not _has(imu, "gyro")]
+        pairs = [(difflib.SequenceMatcher(None, g, a).ratio(), g, a) for g in gyros for a in accels]
+        _, gyro, accel = max(pairs, default=(0.0, None, None))
+        return None if gyro is None else TopicSource(gyro=gyro, accel=accel)
+
+    def _of_type(self, topic: Topic, used: set[str]) -> list[str]:
+        """Recorded topics that a topic of a method could be, by type; attitudes of an Imu are found by pairing."""
+        of_type = {n: t for n, t in self._recording.topics.items() if t.type in topic.types and n not in used}
+        there = {n: t.type == messages.IMU for n, t in of_type.items() if t.count and t.is_readable}
+        if _is_attitude(topic):
+            return [name for name, is_imu in there.items() if not is_imu]
+        needs_attitude = topic.key.startswith("reference")
+        return [n for n, is_imu in there.items() if not (needs_attitude and is_imu) or self._has_attitude(n)]
+
+    def _has_attitude(self, topic: str) -> bool:
+        imu = _rates(self._recording, topic)
+        return imu is not None and bool((imu.wxyz_cov[:, 0, 0] >= 0.0).any() and imu.wxyz.any())
 
 
 def _is_attitude(topic: Topic) -> bool:
     return messages.POSE in topic.types
 
 
-def _pair_up(
-    recording: Recording,
-    config: Config,
-    pair_of: tuple[Topic, Topic],
-    free: list[list[TopicSource]],
-    pairings: dict[tuple[str, str], Pairing | None],
-    topics: dict[str, TopicSource],
-    reasons: list[str],
-) -> set[str]:
-    """The gyro and the attitude that turn together most alike, of those that may serve.
-
-    Returns the keys that people have to choose a topic for: several turn alike, or an attitude fits in a way only that
-    is not taken without being asked for.
-    """
-    attitude, gyro = pair_of
-    fitting = [
-        (found, g, a)
-        for a in free[0]
-        for g in free[1]
-        if a.name != g.name
-        if (found := _pairing(recording, g.name, a, pairings)) is not None and found.correlation > _BELONGS
-    ]
-    if not fitting:
-        return set()
-    found, g, a = max(fitting, key=lambda one: one[0].correlation)
-    least = _as_high(recording, found.correlation)
-    alike = [one for one in fitting if one[0].correlation >= least]
-    named = {
-        gyro: list(dict.fromkeys(g.name for _, g, _ in alike)),
-        attitude: list(dict.fromkeys(a.name for _, _, a in alike)),
-    }
-    to_choose = {topic.key for topic, names in named.items() if len(names) > 1}
-    reasons.extend(f"{_to_choose(topic, names)}; they turn alike" for topic, names in named.items() if len(names) > 1)
-    if found.order != (0, 1, 2, 3) or (found.inverted and found.angle > MAX_MOUNT):
-        fits = "inverted, far from its mount" if found.inverted else "in another order of its components"
-        reasons.append(
-            f"{a.name} turns with {g.name}, but {fits}: are they x, y, z, w where w, x, y, z is meant? Not taken by "
-            "itself: mend the order, or say invert in the config"
-        )
-        return {attitude.key, *to_choose}
-    if config.topic(gyro) != g.name and gyro.key not in to_choose:
-        topics[gyro.key] = g
-    if (config.topic(attitude) != a.name or found.inverted) and attitude.key not in to_choose:
-        topics[attitude.key] = a.model_copy(update={"invert": a.invert != found.inverted})
-    if to_choose:
-        return to_choose
-    way = ", inverted" if found.inverted else ""
-    offset = f", time offset {1e3 * found.offset_s:+.0f} ms" if abs(found.offset_s) > _DELAY else ""
-    reasons.append(f"{a.name} matches {g.name}: rate correlation {found.correlation:.2f}{offset}{way}")
-    return set()
-
-
-def _turns_as(
-    recording: Recording, gyro: str, other: str, attitude: TopicSource, known: dict[tuple[str, str], Pairing | None]
-) -> bool:
-    """Whether a gyro turns with an attitude as another one does, which is then on the same body."""
-    own, theirs = (_pairing(recording, name, attitude, known) for name in (gyro, other))
-    return own is not None and theirs is not None and own.correlation >= _as_high(recording, theirs.correlation)
-
-
-def _as_high(recording: Recording, correlation: float) -> float:
-    """The least correlation not lower by more than chance: three sigmas of Fisher's z of independent samples."""
-    sigma = np.sqrt(2.0 * INTERVAL / max(recording.duration_s, INTERVAL))
-    return float(np.tanh(np.arctanh(min(correlation, _HIGHEST)) - 3.0 * sigma))
+def _is_gyro(topic: Topic) -> bool:
+    return messages.IMU in topic.types and not _is_attitude(topic)
 
 
 def _to_choose(topic: Topic, names: Sequence[str]) -> str:
     return f"{' and '.join(names)} could be the {topic.key}: choose, `topics: {{{topic.key}: {names[0]}}}`"
-
-
-def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[str]) -> list[TopicSource]:
-    """Recorded topics of a type of the topic that serve nothing else: the one the config names, if it is there.
-
-    An attitude may be between any two frames of a TFMessage.
-    """
-    own = config.topic(topic)
-    if own in recording.topics:
-        return [config.topics.get(topic.key, TopicSource(topic=own))]
-    there = [(n, t) for n, t in recording.topics.items() if t.count and t.is_readable and n not in taken]
-    found = [TopicSource(topic=n) for n, t in there if t.type in topic.types]
-    if _is_attitude(topic):
-        for name in (n for n, t in there if t.type == messages.TF):
-            found += [TopicSource(topic=name, frames=pair) for pair in _moving_pairs(recording, name)]
-    return found
 
 
 def _moving_pairs(recording: Recording, topic: str) -> list[tuple[str, str]]:
@@ -305,14 +343,6 @@ def _moving_pairs(recording: Recording, topic: str) -> list[tuple[str, str]]:
     except InputError:
         return []
     return sorted((pair for pair, n in counts.items() if n >= _FEWEST), key=lambda pair: -counts[pair])[:_MOST_PAIRS]
-
-
-def _pairing(
-    recording: Recording, gyro: str, attitude: TopicSource, known: dict[tuple[str, str], Pairing | None]
-) -> Pairing | None:
-    if (gyro, attitude.name) not in known:
-        known[gyro, attitude.name] = _paired(recording, gyro, attitude)
-    return known[gyro, attitude.name]
 
 
 def _paired(recording: Recording, gyro: str, attitude: TopicSource) -> Pairing | None:
@@ -333,64 +363,16 @@ def _rates(recording: Recording, topic: str) -> ImuSeries | None:
         return None
 
 
-def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool) -> str | None:
-    """The topic of the first type that is there: of several the one whose name is most alike; an optional one if it is.
-
-    An attitude of an Imu is left to its content, which pairs it.
-    """
-    there = _of_type(recording, topic, used)
+def _by_name(topic: Topic, there: Sequence[str], is_needed: bool) -> str | None:
+    """The one of several topics whose name is most alike; an optional one if it is alike, or the only gyro."""
     words = topic.key.replace("_", " ")
     alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
-    best = max(there, key=lambda name: alike[name], default=None)
-    if best is not None and (is_needed or alike[best] > _ALIKE) and _is_ambiguous(alike):
-        return None
-    return best if best is not None and (is_needed or alike[best] > _ALIKE or _is_other_gyro(topic, there)) else None
-
-
-def _split_imu(recording: Recording, used: set[str]) -> TopicSource | None:
-    """A gyro and an accelerometer on two topics, as some drivers publish them; None where there are not both."""
-    free = [n for n, t in recording.topics.items() if t.type in messages.IMUS and t.count and n not in used]
-    there = {name: imu for name in free if (imu := _rates(recording, name)) is not None} if len(free) > 1 else {}
-    gyros = [n for n, imu in there.items() if _has(imu, "gyro") and not _has(imu, "accel")]
-    accels = [n for n, imu in there.items() if _has(imu, "accel") and not _has(imu, "gyro")]
-    if not gyros or not accels:
-        return None
-    pairs = [(difflib.SequenceMatcher(None, g, a).ratio(), g, a) for g in gyros for a in accels]
-    _, gyro, accel = max(pairs)
-    return TopicSource(gyro=gyro, accel=accel)
+    ranked = sorted(there, key=lambda name: -alike[name])
+    if not ranked or not (is_needed or alike[ranked[0]] > _ALIKE):
+        return ranked[0] if len(ranked) == 1 and _is_gyro(topic) else None
+    # Which of several is meant, none of them by its name, is not for chance to say.
+    return None if len(ranked) > 1 and alike[ranked[0]] - alike[ranked[1]] < _CLEARLY else ranked[0]
 
 
 def _has(imu: ImuSeries, kind: str) -> bool:
     return is_there(kind, getattr(imu, kind), getattr(imu, f"{kind}_cov"))
-
-
-def _has_attitude(recording: Recording, topic: str) -> bool:
-    imu = _rates(recording, topic)
-    return imu is not None and bool((imu.wxyz_cov[:, 0, 0] >= 0.0).any() and imu.wxyz.any())
-
-
-def _of_type(recording: Recording, topic: Topic, used: set[str]) -> list[str]:
-    """Recorded topics that a topic of a method could be, by type."""
-    return [
-        name
-        for name, found in recording.topics.items()
-        if found.type in topic.types and found.count and found.is_readable and name not in used
-        if not (_is_attitude(topic) and found.type == messages.IMU)
-        if not (topic.key.startswith("reference") and found.type == messages.IMU and not _has_attitude(recording, name))
-    ]
-
-
-def _is_ambiguous(alike: dict[str, float]) -> bool:
-    """Whether several topics could be meant, none of them by its name: which is not for chance to say."""
-    ranked = sorted(alike.values(), reverse=True)
-    return len(ranked) > 1 and ranked[0] - ranked[1] < _CLEARLY
-
-
-def _is_other_gyro(topic: Topic, there: list[str]) -> bool:
-    """Whether a topic of a gyro has but one that is left to serve."""
-    return len(there) == 1 and messages.IMU in topic.types and not _is_attitude(topic)
-
-
-def _short(recording: Recording, name: str) -> str:
-    found = recording.topics[name]
-    return f"{found.type.rpartition('/')[2]}, {found.count} messages"
