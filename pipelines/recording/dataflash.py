@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, redirect_stderr, redirect_stdout
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.container import byte_windows
-from alidade.pipelines.recording.ulog import ENU_FROM_NED, Columns, columns
+from alidade.pipelines.recording.ulog import ENU_FROM_NED, Columns, columns, log_container
 
 # Messages: their kind and the number of the sensor.
 Kind = tuple[str, int]
@@ -71,13 +72,7 @@ def read_dataflash(path: Path, data: Path) -> ArrayContainer:
         topics = dict(_topics(found, offset))
     except KeyError as error:
         raise InputError(f"{path}: an ArduPilot log without the columns of its messages ({error})") from error
-    assumptions = [_CORRECTED]
-    if not offset:
-        assumptions.append("no fix says what time it was: times are those since the autopilot was switched on")
-    container = ArrayContainer(path, topics, assumptions, data)
-    if is_damaged:
-        container.incomplete = ("the log is damaged; what could be read of it is used",)
-    return container
+    return log_container(path, data, topics, [_CORRECTED], offset, is_damaged)
 
 
 def _is_damaged(log: Any, size: int) -> bool:
@@ -147,12 +142,8 @@ def _imu(data: Columns, offset: int) -> series.ImuSeries:
     return series.ImuSeries(_stamps(data, offset), rates, forces)
 
 
-def _gyro(data: Columns, offset: int) -> series.VectorSeries:
-    return series.VectorSeries(_stamps(data, offset), columns(data, "GyrX", "GyrY", "GyrZ"))
-
-
-def _accel(data: Columns, offset: int) -> series.VectorSeries:
-    return series.VectorSeries(_stamps(data, offset), columns(data, "AccX", "AccY", "AccZ"))
+def _vector(kind: str, data: Columns, offset: int) -> series.VectorSeries:
+    return series.VectorSeries(_stamps(data, offset), columns(data, *(f"{kind}{axis}" for axis in "XYZ")))
 
 
 def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
@@ -177,8 +168,8 @@ def _fix(data: Columns, offset: int) -> series.FixSeries:
 
 _READERS: dict[str, Callable[[Columns, int], series.Topic]] = {
     "IMU": _imu,
-    "GYR": _gyro,
-    "ACC": _accel,
+    "GYR": partial(_vector, "Gyr"),
+    "ACC": partial(_vector, "Acc"),
     "MAG": _magnetic,
     "ATT": _attitude,
     "GPS": _fix,

@@ -10,6 +10,7 @@ import bz2
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -81,10 +82,8 @@ class Ros1Bag(Container):
     def _walk(self, stream: BinaryIO) -> None:
         """Note where the chunks are, what connections there are, and where the file ends too early."""
         position, unpacked, indexed = len(MAGIC), 0, 0
-        while position < self.size:
-            try:
-                header, start, end = _record(stream, position, self.size)
-                (op,) = header.get(b"op", b"\0")[:1] or b"\0"
+        try:
+            for op, header, start, end in _records(stream, position, self.size, "a record"):
                 if op == _BAG:
                     indexed = int.from_bytes(header.get(b"index_pos", b""), "little")
                 elif op == _CHUNK:
@@ -109,11 +108,11 @@ class Ros1Bag(Container):
                     self._connect(header, stream.read(min(end - start, _LONGEST_TEXT + 1)))
                 elif op not in (_INDEX, _CHUNK_INFO):
                     raise DamagedError(f"a record of unknown kind {op}")
-            except DamagedError as damaged:
-                kind, reason = ("damage", str(damaged)) if indexed else ("cut", "")
-                self.losses.append(DataLoss(kind, position, self.size - position, reason=reason))  # type: ignore[arg-type]
-                return
-            position = end
+                position = end
+        except DamagedError as damaged:
+            kind, reason = ("damage", str(damaged)) if indexed else ("cut", "")
+            self.losses.append(DataLoss(kind, position, self.size - position, reason=reason))  # type: ignore[arg-type]
+            return
         if not indexed:
             self.losses.append(DataLoss("cut", self.size, 0))
 
@@ -135,10 +134,7 @@ class Ros1Bag(Container):
         stream.seek(chunk.start)
         data = _unpacked(stream.read(chunk.end - chunk.start), chunk.compression, chunk.size)
         found: dict[int, tuple[list[int], list[int], list[int]]] = {}
-        position = 0
-        while position < len(data):
-            header, start, end = _record_in(data, position)
-            (op,) = header.get(b"op", b"\0")[:1] or b"\0"
+        for op, header, start, end in _records(BytesIO(data), 0, len(data), "a record in it"):
             if op == _CONNECTION:
                 self._connect(header, data[start:end])
             elif op == _MESSAGE:
@@ -151,7 +147,6 @@ class Ros1Bag(Container):
                 starts.append(start)
                 sizes.append(end - start)
                 times.append(sec * 1_000_000_000 + nanosec)
-            position = end
         buffer = np.frombuffer(data, np.uint8)
         return {number: MessageBlock(number, buffer, *map(np.array, parts)) for number, parts in found.items()}
 
@@ -173,38 +168,29 @@ def is_closed(stream: BinaryIO) -> bool:
     """Whether a bag has been closed: its header says where the index is."""
     size = stream.seek(0, 2)
     try:
-        header, _, _ = _record(stream, len(MAGIC), size)
-    except DamagedError:
+        _, header, _, _ = next(_records(stream, len(MAGIC), size, "a record"))
+    except (DamagedError, StopIteration):
         return False
     return 0 < int.from_bytes(header.get(b"index_pos", b""), "little") < size
 
 
-def _record(stream: BinaryIO, position: int, stop: int) -> tuple[dict[bytes, bytes], int, int]:
-    """Header of the record at a byte of the file, and where its data begin and end. Raises DamagedError."""
-    stream.seek(position)
-    head = stream.read(4)
-    length = _LENGTH.unpack(head)[0] if len(head) == 4 else stop
-    if length > _LONGEST_HEADER or position + length + 8 > stop:
-        raise DamagedError("a record is not whole")
-    header = stream.read(length + 4)
-    start = position + length + 8
-    end = start + _LENGTH.unpack(header[length:])[0]
-    if end > stop:
-        raise DamagedError("a record is not whole")
-    return _fields(header[:length]), start, end
-
-
-def _record_in(data: bytes, position: int) -> tuple[dict[bytes, bytes], int, int]:
-    """Header, start and end of a record in a chunk's data."""
-    try:
-        (length,) = _LENGTH.unpack_from(data, position)
+def _records(
+    stream: BinaryIO, position: int, stop: int, what: str
+) -> Iterator[tuple[int, dict[bytes, bytes], int, int]]:
+    """Kind, header, begin and end of data of each record in [position, stop); DamagedError names `what`."""
+    while position < stop:
+        stream.seek(position)
+        head = stream.read(4)
+        length = _LENGTH.unpack(head)[0] if len(head) == 4 else stop
+        if length > _LONGEST_HEADER or position + length + 8 > stop:
+            raise DamagedError(f"{what} is not whole")
+        header = stream.read(length + 4)
         start = position + length + 8
-        end = start + _LENGTH.unpack_from(data, start - 4)[0]
-    except struct.error as error:
-        raise DamagedError("a record in it is not whole") from error
-    if length > _LONGEST_HEADER or end > len(data):
-        raise DamagedError("a record in it is not whole")
-    return _fields(data[position + 4 : start - 4]), start, end
+        position = start + _LENGTH.unpack(header[length:])[0]
+        if position > stop:
+            raise DamagedError(f"{what} is not whole")
+        fields = _fields(header[:length])
+        yield (fields.get(b"op") or b"\0")[0], fields, start, position
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:

@@ -54,10 +54,17 @@ def read_ulog(path: Path, data: Path) -> ArrayContainer:
     dropped = sum(dropout.duration for dropout in log.dropouts)
     if dropped:
         assumptions.append(f"the logger says that it lost {dropped} ms of messages, {len(log.dropouts)} times")
+    return log_container(path, data, topics, assumptions, offset, log.file_corruption)
+
+
+def log_container(
+    path: Path, data: Path, topics: Mapping[str, series.Topic], assumptions: list[str], offset: int, is_damaged: bool
+) -> ArrayContainer:
+    """What an autopilot logged, with times that no fix put into Unix time where the offset is 0."""
     if not offset:
         assumptions.append("no fix says what time it was: times are those since the autopilot was switched on")
     container = ArrayContainer(path, topics, assumptions, data)
-    if log.file_corruption:
+    if is_damaged:
         container.incomplete = ("the log is damaged; what could be read of it is used",)
     return container
 

@@ -1,8 +1,8 @@
 """Where the tags sit on a body, from pictures of it: bundle adjustment of their corners, with covariance.
 
 The tag with the lowest id stays where it is given and so defines the body's frame; the sizes given define its scale.
-Tags are placed by a vote of all pictures (`placing`), then poses of tags and pictures are adjusted together (`bundle`,
-`robust`), with the time that shutters take to roll and, if asked for, the cameras (`additional`).
+Tags are placed by a vote of all pictures (`placing`), then poses of tags and pictures are adjusted together (`bundle`),
+with the time that shutters take to roll and, if asked for, the cameras.
 """
 
 from __future__ import annotations
@@ -17,10 +17,17 @@ from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.layout.bundle import LINE_TIME, moved, refined_pictures, shutters, with_intrinsics
+from alidade.pipelines.vision.layout.bundle import (
+    LINE_TIME,
+    Fit,
+    fitted,
+    moved,
+    refined_pictures,
+    shutters,
+    with_intrinsics,
+)
 from alidade.pipelines.vision.layout.covariance import Covariance, covariance
 from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_told, joint
-from alidade.pipelines.vision.layout.robust import Fit, fitted
 from alidade.pipelines.vision.layout.sights import Gathered, Shots, Sights, gathered, linearized
 from alidade.pipelines.vision.pose import TagBody, part
 

@@ -26,8 +26,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.array import Array
-from alidade.pipelines.vision.layout.bundle import normal_equations, shared_rows
-from alidade.pipelines.vision.layout.robust import Fit
+from alidade.pipelines.vision.layout.bundle import Fit, normal_equations, shared_rows
 from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights
 from alidade.pipelines.vision.pose import SQUARE
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.vision.layout.bundle import adjusted, loss, nothing, refined_pictures
-from alidade.pipelines.vision.layout.robust import Fit, fitted
+from alidade.pipelines.vision.layout.bundle import Fit, adjusted, fitted, loss, nothing, refined_pictures
 from alidade.pipelines.vision.layout.sights import Bundle, Gathered, Index, Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, planar_solutions
 
