@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -267,26 +267,18 @@ def estimate_pose(
     tags, pixels, variance = _matched(camera, body, detections, use)
     if not len(tags.ids):
         return None
-    noise = _Noise(np.sqrt(variance) if sigma_px is None else sigma_px, raised=sigma_px is None)
-    solution = _solve(camera, tags, pixels, noise, expected)
-    if solution is None or len(use) < 3 or solution.rms_px < _WRONG_SIGMAS * noise.sigma:
+    sigma, is_raised = (float(np.sqrt(variance)), True) if sigma_px is None else (sigma_px, False)
+    solution = _solve(camera, tags, pixels, sigma, is_raised, expected)
+    if solution is None or len(use) < 3 or solution.rms_px < _WRONG_SIGMAS * sigma:
         return solution
     # One wrong tag spoils the fit of all: it is the one without which the others agree.
     rests = [np.arange(len(tags.ids)) != k for k in range(len(tags.ids))]
-    others = [_solve(camera, part(tags, keep), pixels[keep], noise, expected) for keep in rests]
+    others = [_solve(camera, part(tags, keep), pixels[keep], sigma, is_raised, expected) for keep in rests]
     best = min((o for o in others if o is not None), key=lambda o: o.rms_px, default=solution)
     if best.rms_px * _WRONG_GAIN > solution.rms_px:
         return solution
     rejected = tuple(set(tags.ids.tolist()) - set(best.ids.tolist()))
-    return BodyPose(**{**vars(best), "rejected": rejected})
-
-
-@dataclass(frozen=True)
-class _Noise:
-    """Sigma of a corner, px per axis; `raised`: to what the misfit shows, if that is more."""
-
-    sigma: float
-    raised: bool
+    return replace(best, rejected=rejected)
 
 
 def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequence[int]) -> tuple[TagBody, Array, float]:
@@ -306,23 +298,26 @@ def part(body: TagBody, keep: NDArray[Any]) -> TagBody:
     return TagBody(body.ids[keep], body.size[keep], body.bRt[keep], body.position[keep], body.family)
 
 
-def _solve(camera: Camera, tags: TagBody, pixels: Array, noise: _Noise, expected: ArrayLike | None) -> BodyPose | None:
-    fits = sorted(_minima(camera, tags, pixels, _starts(camera, tags, pixels)), key=lambda fit: fit.square)
+def _solve(
+    camera: Camera, tags: TagBody, pixels: Array, sigma: float, is_raised: bool, expected: ArrayLike | None
+) -> BodyPose | None:
+    """The pose by corners of a sigma, px per axis, which is raised to what the misfit shows, if that is more."""
+    fits = sorted(_minima(camera, tags, pixels), key=lambda fit: fit.square)
     if not fits:
         return None
     best = fits[0]
     # A sigma that is too small must not make the flip look impossible.
-    variance = max(noise.sigma**2, best.square / (pixels.size - 6))
+    variance = max(sigma**2, best.square / (pixels.size - 6))
     odds = float(np.exp(-0.5 * (fits[1].square - best.square) / variance)) if len(fits) > 1 else 0.0
     ambiguous = odds > _AMBIGUOUS
     if ambiguous and expected is not None:
-        far = [_angle(fit.cRb, np.asarray(expected, dtype=float)) for fit in fits]
+        far = [float(angles(fit.cRb, np.asarray(expected, dtype=float))) for fit in fits]
         best = fits[int(np.argmin(far))]
         ambiguous = 2 * min(far) >= max(far)
     return BodyPose(
         cRb=best.cRb,
         position=best.position,
-        covariance=best.covariance * (variance if noise.raised else noise.sigma**2),
+        covariance=best.covariance * (variance if is_raised else sigma**2),
         ids=tags.ids,
         tag_rms_px=np.sqrt((best.miss.reshape(pixels.shape) ** 2).mean(axis=(1, 2))),
         rms_px=float(np.sqrt((best.miss**2).mean())),
@@ -332,24 +327,9 @@ def _solve(camera: Camera, tags: TagBody, pixels: Array, noise: _Noise, expected
     )
 
 
-def _angle(p: Array, q: Array) -> float:
-    return float(np.linalg.norm(so3.log(so3.multiply(so3.inverse(p), q))))
-
-
-def _starts(camera: Camera, tags: TagBody, pixels: Array) -> list[list[tuple[float, Array, Array]]]:
-    """For each tag its planar solutions as body poses: (sum of squares over all tags in px^2, cRb, position)."""
-    corners = tags.corners
-    starts = []
-    for k, (attitudes, places) in enumerate(zip(*planar_solutions(camera, tags.size, pixels), strict=True)):
-        pair = []
-        for cRt, place in zip(attitudes, places, strict=True):
-            cRb = so3.multiply(cRt, so3.inverse(tags.bRt[k]))
-            origin = place - so3.rotate(cRb, tags.position[k])
-            miss = reprojection_errors(camera, corners, pixels, cRb, origin)
-            square_sum = float((miss**2).sum())
-            pair.append((square_sum if np.isfinite(square_sum) else np.inf, cRb, origin))
-        starts.append(pair)
-    return starts
+def angles(p: Array, q: Array) -> Array:
+    """Angles (...,), rad, of the rotations between attitudes (..., 4)."""
+    return np.asarray(np.linalg.norm(so3.log(so3.multiply(so3.inverse(p), q)), axis=-1))
 
 
 def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array, Array]:
@@ -379,20 +359,25 @@ def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array,
     return so3.exp(vectors), places
 
 
-def _minima(
-    camera: Camera, tags: TagBody, pixels: Array, starts: list[list[tuple[float, Array, Array]]]
-) -> list[PoseFit]:
-    """The refined best start, and the refined best start of those that lie on the other side of the flip."""
-    _, cRb, position = min((start for pair in starts for start in pair), key=lambda start: start[0])
-    corners, seen = tags.corners.reshape(-1, 3), pixels.reshape(-1, 2)
-    first = refine(camera, corners, seen, cRb, position)
+def _minima(camera: Camera, tags: TagBody, pixels: Array) -> list[PoseFit]:
+    """The refined best start, and the refined best start of those that lie on the other side of the flip.
+
+    Starts are both planar solutions of each tag, as poses of the body.
+    """
+    cRt, place = planar_solutions(camera, tags.size, pixels)
+    cRb = so3.multiply(cRt, so3.inverse(tags.bRt)[:, None])
+    position = place - so3.rotate(cRb, tags.position[:, None])
+    miss = reprojection_errors(camera, tags.corners, pixels, cRb[:, :, None, None], position[:, :, None, None])
+    squares = (miss**2).sum(axis=(2, 3, 4))
+    squares[~np.isfinite(squares)] = np.inf
+
+    def refined(costs: Array) -> PoseFit | None:
+        k = np.unravel_index(costs.argmin(), costs.shape)
+        return refine(camera, tags.corners.reshape(-1, 3), pixels.reshape(-1, 2), cRb[k], position[k])
+
+    first = refined(squares)
     if first is None:
         return []
-    far = [max(pair, key=lambda start: _angle(start[1], first.cRb)) for pair in starts if len(pair) > 1]
-    if not far:
-        return [first]
-    _, cRb, position = min(far, key=lambda start: start[0])
-    second = refine(camera, corners, seen, cRb, position)
-    if second is None or _angle(second.cRb, first.cRb) < _SAME:
-        return [first]
-    return [first, second]
+    away = angles(cRb, first.cRb)
+    second = refined(np.where(away < away[:, ::-1], np.inf, squares))
+    return [first] if second is None or angles(second.cRb, first.cRb) < _SAME else [first, second]

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -335,21 +335,18 @@ def detections(
     stream = iter(images)
     first = list(islice(stream, _MANY + 1)) if (jobs := allowed()) > 1 else []
     if len(first) <= _MANY:
-        for t_ns, encoded in [*first, *stream] if first else stream:
+        for t_ns, encoded in chain(first, stream):
             yield t_ns, _find(encoded, family, camera)
         return
     pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _prepare)
     under_way: deque[tuple[int, Future[Detections | None]]] = deque()
     try:
-        for part in (first, stream):
-            for t_ns, encoded in part:
-                under_way.append((t_ns, pool.submit(_find, encoded, family, camera)))
-                if len(under_way) >= _AHEAD * jobs:
-                    t, found = under_way.popleft()
-                    yield t, found.result()
-        while under_way:
-            t, found = under_way.popleft()
-            yield t, found.result()
+        for t_ns, encoded in chain(first, stream):
+            under_way.append((t_ns, pool.submit(_find, encoded, family, camera)))
+            if len(under_way) >= _AHEAD * jobs:
+                t, found = under_way.popleft()
+                yield t, found.result()
+        yield from ((t, found.result()) for t, found in under_way)
     finally:
         pool.shutdown(cancel_futures=True)
 

@@ -19,7 +19,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.layout.bundle import Fit, adjusted, fitted, loss, nothing, refined_pictures
 from alidade.pipelines.vision.layout.sights import Bundle, Gathered, Index, Sights, linearized
-from alidade.pipelines.vision.pose import TagBody, planar_solutions
+from alidade.pipelines.vision.pose import TagBody, angles, planar_solutions
 
 # Sum of squares of a tag in a picture, eight numbers in sigmas, beyond which it counts less and less.
 FAR = 8.0 * 4.0**2
@@ -116,7 +116,7 @@ def _right_side_out(start: Bundle, sights: Sights) -> TagBody:
         bodies.append(after.body)
         costs.append(float(loss(rows.squares, FAR).sum()))
     best = int(np.argmin(costs))
-    apart = _angles(bodies[0].bRt, bodies[1].bRt).max()
+    apart = angles(bodies[0].bRt, bodies[1].bRt).max()
     if apart > _SAME and abs(costs[1] - costs[0]) < _DECIDED:
         raise InputError(
             "the pictures fit the tags and their mirror image alike, an edge seen from outside and one seen from "
@@ -135,12 +135,8 @@ def flip_told(fit: Fit, view: Index, tag: int) -> bool:
     seen = fit.sights[_some(mine, _HEARD)]
     others = fit.sights[np.isin(fit.sights.picture, seen.picture) & (fit.sights.tag != tag)]
     bRt, _, cost = vote(fit.bundle, seen, sides(fit.bundle, others))
-    now = _angles(bRt, fit.bundle.body.bRt[tag]) < _SAME
+    now = angles(bRt, fit.bundle.body.bRt[tag]) < _SAME
     return bool(now.any() and (now.all() or cost[~now].min() - cost[now].min() > _DECIDED))
-
-
-def _angles(p: Array, q: Array) -> Array:
-    return np.asarray(np.linalg.norm(so3.log(so3.multiply(so3.inverse(p), q)), axis=-1))
 
 
 def grown(bundle: Bundle, sights: Sights) -> TagBody:
@@ -324,10 +320,10 @@ def sides(bundle: Bundle, sights: Sights) -> Sides:
     picture = np.repeat(sights.picture, 2)
     cRb, position = cRb.reshape(-1, 4), position.reshape(-1, 3)
     first = _refined(bundle, sights, _best(picture, costs.ravel(), f), cRb, position)
-    away = _angles(first.cRb[picture], cRb).reshape(-1, 2)
+    away = angles(first.cRb[picture], cRb).reshape(-1, 2)
     other = np.where(away < away[:, ::-1], np.inf, costs)
     second = _refined(bundle, sights, _best(picture, other.ravel(), f), cRb, position)
-    second.cost[_angles(first.cRb, second.cRb) < _ONE_POSE] = np.inf
+    second.cost[angles(first.cRb, second.cRb) < _ONE_POSE] = np.inf
     order = np.argsort(np.stack([first.cost, second.cost], axis=1), axis=1)
     both = (np.stack(pair, axis=1) for pair in zip(vars(first).values(), vars(second).values(), strict=True))
     return Sides(*(pair[np.arange(f)[:, None], order] for pair in both))
