@@ -23,7 +23,7 @@ from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_grav
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import TableTopic, tables_of
 from alidade.pipelines.recording.table_values import COMPATIBLE, TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
-from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
+from alidade.pipelines.recording.tables import CsvFile, numbers, read_columns
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
 
@@ -129,13 +129,12 @@ class _Table:
     """What one table holds."""
 
     def __init__(self, table: CsvFile, is_named: bool) -> None:
-        self.path, self._data = table.path, table.data
-        self._form: TableForm = table_form(table.path, table.data)
+        self.path, self._form = table.path, table.form
         self._file = table.path.name if is_named else None
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
-        texts, _ = read_columns(table.path, table.data, self._form, names)
+        texts, _ = read_columns(self._form, names)
         self._texts = [texts[name][:_ROWS] for name in names]
         self._values = [self._numbers(i) for i in range(len(names))]
 

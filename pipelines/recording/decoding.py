@@ -230,7 +230,8 @@ class MessageFormat:
         if not self.is_readable:
             return block.log_ns
         try:
-            return self._header_stamps(self._translated(block))
+            wire = "cdr" if self._is_translated else self._wire or "cdr"
+            return header_stamps(self._has_header, self._translated(block), wire)
         except MessageError:
             return block.log_ns
 
@@ -292,9 +293,6 @@ class MessageFormat:
         if not self._is_translated and self._language == "msg" and self._schema is not None and self._schema.data:
             return messages.has_header(self._schema.data.decode(errors="replace"))
         return self.definition.has_header
-
-    def _header_stamps(self, block: MessageBlock) -> Stamps:
-        return header_stamps(self._has_header, block, "cdr" if self._is_translated else self._wire or "cdr")
 
     @cached_property
     def _translation(self) -> Translation:

@@ -45,7 +45,7 @@ def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, seri
     """Topics of a sensor's table, by name."""
     layout = table_form(table, table)
     names = layout.names
-    columns, _ = read_columns(table, table, layout, names)
+    columns, _ = read_columns(layout, names)
     t_ns = nanoseconds(table, columns[names[0]], "ns")
 
     def chosen(letter: str) -> list[str]:

@@ -75,11 +75,6 @@ def netpbm(image: Any) -> bytes:
     return _file(np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_Bayer{_OPENCV_BAYER[bayer['pattern']]}2RGB"))))
 
 
-def colour_file(rgb: Pixels) -> bytes:
-    """A picture (height, width, 3) of 8 bits as a file."""
-    return _file(np.ascontiguousarray(rgb))
-
-
 def _used_bytes(data: NDArray[np.uint8], height: int, used: int, step: int) -> NDArray[np.uint8]:
     """The bytes that are used of each row."""
     if not 0 < used <= step or height <= 0 or height * step != len(data) or len(data) > MAX_PICTURE_BYTES:
@@ -97,6 +92,7 @@ def _eight_bits(rows: NDArray[np.uint8], width: int, image: Any) -> NDArray[np.u
 
 
 def _file(pixels: Pixels) -> bytes:
+    """A picture (height, width) or (height, width, 3) of 8 bits as a file."""
     kind = "P5" if pixels.ndim == 2 else "P6"
     return f"{kind} {pixels.shape[1]} {pixels.shape[0]} 255\n".encode() + pixels.tobytes()
 
@@ -138,7 +134,7 @@ def _decoded_by_pyav(packets: Iterable[tuple[int, bytes]], form: str) -> Iterato
             raise ValueError(f"message {i + 1} of the video has {len(frames)} pictures: {_NEEDED}")
         if frames[0].width * frames[0].height > MAX_PICTURE_PIXELS:
             raise ValueError(f"pictures of {frames[0].width} x {frames[0].height}, which no camera makes")
-        yield t_ns, colour_file(frames[0].to_ndarray(format="rgb24"))
+        yield t_ns, _file(frames[0].to_ndarray(format="rgb24"))
 
 
 def is_video(start: bytes) -> bool:
@@ -193,6 +189,6 @@ def _decoded_pictures(name: str, count: int, of: str, needed: str) -> Iterator[b
                 )
             if i == count - 1 and video.grab():
                 raise ValueError(f"the video has more pictures than its {count} {of}")
-            yield colour_file(pixels[:, :, ::-1])
+            yield _file(pixels[:, :, ::-1])
     finally:
         video.release()

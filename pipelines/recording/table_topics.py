@@ -33,7 +33,7 @@ from alidade.pipelines.recording.table_values import (
     of_rate,
     unit_of,
 )
-from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns, table_form
+from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns
 from alidade.pipelines.recording.topics import Axes, along
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
@@ -122,7 +122,7 @@ class TableTopic(BaseModel):
         return [*stamps, *self.where, *(name for found in self._given.values() for name in found)]
 
     def to_series(
-        self, topic: str, path: Path, form: TableForm, columns: Mapping[str, NDArray[np.str_]]
+        self, topic: str, form: TableForm, columns: Mapping[str, NDArray[np.str_]]
     ) -> tuple[series.Topic, list[str]]:
         """The topic as a series, and sentences about what was concluded or left out.
 
@@ -130,11 +130,10 @@ class TableTopic(BaseModel):
 
         Args:
             topic: its name.
-            path: of the table.
-            form: of the table.
+            form: the table.
             columns: texts of its columns, `names` at least.
         """
-        given, notes = self._given, list[str]()
+        path, given, notes = form.path, self._given, list[str]()
         columns = {name: columns[name] for name in self.names}
         rows = self._rows(path, columns)
         columns = {name: column[rows] for name, column in columns.items()}
@@ -146,13 +145,13 @@ class TableTopic(BaseModel):
             t_ns, unit = of_rate(len(filled), self.rate or 1.0)[filled], "s"
         else:
             filled &= numbers_or_times(columns[self.time])
-            unit = self._time_unit(form, path, notes)
+            unit = self._time_unit(form, notes)
             t_ns = nanoseconds(path, columns[self.time][filled], unit)
         values = {name: one[filled] for name, one in values.items()}
         t_ns, values = _without_erased(path, t_ns, values, notes)
         if not self._is_slow and self.time is not None:
             check_steps(path, topic, t_ns, unit, SLOWEST_GYRO_S if self.gyro else SLOWEST_S)
-        scales = {name: self._scale(name, form, path, notes) for name in values}
+        scales = {name: self._scale(name, form, notes) for name in values}
         values = {
             name: (along(self.axes, one) if name in _VECTORS else one) * scales[name] for name, one in values.items()
         }
@@ -194,24 +193,24 @@ class TableTopic(BaseModel):
         value = getattr(self, name)
         return [value] if isinstance(value, str) else list(value.values() if isinstance(value, dict) else value)
 
-    def _time_unit(self, form: TableForm, path: Path, notes: list[str]) -> str:
+    def _time_unit(self, form: TableForm, notes: list[str]) -> str:
         """Unit of time by the config, else by the header, else s."""
-        stated = "" if self.time is None else form.units[form.index(path, self.time)]
+        stated = "" if self.time is None else form.units[form.index(self.time)]
         if self.unit is not None or stated not in TIME_UNITS:
             return self.unit or "s"
         if stated != "s":
-            notes.append(f"{path.name}: {self.time} is in {stated} by its header")
+            notes.append(f"{form.path.name}: {self.time} is in {stated} by its header")
         return stated
 
-    def _scale(self, name: str, form: TableForm, path: Path, notes: list[str]) -> float:
+    def _scale(self, name: str, form: TableForm, notes: list[str]) -> float:
         """SI of the unit that the config says, else the header of all its columns, else 1."""
         if name in self.units:
             return UNITS[self.units[name]]
-        stated = {unit_of(name, form.units[form.index(path, column)]) for column in self._columns(name)}
+        stated = {unit_of(name, form.units[form.index(column)]) for column in self._columns(name)}
         (unit,) = stated if len(stated) == 1 else ("",)
         if unit not in UNITS or not _measures(name, unit) or UNITS[unit] == 1.0:
             return 1.0
-        notes.append(f"{path.name}: {name} is in {unit} by its header")
+        notes.append(f"{form.path.name}: {name} is in {unit} by its header")
         return UNITS[unit]
 
 
@@ -273,12 +272,11 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
     of: dict[str, dict[str, series.Topic]] = {}
     notes: list[str] = []
     for name, topics in by_file.items():
-        path, data = tables[name].path, tables[name].data
-        form = table_form(path, data)
+        form = tables[name].form
         needed = dict.fromkeys(column for table in topics.values() for column in table.names)
-        texts, left_out = read_columns(path, data, form, list(needed))
+        texts, left_out = read_columns(form, list(needed))
         notes += left_out
-        found = {topic: table.to_series(topic, path, form, texts) for topic, table in topics.items()}
+        found = {topic: table.to_series(topic, form, texts) for topic, table in topics.items()}
         of[name] = {topic: made for topic, (made, _) in found.items()}
         notes += [note for _, concluded in found.values() for note in concluded]
     whole = _with_topics(container, of)

@@ -46,9 +46,11 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|
 
 @dataclass(frozen=True)
 class TableForm:
-    """Format of a table: encoding, delimiter, decimal mark, columns.
+    """A table in a text file, by its format: encoding, delimiter, decimal mark, columns.
 
     Attributes:
+        path: as it was named.
+        data: the file to read.
         encoding: of its text.
         delimiter: between cells; a blank stands for one or more.
         decimal: mark of a fraction, a point or a comma.
@@ -59,6 +61,8 @@ class TableForm:
         preamble: what stands ahead of the header.
     """
 
+    path: Path
+    data: Path
     encoding: str
     delimiter: str
     decimal: str
@@ -68,17 +72,17 @@ class TableForm:
     width: int
     preamble: tuple[str, ...]
 
-    def index(self, path: Path, name: str) -> int:
+    def index(self, name: str) -> int:
         """Number of the column of a name, or of `column 3`. Raises InputError where none or several have it."""
         found = [i for i, one in enumerate(self.names) if one == name]
         numbered = re.fullmatch(r"column (\d+)", name)
         if not found and numbered and 0 < int(numbered[1]) <= len(self.names):
             found = [int(numbered[1]) - 1]
         if not found:
-            raise InputError(f"{path}: no column {name}; the columns are {', '.join(self.names)}")
+            raise InputError(f"{self.path}: no column {name}; the columns are {', '.join(self.names)}")
         if len(found) > 1:
             places = " and ".join(f"`column {i + 1}`" for i in found)
-            raise InputError(f"{path}: {len(found)} columns are called {name}; name one of them as {places}")
+            raise InputError(f"{self.path}: {len(found)} columns are called {name}; name one of them as {places}")
         return found[0]
 
 
@@ -93,14 +97,19 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
     if not form.width:
         # A file that grows may still have one.
         raise InputError(str(_unknown(path, ": no line of numbers in it")))
-    if (poses := _trajectory(path, data, form)) is not None:
+    if (poses := _trajectory(form)) is not None:
         return ArrayContainer(path, {"/trajectory": poses})
-    columns = ", ".join(form.names[:40])
-    return CsvFile(path, {}, [f"a table with the columns {columns}; `columns:` in the config says which is what"], data)
+    return CsvFile(form)
 
 
 class CsvFile(ArrayContainer):
     """A table; without topics until `table_topics.described` says which column is what."""
+
+    def __init__(self, form: TableForm) -> None:
+        columns = ", ".join(form.names[:40])
+        assumed = f"a table with the columns {columns}; `columns:` in the config says which is what"
+        super().__init__(form.path, {}, [assumed], form.data)
+        self.form = form
 
 
 def _unknown(path: Path, why: str = "") -> NotARecordingError:
@@ -145,6 +154,8 @@ def table_form(path: Path, data: Path) -> TableForm:
     stated = [unit_named(cell) for cell in _cells(lines[units], delimiter)] if units is not None else []
     stated += [""] * (len(names) - len(stated))
     return TableForm(
+        path,
+        data,
         encoding,
         delimiter,
         decimal,
@@ -166,9 +177,7 @@ def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:
         )
 
 
-def read_columns(
-    path: Path, data: Path, form: TableForm, names: Sequence[str]
-) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+def read_columns(form: TableForm, names: Sequence[str]) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
     """The named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
@@ -177,8 +186,7 @@ def read_columns(
     Raises:
         InputError: a column is missing, or more rows are too short; the first of them is named.
     """
-    wanted = [form.index(path, name) for name in names]
-    rows, notes = _whole_rows(path, data, form, wanted)
+    rows, notes = _whole_rows(form, [form.index(name) for name in names])
     table = np.array(rows, dtype=np.str_).reshape(len(rows), len(names))
     if form.decimal == ",":
         table = np.char.replace(table, ",", ".")
@@ -209,12 +217,12 @@ def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
     return ~np.isin(np.char.lower(texts), list(_ABSENT))
 
 
-def _whole_rows(path: Path, data: Path, form: TableForm, wanted: Sequence[int]) -> tuple[list[list[str]], list[str]]:
+def _whole_rows(form: TableForm, wanted: Sequence[int]) -> tuple[list[list[str]], list[str]]:
     """The wanted cells of each row, and sentences about rows that are left out; see `read_columns`."""
     rows: list[list[str]] = []
     cut: list[tuple[int, int]] = []
     headers, needed = 1, max(form.width, *(i + 1 for i in wanted))
-    for number, row in _rows(path, data, form):
+    for number, row in _rows(form):
         if len(row) < needed:
             cut.append((number, len(row)))
         elif row[: len(form.names)] == list(form.names[: len(row)]):
@@ -223,10 +231,10 @@ def _whole_rows(path: Path, data: Path, form: TableForm, wanted: Sequence[int]) 
             rows.append([row[i] for i in wanted])
     if len(cut) > max(1, _MOST_CUT * len(rows)):
         number, width = cut[0]
-        raise InputError(f"{path}: line {number} has {width} columns instead of {needed}")
-    notes = [f"{path.name}: rows cut short, the first in line {cut[0][0]}: {len(cut)} left out"] if cut else []
+        raise InputError(f"{form.path}: line {number} has {width} columns instead of {needed}")
+    notes = [f"{form.path.name}: rows cut short, the first in line {cut[0][0]}: {len(cut)} left out"] if cut else []
     if headers > 1:
-        notes.append(f"{path.name}: its header is there {headers} times, as of a logger that was started again")
+        notes.append(f"{form.path.name}: its header is there {headers} times, as of a logger that was started again")
     return rows, notes
 
 
@@ -284,9 +292,9 @@ def _are_units(cells: Sequence[str]) -> bool:
     return bool(filled) and all(unit_named(cell) for cell in filled)
 
 
-def _rows(path: Path, data: Path, form: TableForm) -> Iterator[tuple[int, list[str]]]:
+def _rows(form: TableForm) -> Iterator[tuple[int, list[str]]]:
     """Number of the line and stripped cells of each row; blank lines and comments are none."""
-    with data.open(encoding=form.encoding, errors="replace", newline=None) as stream:
+    with form.data.open(encoding=form.encoding, errors="replace", newline=None) as stream:
         for _ in range(form.first):
             stream.readline()
         reader = csv.reader(stream, delimiter=form.delimiter, skipinitialspace=True)
@@ -298,7 +306,7 @@ def _rows(path: Path, data: Path, form: TableForm) -> Iterator[tuple[int, list[s
                 if any(cells) and not cells[0].startswith(_COMMENTS):
                     yield form.first + reader.line_num, cells
         except csv.Error as error:
-            raise InputError(f"{path}: line {form.first + reader.line_num}: no table ({error})") from error
+            raise InputError(f"{form.path}: line {form.first + reader.line_num}: no table ({error})") from error
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
@@ -333,19 +341,17 @@ def _is_value(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None or _CLOCK.fullmatch(cell) is not None
 
 
-def _trajectory(path: Path, data: Path, form: TableForm) -> series.PoseSeries | None:
+def _trajectory(form: TableForm) -> series.PoseSeries | None:
     """A trajectory in TUM's form: eight columns by blanks, the last four a unit quaternion; None for other tables."""
     if form.delimiter != " " or len(form.names) != len(_TUM):
         return None
-    _, first = next(_rows(path, data, form), (0, []))
+    _, first = next(_rows(form), (0, []))
     try:
         if len(first) != len(_TUM) or not abs(float(np.linalg.norm([float(x) for x in first[4:]])) - 1.0) < 0.01:
             return None
     except ValueError:
         return None
-    rows, _ = _whole_rows(path, data, form, range(len(_TUM)))
+    rows, _ = _whole_rows(form, range(len(_TUM)))
     columns: dict[str, Any] = dict(zip(_TUM, np.array(rows, dtype=np.str_).T, strict=True))
-    xyzw = numbers(path, columns, _TUM[4:])
-    return series.PoseSeries(
-        nanoseconds(path, columns["t"], "s"), xyzw[:, [3, 0, 1, 2]], numbers(path, columns, _TUM[1:4])
-    )
+    position, xyzw = (numbers(form.path, columns, names) for names in (_TUM[1:4], _TUM[4:]))
+    return series.PoseSeries(nanoseconds(form.path, columns["t"], "s"), xyzw[:, [3, 0, 1, 2]], position)
