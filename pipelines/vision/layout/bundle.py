@@ -12,9 +12,11 @@ the body moves in each picture, for shutters that roll, follows from its poses i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from alidade.factors import so3
 from alidade.factors.array import Array
@@ -167,14 +169,16 @@ def normal_equations(
 ) -> Normal:
     """Normal equations of weighted errors; tag number `fixed` stays, Levenberg's damping is relative."""
     f = len(bundle.cRb)
-    own, gradient, At = of_pictures(sights, rows, weights, f)
-    J = shared_rows(bundle, sights, rows, additional)
-    free = np.concatenate([np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6), additional.free])[: J.shape[2]]
-    J = J[..., free]
-    across = sights.by_picture(At @ J, f)
-    flat, weighted = J.reshape(-1, J.shape[2]), (weights[:, None, None] * J).reshape(-1, J.shape[2])
-    information, vector = weighted.T @ flat, weighted.T @ rows.miss.ravel()
-    priors = np.arange(J.shape[2] - additional.free.sum(), J.shape[2])
+    own, gradient = of_pictures(sights, rows, weights, f)
+    A, J = _blocks(rows.by_picture, sights.picture, f), _blocks(rows.by_tag, sights.tag, len(bundle.body.ids))
+    if additional.free.any():
+        J = sparse.hstack([J, additional.rows(bundle, sights, rows).reshape(J.shape[0], -1)], "csr")
+    free = np.concatenate([np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6), additional.free])[: J.shape[1]]
+    J = J[:, free]
+    weighted = sparse.diags_array(np.repeat(weights, 8)) @ J
+    information, vector = (J.T @ weighted).toarray(), weighted.T @ rows.miss.ravel()
+    across = (A.T @ weighted).toarray().reshape(f, 6, -1)
+    priors = np.arange(J.shape[1] - additional.free.sum(), J.shape[1])
     precision = additional.sigma[additional.free] ** -2.0
     information[priors, priors] += precision
     vector[priors] += precision * additional.off(bundle)[additional.free]
@@ -191,11 +195,17 @@ def normal_equations(
     return Normal(free, np.asarray(information, dtype=float), vector, across, inverse, gradient)
 
 
-def of_pictures(sights: Sights, rows: Rows, weights: Array, f: int) -> tuple[Array, Array, Array]:
-    """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses, and the weighted Jacobians' transposes."""
+def _blocks(values: Array, columns: Index, count: int) -> Any:
+    """Sparse matrix (8 m, 6 count) of a Jacobian (m, 8, 6) by the pose of the picture or the tag of each sight."""
+    m = len(values)
+    return sparse.bsr_array((values, columns, np.arange(m + 1)), shape=(8 * m, 6 * count)).tocsr()
+
+
+def of_pictures(sights: Sights, rows: Rows, weights: Array, f: int) -> tuple[Array, Array]:
+    """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses."""
     At = np.swapaxes(rows.by_picture, 1, 2) * weights[:, None, None]
     gradient = sights.by_picture((At @ rows.miss[..., None])[..., 0], f)
-    return sights.by_picture(At @ rows.by_picture, f), gradient, At
+    return sights.by_picture(At @ rows.by_picture, f), gradient
 
 
 def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional) -> Bundle:
@@ -271,7 +281,7 @@ def refined_pictures(
     f = len(bundle.cRb)
     rows = linearized(bundle, sights)
     cost, damping = _costs(rows, sights, far, f), np.full(f, 1e-3)
-    own, gradient, _ = of_pictures(sights, rows, weights(rows, far), f)
+    own, gradient = of_pictures(sights, rows, weights(rows, far), f)
     going = own[:, 0, 0] > 0.0
     for _ in range(steps):
         seen = sights[going[sights.picture]]
@@ -294,7 +304,7 @@ def refined_pictures(
             cRb=np.where(better[:, None], after.cRb, bundle.cRb),
             position=np.where(better[:, None], after.position, bundle.position),
         )
-        new, slope, _ = of_pictures(seen, there, weights(there, far), f)
+        new, slope = of_pictures(seen, there, weights(there, far), f)
         own[better], gradient[better] = new[better], slope[better]
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         going &= np.abs(cost - now) > _STEADY * cost
