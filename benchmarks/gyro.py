@@ -44,7 +44,7 @@ def run() -> Iterator[Ratio]:
         values.insert(KEYS[k], so3.to_gtsam(attitude))
     for key, size in [(BIAS, 3), (ERRORS, 15)]:
         values.insert(key, np.zeros(size))
-    model = GyroIncrementFactor(edges[1:], turns, path, np.full(WINDOWS, 1e-5))
+    model = GyroIncrementFactor(edges[1:], turns, path, np.full(WINDOWS, 1e-5), errors=15)
     factor = Factor.process_of("gyro", model.on(KEYS[:-1], KEYS[1:], BIAS, ERRORS))
     layout, ours = Layout.of(ChainLayout("x"), values)
     linearization = Linearization.of([factor], layout)

@@ -32,7 +32,7 @@ class VisionAttitudeFactor(Model):
     Predicted: cRh = cRb bRv(at) vRh with bRv(at) = dB(anchor, at)^T bRv(anchor) dV(anchor, at), the gyros' own samples
     carrying the attitude from the time of the variable to that of the picture. Blocks: bRv at the anchors (rotations),
     gyro bias (3), cRb, vRh (rotations), the pictures' errors (1 or 4) and, unless the gyros are perfect, the helmet
-    gyro's errors (6 to 18) and those of the platform's gyro (9), see alidade.factors.gyro. The pictures' errors are
+    gyro's errors (6 to 19) and those of the platform's gyro (9), see alidade.factors.gyro. The pictures' errors are
     time offset, s, positive when a picture was taken later than its stamp says; clock skew, at = stamp + time offset -
     skew * elapsed; angle scale, Log(first^T cRh) is measured 1 + scale times as large; filter, s^2, half the difference
     of the second moments of both impulse responses, vision's less the gyro's, which adds Exp(filter * acceleration) to

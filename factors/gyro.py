@@ -3,9 +3,10 @@
 S is symmetric, scale errors on its diagonal and half the angle errors between two axes off it; what else a 3x3 matrix
 could hold is a rotation, which is the mounting's. f are the drivers: the specific force that the accelerometer of the
 same IMU measures, in the same frame, where D holds the g-sensitivity G, rad/s per m/s^2; the temperature above that at
-which the bias is the bias, where D holds the slope c, rad/s/K; or one after the other, D = [G c]. As a variable,
-`errors`, they are 6 numbers of S, xx yy zz xy xz yz, then 9 of G by rows, row for the gyro's axis, column for the
-force's, then 3 of c, as far as there are such drivers: 6, 9, 15 or 18 numbers.
+which the bias is the bias, where D holds the slope c, rad/s/K; the sides, -1 or 1, on which readings are beyond a dead
+band, 0 within, where D is -band on its diagonal, what the gyro subtracts from the size of its rates; or one after the
+other, D = [G c -band I]. As a variable, `errors`, they are 6 numbers of S, xx yy zz xy xz yz, then 9 of G by rows, row
+for the gyro's axis, column for the force's, 3 of c and the band, as far as there are such drivers: 6 to 19 numbers.
 
 The rate from a reading m is w = N (m - D f - bias) with N = (I + S)^-1, linear in N, N D and N bias. So is the rotation
 vector by which an increment, once integrated, has to be turned further, but for a twelfth of its square times the angle
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -26,13 +28,11 @@ from alidade.factors import so3
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
 
-# Derivatives by bias (n, 3, 3) and, where they are variables, by errors (n, 3, 6 to 18).
+# Derivatives by bias (n, 3, 3) and, where they are variables, by errors (n, 3, 6 to 19).
 Derivatives = Callable[[], tuple[Array, ...]]
 
 # Numbers of S, and of a platform's gyro: its bias and S.
 SCALE, PLATFORM = 6, 9
-# Where the numbers of G and then of c are among those of [G c] by rows.
-_G_THEN_C = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11])
 _ROW, _COLUMN = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 
 
@@ -50,7 +50,7 @@ def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tup
     Args:
         turns: n increments, with their scale_jacobian if there are errors and their driver_jacobian if D is among them.
         bias_error: (n, 3), the bias beyond what was taken off the rates.
-        errors: (n, 6 to 18); None for a perfect gyro.
+        errors: (n, 6 to 19); None for a perfect gyro.
     """
     if errors is None:
         phi = _apply(turns.bias_jacobian, bias_error)
@@ -73,16 +73,9 @@ def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tup
             return by_bias, by_symmetric(by_scale)
         by_d = N[:, None] @ (to_end @ needed(turns.driver_jacobian)).reshape(len(by_bias), 3, 3, -1)
         by_scale -= by_d @ np.swapaxes(d_off, 1, 2)[:, None]
-        return by_bias, np.concatenate([by_symmetric(by_scale), _by_driven(by_d)], axis=2)
+        return by_bias, np.concatenate([by_symmetric(by_scale), _by_driven(by_d, errors)], axis=2)
 
     return so3.multiply(turns.wxyz, so3.exp(phi)), derivatives
-
-
-def errors_block(turns: Increments) -> int:
-    """Numbers of the errors that increments have derivatives by; 0 for a perfect gyro."""
-    if turns.scale_jacobian is None:
-        return 0
-    return SCALE if turns.driver_jacobian is None else SCALE + turns.driver_jacobian.shape[2]
 
 
 def error_blocks(own: int, platform: bool) -> tuple[int, ...]:
@@ -119,7 +112,7 @@ def carried(
         start, stop: (n,) the windows' ends, s.
         middle: (n,) s, where the errors are evaluated; does not move with the windows' ends.
         bias: (n, 3) rad/s.
-        errors: (n, 6 to 18); None for a perfect gyro.
+        errors: (n, 6 to 19); None for a perfect gyro.
 
     Returns:
         The increments (n, 4), the true rate at their ends (n, 3) in the turned frame, and how bias and errors turn
@@ -148,7 +141,7 @@ class GyroIncrementFactor(Model):
 
     Equal to gtsam's AHRSFactor where the errors are zero. On a platform that turns and has a gyro of its own the
     attitudes are those on the platform: bRm_j = dB(platform)^T bRm_i dV. Blocks: attitudes i and j (rotations), gyro
-    bias (3, rad/s); unless all are perfect, errors (6 to 18) and, on a platform, its gyro's bias and S (3 + 6).
+    bias (3, rad/s); unless all are perfect, errors (6 to 19) and, on a platform, its gyro's bias and S (3 + 6).
 
     The residual is in the units in which noise is white, those of what the sensors read: (I + S) Log(predicted^T j).
     In true units a larger S would shrink the noise, which pays for nothing in the cost. Of two gyros each contributes
@@ -161,6 +154,7 @@ class GyroIncrementFactor(Model):
         sigma: (n,) rad per axis of each increment, both gyros together.
         platform_turns, platform: the same of the platform's gyro; None where the attitudes are inertial.
         share: of the increments' variance that is the gyro's own; the rest is the platform's.
+        errors: numbers of the gyro's errors, 0 for a perfect one.
     """
 
     time: Array
@@ -170,19 +164,20 @@ class GyroIncrementFactor(Model):
     platform_turns: Increments | None = None
     platform: GyroPath | None = None
     share: float = 1.0
+    errors: int = 0
     shapes: ClassVar = {"sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "turns", "sigma", "platform_turns")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitudes, bias and, where the increments have derivatives by them, errors and those of the platform."""
+        """Attitudes, bias and, where they are variables, errors and those of the platform."""
         platform = self.platform_turns is not None and self.platform_turns.scale_jacobian is not None
-        return ROT3, ROT3, 3, *error_blocks(errors_block(self.turns), platform)
+        return ROT3, ROT3, 3, *error_blocks(self.errors, platform)
 
     def __call__(self, i: Array, j: Array, bias: Array, *of_gyros: Array) -> Residuals:
         """Residual (I + S) Log(predicted_j^T j) / sigma, (n, 3)."""
-        errors, platform = parted(of_gyros, errors_block(self.turns) > 0)
+        errors, platform = parted(of_gyros, self.errors > 0)
         dV, by_gyro = corrected(self.turns, bias - self.gyro.bias_hat, errors)
         predicted = so3.multiply(i, dV)
         by_dB: Derivatives = tuple
@@ -265,7 +260,7 @@ def rate_error(
 
     Args:
         bias_error: (n, 3), the bias beyond what was taken off the rates.
-        errors: (n, 6 to 18); None for a perfect gyro.
+        errors: (n, 6 to 19); None for a perfect gyro.
         rate: (n, 3) as read.
         drivers: (n, d), needed where D is among the errors.
     """
@@ -282,7 +277,8 @@ def rate_error(
         by_errors = by_symmetric(N[..., None] * (rate - excess)[:, None, None])
         if D is None:
             return N, by_errors
-        return N, np.concatenate([by_errors, _by_driven(N[..., None] * needed(drivers)[:, None, None])], axis=2)
+        by_d = N[..., None] * needed(drivers)[:, None, None]
+        return N, np.concatenate([by_errors, _by_driven(by_d, errors)], axis=2)
 
     return excess, derivatives
 
@@ -297,17 +293,29 @@ def _inverse(errors: Array) -> tuple[Array, Array, Array]:
 def _driven(errors: Array) -> Array | None:
     """D, (n or 1, 3, d), if it is among the errors."""
     numbers = _distinct(errors)[:, SCALE:]
-    if not numbers.shape[1]:
-        return None
-    if numbers.shape[1] == len(_G_THEN_C):
-        numbers = numbers[:, np.argsort(_G_THEN_C)]
-    return numbers.reshape(len(numbers), 3, -1)
+    count = numbers.shape[1]
+    return (numbers @ _entries(count).T).reshape(len(numbers), 3, -1) if count else None
 
 
-def _by_driven(by_entry: Array) -> Array:
-    """Derivatives by the entries of D, (n, 3, 3, d), to those by its numbers, (n, 3, 3 d)."""
-    flat = by_entry.reshape(len(by_entry), 3, -1)
-    return flat[..., _G_THEN_C] if flat.shape[2] == len(_G_THEN_C) else flat
+def _by_driven(by_entry: Array, errors: Array) -> Array:
+    """Derivatives by the entries of D, (n, 3, 3, d), to those by its numbers among the errors."""
+    entries = _entries(errors.shape[1] - SCALE)
+    return np.asarray(by_entry.reshape(-1, len(entries)) @ entries).reshape(len(by_entry), 3, -1)
+
+
+@cache
+def _entries(numbers: int) -> Array:
+    """What each number of D adds to its entries by rows, (3 d, numbers): 9 of G, 3 of c, 1 of a dead band."""
+    parts = [np.eye(9).reshape(3, 3, 9)] if numbers >= 9 else []
+    parts += [np.eye(3)[:, None]] if numbers // 3 in (1, 4) else []
+    parts += [-np.eye(3)[..., None]] if numbers % 3 == 1 else []
+    columns, rows = (sum(part.shape[axis] for part in parts) for axis in (1, 2))
+    out, row, column = np.zeros((3, columns, rows)), 0, 0
+    for part in parts:
+        d, n = part.shape[1:]
+        out[:, column : column + d, row : row + n] = part
+        row, column = row + n, column + d
+    return out.reshape(-1, rows)
 
 
 def _distinct(rows: Array) -> Array:

@@ -87,7 +87,7 @@ class LosDirectionFactor(Model):
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
     picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with
-    `context` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 to 18), see
+    `context` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 to 19), see
     alidade.factors.gyro. With those errors
 
     - a picture was exposed at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay

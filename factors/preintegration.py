@@ -84,6 +84,8 @@ class GyroPath:
             accelerometer of the same IMU, in the same frame, m/s^2, its temperature above some other, K, or both.
         density: of the rates' white noise, rad/s/sqrt(Hz): changes of the rate beyond it add to `Increments.unseen`
             what a slow gyro misses; None: gaps alone do.
+        hidden: (N,) density of what each sample does not show, as within a dead band, rad/s/sqrt(Hz): adds to
+            `Increments.unseen`; None: nothing.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class GyroPath:
         bias_hat: ArrayLike = (0.0, 0.0, 0.0),
         drivers: ArrayLike | None = None,
         density: float | None = None,
+        hidden: Array | None = None,
     ) -> None:
         self.t = np.asarray(t, dtype=float)
         self.bias_hat = np.asarray(bias_hat, dtype=float)
@@ -103,7 +106,8 @@ class GyroPath:
         if self._driving.ndim != 2 or len(self._driving) != len(self.read):
             raise ValueError(f"needs drivers for each rate; got {self._driving.shape} and {self.read.shape}")
         self._density = density
-        self._unseen = _unseen_variance(self.t, self.read, density)
+        self._hidden = hidden
+        self._unseen = _unseen_variance(self.t, self.read, density, hidden)
         self.interval = float(np.median(np.diff(self.t)))
         self._last = (len(self.t) - 2) // _BLOCK
         self._kept: dict[int, _Block] = {}
@@ -114,7 +118,7 @@ class GyroPath:
 
     def with_rate(self, rate: Array) -> GyroPath:
         """The same stream with other rates (N, 3), rad/s."""
-        return GyroPath(self.t, rate, self.bias_hat, self._driving, self._density)
+        return GyroPath(self.t, rate, self.bias_hat, self._driving, self._density, self._hidden)
 
     def _block(self, number: int) -> _Block:
         """The integrated block of sample intervals with this number."""
@@ -337,8 +341,8 @@ def trapezoid_excess(t: Array, mean: Array) -> Array:
     return excess
 
 
-def _unseen_variance(t: Array, mean: Array, density: float | None) -> tuple[Array, Array]:
-    """Cumulative variance of the interpolation between samples, rad^2 per axis, (m,), at times (m,), s; times first.
+def _unseen_variance(t: Array, mean: Array, density: float | None, hidden: Array | None) -> tuple[Array, Array]:
+    """Cumulative variance of what samples do not show, rad^2 per axis, (m,), at times (m,), s; times first.
 
     Between these times it grows in proportion to time; there are none but the ends of intervals that have any. In gaps
     a line over T is off by T^3 w'' / 12, w'' as large as between samples; but never by more than T times the spread of
@@ -357,6 +361,8 @@ def _unseen_variance(t: Array, mean: Array, density: float | None) -> tuple[Arra
         rms = float(np.sqrt(square / count)) if count else np.inf
         spread = float(np.sqrt(mean.var(axis=0).mean()))
         variance[gap] = np.minimum(step[gap] * spread, step[gap] ** 3 * rms / 12.0) ** 2
+    if hidden is not None:
+        variance = variance + 0.5 * step * (hidden[1:] ** 2 + hidden[:-1] ** 2)
     found = np.flatnonzero(variance)
     if not len(found):
         return t[:1], np.zeros(1)

@@ -35,7 +35,7 @@ class FieldFactor(Model):
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), gyro filter (1), triad (12), strength s (1), dip (1;
     rad, the field's inclination, positive down), delay (1; s by which a reading was taken later than its stamp says),
-    unless the gyro is perfect its errors (6 to 18), see alidade.factors.gyro, and, where it is unknown, the earth's
+    unless the gyro is perfect its errors (6 to 19), see alidade.factors.gyro, and, where it is unknown, the earth's
     rate (3).
 
     Attributes:
@@ -122,7 +122,7 @@ class UpFactor(Model):
     """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b + drift).
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), gyro filter (1), triad (12), strength s (1), unless
-    the gyro is perfect its errors (6 to 18), of a sensor that is swung about a point arm (3; in b, from there to the
+    the gyro is perfect its errors (6 to 19), of a sensor that is swung about a point arm (3; in b, from there to the
     sensor), what drivers of its offset do (m; see `ellipsoid.drifted`) and, where it is unknown, the earth's rate (3).
 
     Attributes:

@@ -139,6 +139,7 @@ class GyroSheet(Sheet):
     g_sensitivity: SigmaOrZero | None = None  # rad/s per m/s^2
     filter: SigmaOrZero | None = None  # s^2, half the second moment of its impulse response, beyond a sample interval's
     temperature: SigmaOrZero | None = None  # rad/s/K, slope of the bias
+    dead_band: SigmaOrZero | None = None  # rad/s, what a gyro with one subtracts from the size of its rates
 
 
 class PlatformGyroSheet(Sheet):

@@ -223,8 +223,9 @@ class GyroChain:
         states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
         bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
         carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
+        errors = 0 if self.errors is None else len(self.errors.quantities)
         model = GyroIncrementFactor(
-            self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform, self.share
+            self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform, self.share, errors
         )
         turned = np.linalg.norm(so3.log(turns.wxyz), axis=1)
         beside, fixed = turned / np.sqrt(turns.duration * variance), self.unseen[after - 1] / variance

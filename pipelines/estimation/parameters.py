@@ -149,6 +149,10 @@ def temperature_slope(sensor: str, unit: str, sigma: float) -> ParameterSpec:
     )
 
 
+# Half a degree a second, what devices clear of the noise at rest.
+DEAD_BAND = scalar(
+    "gyro_dead_band", "rad/s", 1e-2, "Dead band that the gyro subtracts from its rates.", "gyro.dead_band"
+)
 CLOCK_SKEW = scalar("clock_skew", "", 1e-4, "Clock skew, camera against gyro.", "clock.skew", per_recording=True)
 
 

@@ -35,15 +35,21 @@ _LESS = 0.5
 # Largest plausible sigmas of a sample, SI: of a gyro, of an accelerometer (gravity), of a
 # magnetometer (twice the earth's field) and of an attitude (a radian).
 MOST_SIGMA = {"gyro": 0.5, "accel": 9.8, "mag": 1e-4, "attitude": 1.0}
+DEAD_BAND = (
+    "The gyro has a dead band: at small rates it reads one value. Its offset is known from the turns alone, and "
+    "gyro_dead_band is what it subtracts from larger rates: add it to the size of readings before the formula, or "
+    "switch the dead band off in the device and record again."
+)
 HELD = ": repeats the reading before, used once"
 _MAX_NUMBER = 1e100
 # A topic holds readings where more than this share of the rows repeats the row before; least number of rows tested.
 _HELD, _MIN_HELD = 0.4, 100
-# A dead band has at least so many samples at its value, and so many times those at both values next to it: without one
-# noise of half a step makes it twice them.
-_LEAST_WITHIN, _ALONE = 20, 10.0
-# Its half width is more than so many of the device's steps: those between neighbouring values where readings are dense.
+# The half width of a dead band is more than so many of the device's steps: those between neighbouring values where
+# readings are dense.
 _FEWEST_STEPS, _DENSE = 2.0, 0.1
+# It has at least so many samples at its value, and so many times those at both values next to it: passed evenly, a half
+# width of n steps has 2 n + 1 times those at one of them. Without one noise of half a step makes it twice them.
+_LEAST_WITHIN, _ALONE = 20, _FEWEST_STEPS + 0.5
 # Readings pass through a dead band in less than this, s, as fast as so many samples before and after.
 _PASSING_S, _ASIDE = 0.25, 5
 
@@ -192,6 +198,9 @@ def dead_band(t: Array, values: Array) -> tuple[float, Array]:
         t: (N,) s.
         values: in any unit.
     """
+    # Conversions of units leave rounding of doubles, which makes many values of one.
+    largest = max(float(np.abs(values).max()), np.finfo(float).tiny)
+    values = largest * np.round(values / largest, 12)
     found = [value for column in values.T if (value := _one_value(column)) is not None]
     side = np.sign(values - np.median(found)) if found else np.zeros_like(values)
     passed = np.concatenate([_passed(t, *columns) for columns in zip(values.T, side.T, strict=True)])

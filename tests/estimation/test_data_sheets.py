@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.parameters import ParameterSpec
+from alidade.pipelines.estimation.parameters import DEAD_BAND, ParameterSpec
 from alidade.pipelines.methods.cube.parameters import NUISANCE as CUBE
 from alidade.pipelines.methods.head.parameters import NUISANCE as HEAD
 from alidade.pipelines.methods.indexer.parameters import NUISANCE as INDEXER
@@ -28,8 +28,8 @@ ASSUMED: dict[str, Sequence[ParameterSpec]] = {
     "los": LOS,
     "head": HEAD,
     "indexer": INDEXER,
-    "cube": (*CUBE, FIELD),
-    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD, ACCEL_SQUARE),
+    "cube": (*CUBE, FIELD, DEAD_BAND),
+    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD, ACCEL_SQUARE, DEAD_BAND),
 }
 DEFAULTS = {
     (method, f"{each.sheet}.{each.figure}"): each.prior for method, assumed in ASSUMED.items() for each in assumed

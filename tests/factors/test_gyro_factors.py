@@ -1,4 +1,4 @@
-"""The gyro chain, measured = (I + S) w + G f + c (T - T0) + bias: against integrating again, differences, and gtsam."""
+"""The gyro chain, (I + S) w + G f + c (T - T0) - band + bias: against integrating again, differences, and gtsam."""
 
 from __future__ import annotations
 
@@ -23,8 +23,20 @@ RATE = 2.0 * np.sin(2.0 * np.pi * np.array([0.5, 0.8, 0.6]) * T[:, None] + np.ar
 FORCE = np.stack([3.0 * np.sin(T), 2.0 * np.cos(1.3 * T), 9.8 + np.sin(2.0 * T)], axis=1)
 # K above the first.
 WARMTH = 5.0 * (1.0 - np.exp(-T / 8.0)) + 0.3 * np.sin(0.9 * T)
+# The sides on which rates are beyond a dead band.
+BEYOND = np.sign(RATE) * (np.abs(RATE) > 0.5)
 # What moves the gyro's readings, by how many numbers its errors are.
-DRIVERS = {0: None, 6: None, 9: WARMTH[:, None], 15: FORCE, 18: np.column_stack([FORCE, WARMTH])}
+DRIVERS = {
+    0: None,
+    6: None,
+    7: BEYOND,
+    9: WARMTH[:, None],
+    10: np.column_stack([WARMTH, BEYOND]),
+    15: FORCE,
+    16: np.column_stack([FORCE, BEYOND]),
+    18: np.column_stack([FORCE, WARMTH]),
+    19: np.column_stack([FORCE, WARMTH, BEYOND]),
+}
 BIAS, BIAS_HAT = np.array([0.01, -0.02, 0.015]), np.array([0.005, -0.01, 0.0])
 SCALE = np.array([1.0, -0.7, 0.4, -0.5, 0.8, 0.3])
 G = np.array([0.2, -0.9, 0.5, 1.0, 0.3, -0.6, 0.1, 0.7, -0.4])
@@ -109,10 +121,10 @@ def test_drivers_between_stamps() -> None:
 
 
 def _blocks(angle: float, size: float, errors: int, platform: bool = False) -> list[Array]:
-    """Random values for the factor's blocks, with `errors` numbers of S and G, of the given size."""
+    """Random values for the factor's blocks, with `errors` numbers of S and D, of the given size."""
     rng = np.random.default_rng(4)
     attitudes = [so3.exp(angle * rng.normal(size=(N, 3))) for _ in range(2)]
-    gyro = [BIAS_HAT + 0.02 * rng.normal(size=(N, 3)), size * rng.normal(size=(N, 18)) * ([1.0] * 6 + [0.03] * 12)]
+    gyro = [BIAS_HAT + 0.02 * rng.normal(size=(N, 3)), size * rng.normal(size=(N, 19)) * ([1.0] * 6 + [0.03] * 13)]
     base = [size * rng.normal(size=(N, 9))] if platform else []
     return [*attitudes, gyro[0], *([gyro[1][:, :errors]] if errors else []), *base]
 
@@ -131,11 +143,11 @@ def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> Gyro
     (turns, path), (base_turns, base) = _increments(errors, False), _increments(errors, True)
     stop, sigma = WINDOWS[1][rows], np.linspace(0.5, 2.0, N)[rows]
     if platform:
-        return GyroIncrementFactor(stop, turns[rows], path, sigma, base_turns[rows], base, share=0.4)
-    return GyroIncrementFactor(stop, turns[rows], path, sigma)
+        return GyroIncrementFactor(stop, turns[rows], path, sigma, base_turns[rows], base, share=0.4, errors=errors)
+    return GyroIncrementFactor(stop, turns[rows], path, sigma, errors=errors)
 
 
-CASES = [(errors, platform) for errors in (0, 6, 9, 15, 18) for platform in (False, True) if errors or not platform]
+CASES = [(errors, platform) for errors in DRIVERS for platform in (False, True) if errors or not platform]
 
 
 @pytest.mark.parametrize(("errors", "platform"), CASES)
@@ -157,7 +169,13 @@ def test_a_platform_of_known_errors() -> None:
     base = GyroPath(T, base_rate @ (np.eye(3) + symmetric(-scale)).T - BIAS)
     windows = START, START + 0.05
     model = GyroIncrementFactor(
-        windows[1], gyro.increments(*windows, scale=True), gyro, np.ones(N), base.increments(*windows, scale=True), base
+        windows[1],
+        gyro.increments(*windows, scale=True),
+        gyro,
+        np.ones(N),
+        base.increments(*windows, scale=True),
+        base,
+        errors=15,
     )
     turned, carrying = (GyroPath(T, rate).increments(*windows).wxyz for rate in (RATE, base_rate))
     i = so3.exp(np.random.default_rng(1).normal(size=(N, 3)))
@@ -205,6 +223,21 @@ def test_a_gyro_that_warms_up(errors: int) -> None:
     assert np.abs(so3.log(so3.multiply(so3.inverse(true), cold))).max() > 1e-4
 
 
+@pytest.mark.parametrize("errors", [7, 10, 16, 19])
+def test_gyro_that_subtracts_its_dead_band(errors: int) -> None:
+    """With what it subtracts added to the size of readings it tells the true rate."""
+    scale, band = 1e-2 * SCALE, 5e-3
+    others = np.zeros(errors - 7)
+    path = GyroPath(T, RATE @ (np.eye(3) + symmetric(scale)).T + BIAS - band * BEYOND, BIAS_HAT, DRIVERS[errors])
+    stop, bias = START + 0.05, np.tile(BIAS, (N, 1))
+    true = GyroPath(T, RATE).increments(START, stop).wxyz
+    turns = path.increments(START, stop, scale=True)
+    for subtracted, low, high in ((band, 0.0, 5e-7), (0.0, 1e-4, 1e-3)):
+        got, _ = corrected(turns, bias - BIAS_HAT, np.tile([*scale, *others, subtracted], (N, 1)))
+        off = np.abs(so3.log(so3.multiply(so3.inverse(true), got))).max()
+        assert low <= off < high
+
+
 def test_errors_as_variables_need_derivatives_by_them() -> None:
     path = GyroPath(T, RATE)
     turns = path.increments([1.0], [2.0])
@@ -228,7 +261,7 @@ def test_equals_the_native_factor_where_the_gyro_is_perfect() -> None:
     values.insert(errors, np.zeros(15))
     sigma = np.linspace(0.5, 2.0, N)
     keys = keys_i, keys_j, keys_bias
-    ours = GyroIncrementFactor(START + 0.1, turns, path, sigma).on(*keys, errors)
+    ours = GyroIncrementFactor(START + 0.1, turns, path, sigma, errors=15).on(*keys, errors)
     perfect = GyroIncrementFactor(START + 0.1, path.increments(START, START + 0.1), path, sigma).on(*keys)
     graph = gtsam.NonlinearFactorGraph()
     for factor in ahrs_factors(keys_i, keys_j, keys_bias, turns, BIAS_HAT, sigma**2):

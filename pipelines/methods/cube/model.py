@@ -64,7 +64,7 @@ from alidade.pipelines.methods.cube.reference import Reference, cube_reference, 
 from alidade.pipelines.methods.cube.static_poses import SeenTags, StaticPoses, static_poses, turn
 from alidade.pipelines.methods.cube.tags import layout_prior
 from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
-from alidade.pipelines.recording.plausibility import dead_band
+from alidade.pipelines.recording.plausibility import DEAD_BAND, dead_band
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -74,11 +74,6 @@ if TYPE_CHECKING:
 _NO_FIELD = (
     "The magnetometer is not calibrated, for the field is not known where nobody says where it was: give latitude_deg "
     "and longitude_deg in the config, or record /reference/fix."
-)
-_DEAD_BAND = (
-    "The gyro has a dead band: at small rates it reads one value. Its offset is known from the turns alone, and "
-    "gyro_dead_band is what it subtracts from larger rates: add it to the size of readings before K, or switch the "
-    "dead band off in the device and record again."
 )
 # Sigmas of priors as good as none, m on the cube's place in the camera and rad on an attitude that no gyro leads to:
 # these only make the new variables of a step determined without its measurements.
@@ -125,7 +120,7 @@ def _premises(model: Model) -> tuple[str, ...]:
     """Sentences about what the recording lacks."""
     lacking = {
         _NO_FIELD: model.poses.mag is not None and model.field is None,
-        _DEAD_BAND: model.parameters.dead_band is not None,
+        DEAD_BAND: model.dead_band > 0.0,
     }
     return tuple(sentence for sentence, lacks in lacking.items() if lacks)
 

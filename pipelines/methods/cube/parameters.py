@@ -14,6 +14,7 @@ from alidade.factors import so3
 from alidade.factors.triad import FieldPriorFactor, TriadPriorFactor, calibration, triad
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
+    DEAD_BAND,
     ParameterSpec,
     accel_square,
     check_parameters,
@@ -90,8 +91,6 @@ TILT = ParameterSpec(
     axes="en",
     per_recording=True,
 )
-# Of a gyro with a dead band, half a degree a second.
-DEAD_BAND = scalar("gyro_dead_band", "rad/s", 1e-2, "Dead band that the gyro subtracts from its rates.")
 # Errors of CameraInfo.
 FOCAL = scalar("camera_focal", "", 5e-3, "Relative correction of the focal length.", "camera.focal")
 CENTRE = ParameterSpec(
@@ -135,7 +134,7 @@ class Parameters:
         curvature: square and cube terms of the accelerometer, None where it has none.
         slopes: sensor -> what its offset does with its temperature, where that is known.
         lens: what the camera's focal length and centre are off by, None where they are exact.
-        dead_band: what the gyro subtracts from its rates, None where it has no dead band.
+        dead_band: what the gyro subtracts from its rates, None where it has no dead band, or a stated one.
     """
 
     triads: Mapping[str, Parameter]
@@ -266,7 +265,7 @@ def cube_parameters(
         curvature=parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
         lens=parameter(LENS_KEY, (FOCAL, CENTRE), config) if camera else None,
         slopes=_slopes(config) if thermometer else {},
-        dead_band=Parameter(DEAD_BAND_KEY, nuisance(DEAD_BAND)) if dead_band else None,
+        dead_band=parameter(DEAD_BAND_KEY, (DEAD_BAND,), config) if dead_band else None,
     )
 
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from alidade.pipelines.estimation.parameters import ParameterSpec, gyro_bias, scalar
+from alidade.pipelines.estimation.parameters import DEAD_BAND, ParameterSpec, gyro_bias, scalar
 from alidade.pipelines.methods import Method, deferred
 from alidade.pipelines.methods.triads import triad_specs
 from alidade.pipelines.methods.tumble import turning
@@ -32,6 +32,7 @@ PARAMETERS = (
     turning.SENSITIVITY,
     turning.DELAY,
     turning.FILTER,
+    DEAD_BAND,
     ParameterSpec("accel_arm", "m", 0.3, "Lever arm from the point of rotation to the accelerometer, {axis}."),
     ACCEL_SQUARE,
     *SLOPES,

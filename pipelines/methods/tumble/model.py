@@ -30,7 +30,7 @@ from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, NO_RATE, TumbleData
 from alidade.pipelines.methods.tumble.ring import ring
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
-from alidade.pipelines.recording.plausibility import SI, dead_band, likely_unit
+from alidade.pipelines.recording.plausibility import DEAD_BAND, SI, dead_band, likely_unit
 from alidade.pipelines.settings import Config
 
 # Plausible norms of readings with their offset, SI; others are counts.
@@ -79,10 +79,6 @@ _UPRIGHT = (
 _NOT_AS_FIELD = (
     "The gyro is not used: it does not turn as the field does; are its axes and clock right, and is the field the same "
     "everywhere the device was?"
-)
-_DEAD_BAND = (
-    "The gyro has a dead band: at small rates it reads one value. Its bias and scale may be off by more than their "
-    "sigmas; switch the dead band off in the device and record again."
 )
 _NEVER_TOGETHER = "The magnetometer has no reading during a rest: nothing ties its axes to the accelerometer's."
 _NEGATIVE_DIP = (
@@ -332,7 +328,7 @@ def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, l
         return None, [_NOT_AS_FIELD]
     notes = {
         _STRAIGHT: found.assumed and ring(sensors[-1].raw) is not None,
-        _DEAD_BAND: dead_band(data.gyro_t, data.gyro)[0] > 0.0,
+        DEAD_BAND: dead_band(data.gyro_t, data.gyro)[0] > 0.0,
     }
     return found, [note for note, holds in notes.items() if holds]
 

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors.ellipsoid import entries
-from alidade.pipelines.estimation.parameters import quantities
+from alidade.pipelines.estimation.parameters import DEAD_BAND, quantities
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 from alidade.pipelines.methods.triads import MAG_SHAPE, triad_names, with_factor
@@ -137,7 +137,9 @@ def _check_names(config: Config) -> None:
         *BIAS,
         *ARM,
         *EARTH,
-        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, FILTER, ACCEL_SQUARE, *SLOPES)),
+        *chain.from_iterable(
+            each.names for each in (*SCALE, SENSITIVITY, DELAY, FILTER, DEAD_BAND, ACCEL_SQUARE, *SLOPES)
+        ),
     ]
     check_names(config.priors, known, "priors")
     check_names(config.require, [*known, MAG_SHAPE], "require")

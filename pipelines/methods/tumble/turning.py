@@ -20,6 +20,7 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.gyro_chain import GyroChain, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import (
+    DEAD_BAND,
     ParameterSpec,
     acting,
     g_sensitivity,
@@ -33,6 +34,7 @@ from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.estimation.walking_bias import FIRST
 from alidade.pipelines.methods.noise import sampled, stated, walking
 from alidade.pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
+from alidade.pipelines.recording.plausibility import dead_band
 from alidade.pipelines.settings import Config
 
 Index = NDArray[np.intp]
@@ -296,8 +298,13 @@ def turning(
         drivers[SENSITIVITY] = np.stack(force, axis=1)
     if data.temperature is not None:
         drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)
+    half_width, beyond = dead_band(data.gyro_t, data.gyro)
+    if half_width:
+        drivers[DEAD_BAND] = beyond
     errors = gyro_errors(_ERRORS_KEY, SCALE, list(drivers), config)
-    path = GyroPath(data.gyro_t, data.gyro, guess.bias, acting(errors, drivers), density.used)
+    path = GyroPath(
+        data.gyro_t, data.gyro, guess.bias, acting(errors, drivers), density.used, _hidden(data, half_width, beyond)
+    )
     inside = _inside(mag.time, data.gyro_t)
     time, begins = shared_keyframes(mag.time[inside], mag.time[inside[0]], _SHARED, _APART)
     rested = None if accel is None else Rows.near(time, accel.time, _inside(accel.time, data.gyro_t))
@@ -331,6 +338,20 @@ def turning(
         earth_rate=_earth_rate(config) if earth is None else None,
         levels=(density, walk),
     )
+
+
+def _hidden(data: TumbleData, half_width: float, beyond: Array) -> Array | None:
+    """Density (N,) of what a gyro does not show within its dead band, rad/s/sqrt(Hz); None without one.
+
+    The rate there, with the bias that rests hide, is uniform in the band and may be the same all the time. Over all the
+    time in it, T, white noise of the density half_width sqrt(T / 3) leaves its mean as uncertain as that.
+    """
+    if not half_width:
+        return None
+    assert data.gyro_t is not None
+    within = (beyond == 0.0).any(axis=1)
+    lasting = float(within.mean() * (data.gyro_t[-1] - data.gyro_t[0]))
+    return np.where(within, half_width * np.sqrt(lasting / 3.0), 0.0)
 
 
 def _earth(latitude: float, declination: float) -> Array:

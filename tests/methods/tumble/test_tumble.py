@@ -41,6 +41,7 @@ from alidade.pipelines.methods.tumble.unturned import unturned
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.plausibility import dead_band
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.reports.results_table import result_cards
 from alidade.pipelines.settings import Config
@@ -673,14 +674,44 @@ def test_gyro_clipped_at_its_range_is_noticed(tmp_path: Path) -> None:
         assert abs(found.value - simulated.truth[f"gyro_scale_{axis}"]) < 4.0 * found.sigma
 
 
-@pytest.mark.parametrize("subtracted", [0.0, np.deg2rad(0.3)])
-def test_dead_band_of_a_gyro_is_noticed(subtracted: float) -> None:
-    simulated = TUMBLE.simulate(TumbleScenario(attitudes=14, gyro=TumbledGyro()), 1)
-    gyro = simulated.data.gyro
-    left = np.where(np.abs(gyro) < np.deg2rad(0.3), 0.0, gyro - subtracted * np.sign(gyro))
-    banded = Session.of(TUMBLE, replace(simulated, data=replace(simulated.data, gyro=left))).problem()
-    assert "The gyro has a dead band" in " ".join(banded.premises)
-    assert "dead band" not in " ".join(Session.of(TUMBLE, simulated).problem().premises)
+@pytest.mark.parametrize(
+    ("seed", "subtracted", "rest_s", "step"),
+    [
+        (1, 0.3, 1.0, 0.0),
+        (2, 0.3, 0.0, 1.0 / 16.4),
+        *(
+            pytest.param(seed, subtracted, rest_s, step, marks=pytest.mark.slow)
+            for seed in (3, 4)
+            for subtracted in (0.0, 0.3)
+            for rest_s in (0.0, 1.0)
+            for step in (0.0, 1.0 / 16.4)
+        ),
+        *(pytest.param(seed, 1.0, 0.0, 0.0, marks=pytest.mark.slow) for seed in (1, 2)),
+    ],
+)
+def test_gyro_that_subtracts_its_dead_band(seed: int, subtracted: float, rest_s: float, step: float) -> None:
+    """Unnoticed, .3 deg/s put gyro_scale 19 to 33 sigmas off, gyro_bias 14 with rests; 1/16.4 deg/s is a usual step."""
+    simulated = _simulated(replace_scenario(SECOND, rest_s=rest_s), seed)
+    gyro, band = simulated.data.gyro, np.deg2rad(subtracted)
+    left = np.where(np.abs(gyro) < max(band, np.deg2rad(0.3)), 0.0, gyro - band * np.sign(gyro))
+    left = np.round(left / np.deg2rad(step)) * np.deg2rad(step) if step else left
+    calibration = Session.of(TUMBLE, replace(simulated, data=replace(simulated.data, gyro=left))).calibrate()
+    assert calibration.status == "calibrated"
+    assert "The gyro has a dead band" in " ".join(calibration.notes)
+    found = {name: each for name, each in calibration.parameters.items() if each.sigma}
+    truth = simulated.truth | {"gyro_dead_band": band}
+    off = {name: abs(found[name].value - true) / found[name].sigma for name, true in truth.items() if name in found}
+    assert "gyro_dead_band" in off
+    assert max(off.values()) < 4.0
+    assert found["gyro_dead_band"].sigma < 1e-3
+
+
+@pytest.mark.parametrize("step", [0.0, 1.0 / 131.0, 1.0 / 16.4, 0.3])
+@pytest.mark.parametrize("rest_s", [0.0, 1.0])
+def test_gyro_that_counts_has_no_dead_band(step: float, rest_s: float) -> None:
+    data = _simulated(replace_scenario(SECOND, rest_s=rest_s), 1).data
+    read = np.round(data.gyro / np.deg2rad(step)) * np.deg2rad(step) if step else data.gyro
+    assert dead_band(data.gyro_t, read)[0] == 0.0
 
 
 def test_a_rest_counts_as_one_attitude() -> None:
