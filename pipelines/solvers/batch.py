@@ -33,9 +33,11 @@ from alidade.pipelines.estimation.problem import (
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
+    ColouredNoise,
     Influence,
     added_covariance,
     autocorrelations,
+    coloured_noises,
     error_budget,
     most_influential,
     sigma_ratio,
@@ -243,11 +245,14 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, posterior.at
     names = tuple(q.name for q in problem.quantities)
-    correlations = autocorrelations(engine, values) if solved.levels and not problem.marginal_likelihood else {}
-    influence, added = None, dict[str, Array]()
+    correlations = dict[str, Array]()
+    if solved.levels and not problem.marginal_likelihood:
+        correlations = autocorrelations(engine, values, len(posterior.reported.free))
+    influence, noises, added = None, dict[str, ColouredNoise](), dict[str, Array]()
     if budget or correlations:
         influence = Influence.of(posterior)
-        added = added_covariance(influence, correlations)
+        noises = coloured_noises(influence, correlations)
+        added = added_covariance(influence, noises)
     nominal = posterior.covariance
     covariance = nominal.copy()
     covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
@@ -269,7 +274,7 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
         inflation=by,
         sandwich=sandwich,
         steps=steps,
-        colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in correlations.items()},
+        colours={family: noise.together for family, noise in noises.items()},
         converged=solved.converged,
         message=solved.message,
         residuals=residuals,

@@ -13,6 +13,14 @@ number's variance. One column B (B'N B)^-1 B'J' a number is kept for all unknown
 Noise of a family whose autocorrelation at lag k is g(k) adds 2 sum_k g(k) sum_i L_i+k L_i to a variance (Newey, West,
 "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica
 1987, with influence functions in place of regressors). Each family's correlation counts for its own residuals alone.
+
+Residuals of a fit are less correlated than their noise: it absorbs what is slow. A noise of variance v, a share f of it
+correlated by exp(-k / T), has the restricted likelihood (Harville, J. Am. Stat. Assoc. 72, 1977)
+
+    -2 log L = (n - m) log q + log det V + log det Q'V^-1 Q,    q = min_x (y - Q x)'V^-1 (y - Q x)
+
+V = (1 - f) I + f exp(-|i - j| / T), Q an orthonormal basis of what the m numbers move the n residuals y by;
+v = q / (n - m). But for both ends the cosine transform makes V diagonal.
 """
 
 from __future__ import annotations
@@ -20,10 +28,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.chi_square import quantile
 from alidade.pipelines.estimation.problem import InfluentialMeasurement
 from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Values
@@ -38,6 +48,18 @@ MIN_MEASUREMENTS = 100
 DIED_OUT, CORRELATED = 2.0, 4.0
 # Longest lag, share of the recording.
 MAX_LAG = 0.25
+# Level of the test for coloured noise, which has two numbers more than white noise.
+_COLOURED = 0.999
+# A fit that absorbs more than this share of white residuals, a hundredth of their sigma, may hide their correlation.
+_ABSORBED = 0.02
+# Of a correlated share: white noise beside it keeps V regular.
+_MIN_SHARE, _MAX_SHARE = 1e-6, 1.0 - 1e-6
+# Frequencies with a band of their own, and by what the bands beyond grow: their spectrum is even to a twentieth.
+_SINGLE, _BAND = 64, 1.05
+# Variance over the largest below which a direction is rounding.
+_SAME = 1e-12
+# Correlation lengths after which exp(-lag / length) is left out.
+_LENGTHS = 8.0
 # Blocks of a recording by which variances are judged, each with as many measurements as there are numbers at least.
 _BLOCKS = 16
 # Coefficients of a prior's row below this share of its largest are rounding.
@@ -190,10 +212,11 @@ def most_influential(
     return tuple(InfluentialMeasurement(family, time, name, move) for move, family, time, name in found[:count])
 
 
-def autocorrelation(whitened: Array) -> Array:
+def autocorrelation(whitened: Array, shown: float = CORRELATED) -> Array:
     """Autocorrelation (K,) of residuals (n, r) at the lags 1 ... K, until it has died out; empty if they are white.
 
     Its means over the lags 1, 2 to 3, 4 to 7 and so on: what is faint and long shows in no lag alone, and widens most.
+    One of them is `shown` sigmas above zero.
     """
     n, r = whitened.shape
     if n < MIN_MEASUREMENTS:
@@ -209,7 +232,7 @@ def autocorrelation(whitened: Array) -> Array:
     for j, mean in enumerate(means.tolist()):
         # Estimates of neighbouring lags are correlated as the residuals are (Bartlett, J. Roy. Stat. Soc. Suppl. 1946).
         size = mean * float(n * r * count[j]) ** 0.5 / length
-        if size > (DIED_OUT if end else CORRELATED):
+        if size > (DIED_OUT if end else shown):
             end = j + 1
             length = max(1.0, 1.0 + 2.0 * float(means[:end] @ count[:end]))
         elif end:
@@ -217,42 +240,175 @@ def autocorrelation(whitened: Array) -> Array:
     return np.repeat(means[:end], count[:end])
 
 
-def autocorrelations(engine: Linearization, values: Values) -> dict[str, Array]:
-    """Family of measurements -> autocorrelation of its residuals where they are not white; rejected ones are zero."""
+@dataclass(frozen=True)
+class ColouredNoise:
+    """Noise of n measurements in a row, of which a share is correlated by exp(-lag / length).
+
+    Attributes:
+        share: of the variance that is correlated.
+        length: of the correlation, in measurements.
+        variance: over that of the weights.
+        fall: of -2 log L against white noise.
+    """
+
+    share: float
+    length: float
+    variance: float
+    fall: float
+
+    @classmethod
+    def fitted(cls, whitened: Array, basis: Array, together: float) -> ColouredNoise:
+        """The noise of largest restricted likelihood.
+
+        Args:
+            whitened: residuals (n, r), in time order; each column is a noise of its own.
+            basis: (n, r, m), orthonormal, of what a fit has absorbed of them.
+            together: first guess of how many of them count as one.
+        """
+        from scipy.optimize import minimize
+
+        spectrum, longest = _Spectrum.of(whitened, basis), MAX_LAG * len(whitened)
+
+        def numbers(u: Array) -> tuple[float, float]:
+            share = float(np.clip(1.0 / (1.0 + np.exp(-u[0])), _MIN_SHARE, _MAX_SHARE))
+            return share, float(np.exp(np.clip(u[1], np.log(0.1), np.log(longest))))
+
+        def cost(u: Array) -> float:
+            return spectrum.likelihood(*numbers(u))[0]
+
+        start = np.array([0.0, np.log(min(max(0.5 * together, 1.0), longest))])
+        simplex = start + np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+        options = {"xatol": 0.02, "fatol": 0.02, "initial_simplex": simplex}
+        best = minimize(cost, start, method="Nelder-Mead", options=options)
+        share, length = numbers(best.x)
+        white, variance = spectrum.likelihood(0.0, 1.0)[0], spectrum.likelihood(share, length)[1]
+        return cls(share, length, variance, white - float(best.fun))
+
+    @property
+    def correlation(self) -> Array:
+        """Autocorrelation (K,) at the lags 1 ... K, until it is gone."""
+        return np.asarray(self.share * np.exp(-np.arange(1.0, _LENGTHS * self.length + 2.0) / self.length))
+
+    @property
+    def together(self) -> float:
+        """How many measurements count as one in a mean."""
+        return 1.0 + 2.0 * float(self.correlation.sum())
+
+
+@dataclass(frozen=True)
+class _Spectrum:
+    """Residuals, and what a fit absorbs of them, by frequency: V is diagonal there, but for its ends.
+
+    Attributes:
+        cosine: (b,) of the frequency, of bands in which the spectrum is even.
+        count: (b,) frequencies in each.
+        products: (b, 1 + m, 1 + m) sums over a band, of residuals first.
+        size: residuals n r, of r columns.
+    """
+
+    cosine: Array
+    count: Array
+    products: Array
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, whitened: Array, basis: Array) -> _Spectrum:
+        """Cosine transforms of residuals (n, r) and of a basis (n, r, m)."""
+        from scipy.fft import dct
+
+        rows = dct(np.concatenate([whitened[..., None], basis], axis=2), axis=0, norm="ortho")
+        n, columns = len(rows), rows.shape[2]
+        wide = _SINGLE * _BAND ** np.arange(np.log(max(n / _SINGLE, 1.0)) / np.log(_BAND))
+        edges = np.unique(np.r_[np.arange(min(n, _SINGLE)), wide.astype(int), n])
+        bands = [rows[a:b].reshape(-1, columns) for a, b in pairwise(edges.tolist())]
+        middle = 0.5 * (edges[1:] + edges[:-1] - 1)
+        products = np.array([band.T @ band for band in bands])
+        return cls(np.cos(np.pi * middle / n), np.diff(edges).astype(float), products, whitened.shape)
+
+    def likelihood(self, share: float, length: float) -> tuple[float, float]:
+        """-2 log L of coloured noise, see the module, and its variance."""
+        a, (n, r) = float(np.exp(-1.0 / length)), self.size
+        power = 1.0 - share + share * (1.0 - a**2) / (1.0 + a**2 - 2.0 * a * self.cosine)
+        sums = np.tensordot(1.0 / power, self.products, axes=1)
+        absorbed, across = sums[1:, 1:], sums[1:, 0]
+        square, count = float(sums[0, 0] - across @ np.linalg.solve(absorbed, across)), n * r - len(across)
+        log_det = r * float(self.count @ np.log(power)) + float(np.linalg.slogdet(absorbed)[1])
+        return count * float(np.log(square)) + log_det, square / count
+
+
+def autocorrelations(engine: Linearization, values: Values, fitted: int) -> dict[str, Array]:
+    """Family of measurements -> autocorrelation of its residuals where their noise may be coloured.
+
+    It may where they are so few that what `fitted` numbers absorb of them hides it.
+    """
     found = {}
     for family, groups in engine.measured.items():
         if len({group.model.rows for group in groups}) == 1:
-            whitened = [g.weighted(g.evaluate(values)[0]) * g.inliers(values)[:, None] for g in groups]
-            if len(lags := autocorrelation(np.concatenate(whitened)[_in_time(groups)])):
+            whitened = _residuals(groups, values)
+            lags = autocorrelation(whitened, DIED_OUT)
+            if len(lags) or (len(whitened) >= MIN_MEASUREMENTS and fitted > _ABSORBED * whitened.size):
                 found[family] = lags
     return found
 
 
-def added_covariance(influence: Influence, correlations: Mapping[str, Array]) -> dict[str, Array]:
-    """Family -> covariance (m, m) that the correlation of its residuals adds to the numbers, negative in no direction.
+def coloured_noises(influence: Influence, correlations: Mapping[str, Array]) -> dict[str, ColouredNoise]:
+    """Family of measurements -> its noise where that is coloured; see `autocorrelations` for first guesses."""
+    found = {}
+    for family, lags in correlations.items():
+        whitened = _residuals(influence.at.engine.measured[family], influence.at.values)
+        noise = ColouredNoise.fitted(whitened, _basis(influence, family), 1.0 + 2.0 * float(lags.sum()))
+        if noise.fall > quantile(_COLOURED, 2):
+            found[family] = noise
+    return found
 
-    Residuals of correlation T beside the identity add L'TL to the covariance L'L that white ones leave.
+
+def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) -> dict[str, Array]:
+    """Family -> covariance (m, m) that its coloured noise adds to the numbers, negative in no direction.
+
+    Residuals of variance v and correlation I + T leave the covariance v L'(I + T) L instead of the L'L of white ones.
 
     By their autocorrelation, as if errors knew nothing of the motion; by the sandwich over blocks of the recording
     (Liang, Zeger, Biometrika 1986) where that is certainly larger, as of a field that differs from place to place.
 
     Args:
         influence: of the residuals.
-        correlations: see `autocorrelations`.
+        noises: see `coloured_noises`.
     """
-    added, groups, scale = {}, influence.at.engine.measured, influence.reported.scale
-    for family, correlation in correlations.items():
-        found, order = [influence.rows(group) for group in groups[family]], _in_time(groups[family])
-        L, right = (np.concatenate([each[i] for each in found])[order] for i in (0, 1))
-        time = np.concatenate([group.model.time for group in groups[family]])[order]
+    added, scale = {}, influence.reported.scale
+    for family, noise in noises.items():
+        L, right = _influences(influence, family)
+        groups = influence.at.engine.measured[family]
+        time = np.concatenate([group.model.time for group in groups])[_in_time(groups)]
         nominal = np.einsum("nri,nrj->ij", L, L)
-        whole = nominal + _correlated(L, correlation)
+        whole = noise.variance * (nominal + _correlated(L, noise.correlation[: len(L) - 1]))
         ratio = ratio_by_blocks(time, np.einsum("nrm,nr->nm", L, right), np.diag(whole))
         more = (np.outer(ratio, ratio) * whole - nominal) / np.outer(scale, scale)
         variances, axes = np.linalg.eigh(0.5 * (more + more.T))
         root = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
         added[family] = root @ root.T
     return added
+
+
+def _residuals(groups: Sequence[Group], values: Values) -> Array:
+    """Weighted residuals (n, r) of several groups in time order; zero where a measurement is rejected."""
+    found = [g.weighted(g.evaluate(values)[0]) * g.inliers(values)[:, None] for g in groups]
+    return np.asarray(np.concatenate(found)[_in_time(groups)])
+
+
+def _influences(influence: Influence, family: str) -> tuple[Array, Array]:
+    """L (n, r, m) of a family in time order, and minus its weighted residuals (n, r)."""
+    groups = influence.at.engine.measured[family]
+    found, order = [influence.rows(group) for group in groups], _in_time(groups)
+    return np.concatenate([each[0] for each in found])[order], np.concatenate([each[1] for each in found])[order]
+
+
+def _basis(influence: Influence, family: str) -> Array:
+    """Orthonormal basis (n, r, k) of what the numbers move the residuals of a family by."""
+    L, _ = _influences(influence, family)
+    flat = (L / influence.reported.scale).reshape(-1, L.shape[2])
+    squares, axes = np.linalg.eigh(flat.T @ flat)
+    some = squares > _SAME * squares.max(initial=0.0)
+    return np.asarray((flat @ (axes[:, some] / np.sqrt(squares[some]))).reshape(*L.shape[:2], -1))
 
 
 def variance_shares(posterior: Posterior) -> dict[str, Array]:

@@ -23,6 +23,9 @@ from alidade.pipelines.settings import Config
 _OFF = 1.0
 # ... and those of its parts no farther apart, as a square in such units, than outliers do.
 _NEAR = 6.0
+# Noise of a sample over the radius of the ellipsoid. Through a cloud of Gaussian noise that is the mean length in it,
+# about which lengths scatter by (3 pi / 8 - 1)^.5 = .42 of it; half of that, which no sensor has, is no ellipsoid.
+_CLOUD = 0.21
 _TOPICS = {"accel": IMU, "mag": MAG}
 
 
@@ -58,7 +61,9 @@ def unturned(sensor: Sensor) -> Sensor:
 def check_turned(sensor: Sensor, config: Config) -> None:
     """Raise InputError if readings, or the means of `unturned`, show too few attitudes for any of the numbers."""
     few = not sensor.rested and len(sensor.raw) < FEWEST
-    if few or (sensor.is_si and relative_scatter(sensor.raw) < TURNED):
+    # Counts may have any offset: those of a device that rests are a cloud of noise, and so is their ellipsoid.
+    still = relative_scatter(sensor.raw) < TURNED and (sensor.is_si or sensor.sample_scatter > _CLOUD)
+    if few or still:
         raise InputError(
             f"topic {config.topic(_TOPICS[sensor.name])}: the device did not turn, or hardly, beyond the noise of its "
             f"readings; turn it slowly through all attitudes, {FEWEST} at the very least, and record again"
