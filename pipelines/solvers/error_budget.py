@@ -331,7 +331,8 @@ class _Spectrum:
         power = 1.0 - share + share * (1.0 - a**2) / (1.0 + a**2 - 2.0 * a * self.cosine)
         sums = np.tensordot(1.0 / power, self.products, axes=1)
         absorbed, across = sums[1:, 1:], sums[1:, 0]
-        square, count = float(sums[0, 0] - across @ np.linalg.solve(absorbed, across)), n * r - len(across)
+        left = float(sums[0, 0] - across @ np.linalg.solve(absorbed, across))
+        square, count = max(left, np.finfo(float).tiny), n * r - len(across)
         log_det = r * float(self.count @ np.log(power)) + float(np.linalg.slogdet(absorbed)[1])
         return count * float(np.log(square)) + log_det, square / count
 
@@ -345,8 +346,9 @@ def autocorrelations(engine: Linearization, values: Values, fitted: int) -> dict
     for family, groups in engine.measured.items():
         if len({group.model.rows for group in groups}) == 1:
             whitened = _residuals(groups, values)
-            lags = autocorrelation(whitened, DIED_OUT)
-            if len(lags) or (len(whitened) >= MIN_MEASUREMENTS and fitted > _ABSORBED * whitened.size):
+            lags, left = autocorrelation(whitened, DIED_OUT), whitened.size - fitted
+            hides = len(whitened) >= MIN_MEASUREMENTS <= left and fitted > _ABSORBED * whitened.size
+            if left > 0 and whitened.any() and (len(lags) or hides):
                 found[family] = lags
     return found
 
