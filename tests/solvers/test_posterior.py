@@ -386,23 +386,20 @@ def test_noise_is_as_coloured_as_drawn_whatever_a_fit_absorbs(share: float, leng
     phase = np.linspace(0.0, 2.0 * np.pi, n)
     slow = np.stack([np.ones(n), *(f(k * phase) for k in range(1, 5) for f in (np.sin, np.cos))], axis=1)
     basis = np.linalg.qr(slow)[0]
-    together, naive, variance, white = [], [], [], []
+    a = np.exp(-1.0 / length)
+    fits, naive, white = [], [], []
     for _ in range(25):
         drawn = rng.standard_normal((2, n + 200))
-        a = np.exp(-1.0 / length)
         colour = lfilter([np.sqrt(1.0 - a**2)], [1.0, -a], drawn[0])[200:]
         noise = np.sqrt(share) * colour + np.sqrt(1.0 - share) * drawn[1, 200:]
-        for each, found in ((noise, together), (drawn[1, :n], white)):
-            left = (each - basis @ (basis.T @ each))[:, None]
-            fit = ColouredNoise.fitted(left, basis[:, None], 1.0)
-            found.append(fit.together if found is together else fit.fall)
-            if found is together:
-                variance.append(fit.variance)
-                naive.append(1.0 + 2.0 * float(autocorrelation(left).sum()))
+        coloured, plain = ((each - basis @ (basis.T @ each))[:, None] for each in (noise, drawn[1, :n]))
+        fits.append(ColouredNoise.fitted(coloured, basis[:, None], 1.0))
+        naive.append(1.0 + 2.0 * float(autocorrelation(coloured).sum()))
+        white.append(ColouredNoise.fitted(plain, basis[:, None], 1.0).fall)
     true = 1.0 + 2.0 * share * a / (1.0 - a)
-    assert np.median(together) == pytest.approx(true, rel=0.2)
+    assert np.median([fit.together for fit in fits]) == pytest.approx(true, rel=0.2)
     assert np.mean(naive) < 0.65 * true
-    assert np.median(variance) == pytest.approx(1.0, abs=0.15)
+    assert np.median([fit.variance for fit in fits]) == pytest.approx(1.0, abs=0.15)
     assert np.max(white) < quantile(0.999, 2)
 
 

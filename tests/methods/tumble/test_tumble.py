@@ -24,7 +24,7 @@ from alidade.pipelines.applications.session import Session, resolve_method
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Estimate
+from alidade.pipelines.estimation.problem import Array, Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.methods.triads import triad_names, triad_of
@@ -709,7 +709,7 @@ def test_gyro_that_subtracts_its_dead_band(seed: int, subtracted: float, rest_s:
     assert calibration.status == "calibrated"
     assert "The gyro has a dead band" in " ".join(calibration.notes)
     found = {name: each for name, each in calibration.parameters.items() if each.sigma}
-    truth = simulated.truth | {"gyro_dead_band": band}
+    truth = {**simulated.truth, "gyro_dead_band": band}
     off = {name: abs(found[name].value - true) / found[name].sigma for name, true in truth.items() if name in found}
     assert "gyro_dead_band" in off
     assert max(off.values()) < 4.0
@@ -791,9 +791,9 @@ def test_halves_of_a_real_magnetometer_agree(alone: bool) -> None:
     mag, *accel = (np.loadtxt(folder / name, delimiter=",") for name in names)
     halves = []
     for rows in (slice(len(mag) // 2), slice(len(mag) // 2, None)):
-        t = 0.2 * np.arange(len(mag[rows]))
-        own = {"accel_t": t, "accel": accel[0][rows]} if accel else {}
-        data = TumbleData(0, mag_t=t, mag=mag[rows], **own)
+        t: Array = 0.2 * np.arange(len(mag[rows]), dtype=float)
+        data = TumbleData(0, mag_t=t, mag=mag[rows])
+        data = replace(data, accel_t=t, accel=accel[0][rows]) if accel else data
         halves.append(Session.of(TUMBLE, Simulated(data, {}, "method: tumble\n")).calibrate(report=False))
     first, second = (half.parameters for half in halves)
     for name in [name for name in first if re.fullmatch("(mag|accel)_[kb][0-9]+", name)]:
