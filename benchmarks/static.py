@@ -18,7 +18,7 @@ from alidade.factors.triad import AccelFactor
 from alidade.pipelines.estimation.priors import LinearModel
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.layout import Layout
-from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
+from alidade.pipelines.solvers.levenberg import minimize
 from alidade.pipelines.solvers.linearization import Linearization
 from benchmarks.measure import Ratio, costs
 
@@ -75,7 +75,7 @@ def ours(model: Model, start: Array) -> Array:
     initial.insert(0, start)
     layout, values = Layout.of(None, initial, [0])
     engine = Linearization.of([Factor.of("rows", model.on(0))], layout)
-    return layout.of_key(minimize(engine, values, LevenbergConfig()).values, 0)
+    return layout.of_key(minimize(engine, values).values, 0)
 
 
 def normal_equations(model: Model, start: Array) -> Array:

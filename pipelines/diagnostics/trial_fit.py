@@ -184,7 +184,7 @@ def held_out_residuals(problem: Problem) -> dict[str, float]:
     """
     from alidade.pipelines.solvers.engines import Compiled
     from alidade.pipelines.solvers.posterior import DRAWS, draws
-    from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+    from alidade.pipelines.solvers.robust import solve_robust
 
     steps = list(problem.steps(CHUNK))
     out = np.repeat(np.arange(len(steps)) % _HELD_OUT == _HELD_OUT - 1, [len(step.factors) for step in steps])
@@ -193,7 +193,7 @@ def held_out_residuals(problem: Problem) -> dict[str, float]:
     if all(out[g.factors].all() for g in measurements):
         return {}
     kept = compiled.engine.with_groups([_without(g, out[g.factors]) for g in compiled.engine.groups])
-    solution = solve_robust(kept, compiled.initial, problem.loss, RobustConfig())
+    solution = solve_robust(kept, compiled.initial, problem.loss)
     if not solution.converged:
         return {}
     found: dict[str, list[Array]] = {}

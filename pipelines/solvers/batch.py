@@ -5,7 +5,7 @@ Outliers are found by graduated non-convexity (`robust`), noise levels by restri
 priors (`weak_directions`). What is reported follows from one factorisation at the end (`posterior`).
 
 Of two minima whose measurements are explained alike only their priors differ. The likelihood ratio of two
-points that are not nested has no distribution of its own; `BatchConfig.close` is where one number off by its prior
+points that are not nested has no distribution of its own; `CLOSE` is where one number off by its prior
 would be excluded at one percent.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,48 +44,24 @@ from alidade.pipelines.solvers.error_budget import (
 )
 from alidade.pipelines.solvers.error_map_test import with_error_map
 from alidade.pipelines.solvers.layout import Values
-from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.levenberg import DEFAULT, LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
-from alidade.pipelines.solvers.posterior import (
-    Reported,
-    chi_square,
-    expected_squares,
-    leverages,
-    moved_to,
-    sqrt_information,
-)
+from alidade.pipelines.solvers.posterior import Reported, chi_square, leverages, moved_to, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
-from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated, without_onsets
+from alidade.pipelines.solvers.robust import solve_robust, solve_truncated, without_onsets
 from alidade.pipelines.solvers.step_test import largest_steps
 from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution, unfinished
 
 # Number of the most influential measurements that are reported.
 INFLUENTIAL = 20
-
-
-@dataclass(frozen=True)
-class BatchConfig:
-    """Options of the batch solver.
-
-    Attributes:
-        robust: how minima and outliers are looked for.
-        close: chi-square above the least below which another minimum is reported: 99 % quantile of one degree of
-            freedom.
-        followed: chi-square above the least up to which values are followed to their minimum, which takes off far less.
-        different: part of its prior scale by which a number of another solution differs.
-    """
-
-    robust: RobustConfig = field(default_factory=RobustConfig)
-    close: float = 6.635
-    followed: float = 3.0 * 6.635
-    different: float = 0.1
-
-    @classmethod
-    def of(cls, max_iterations: int) -> BatchConfig:
-        """Default options with a maximum number of iterations of each minimisation."""
-        return cls(RobustConfig(LevenbergConfig(max_iterations=max_iterations)))
+# Chi-square above the least below which another minimum is reported: 99 % quantile of one degree of freedom.
+CLOSE = 6.635
+# Chi-square above the least up to which values are followed to their minimum, which takes off far less.
+_FOLLOWED = 3.0 * CLOSE
+# Part of its prior scale by which a number of another solution differs.
+_DIFFERENT = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,39 +113,39 @@ class Solved:
 def minimum(compiled: Compiled, levels: Sequence[Level]) -> Solution:
     """The solution with noise levels that are known, rejected measurements left out."""
     engine = apply_levels(compiled.engine, levels)
-    return solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig()).at_inliers()
+    return solve_robust(engine, compiled.initial, compiled.problem.loss).at_inliers()
 
 
-def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[Level, ...] | None = None) -> Solved:
+def solve(compiled: Compiled, config: LevenbergConfig = DEFAULT, levels: tuple[Level, ...] | None = None) -> Solved:
     """Solve a compiled problem.
 
     Args:
         compiled: the problem.
-        config: options.
+        config: of every minimisation.
         levels: of the noises, where they are known; None: from the recording.
 
     Raises:
         IndeterminateStateError: states other than the parameters are not determined.
     """
-    config, problem = config or BatchConfig(), compiled.problem
+    problem = compiled.problem
     start = problem.noises if levels is None else levels
     engine = compiled.engine
-    solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config.robust)
+    solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config)
     if levels is None and problem.marginal_likelihood and engine.is_chain:
         # Noise far from what was stated may be why there is no minimum yet.
         if np.isfinite(solution.cost) and any(level.noise.estimated for level in start) and not deadline.passed():
             with suppress(*(() if solution.converged else (IndeterminateStateError,))):
-                compiled, solution, start = solve_likelihood(compiled, solution, start, config.robust.minimizer)
+                compiled, solution, start = solve_likelihood(compiled, solution, start, config)
                 problem = compiled.problem
     elif levels is None:
-        solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, expected_squares)
+        solution, start = estimate_noise(engine, solution, start, problem.loss, config)
     if problem.loss is not None and not problem.marginal_likelihood and solution.converged:
         rest = without_onsets(engine, solution)
         if rest is not None:
             weighted = apply_levels(rest, start)
-            solution = solve_truncated(weighted, solution.values, problem.loss, config.robust)
+            solution = solve_truncated(weighted, solution.values, problem.loss, config)
             if levels is None:
-                solution, start = estimate_noise(rest, solution, start, problem.loss, config.robust, expected_squares)
+                solution, start = estimate_noise(rest, solution, start, problem.loss, config)
     solution, second = _best(compiled, solution, config)
     posterior = unfinished if deadline.passed() and not solution.converged else constrained_solution
     found = posterior(compiled, solution.at_inliers())
@@ -205,7 +181,7 @@ def solve_batch(
     begin = time.perf_counter()
     compiled = Compiled.of(problem, engine)
     built = time.perf_counter()
-    solved = solve(compiled, BatchConfig.of(max_iterations))
+    solved = solve(compiled, LevenbergConfig(max_iterations))
     found = time.perf_counter()
     estimate = whole_estimate(solved, budget, changed)
     if device:
@@ -216,7 +192,7 @@ def solve_batch(
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
 
 
-def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[Solution, Minimum | None]:
+def _best(compiled: Compiled, solution: Solution, config: LevenbergConfig) -> tuple[Solution, Minimum | None]:
     """The solution or, if another minimum is deeper, that one; and the second best if it is close."""
     problem, layout = compiled.problem, compiled.layout
     if problem.elsewhere is None or not solution.converged:
@@ -226,17 +202,17 @@ def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[
         if deadline.passed("the search for other solutions"):
             break
         values = layout.from_gtsam(other)
-        if engine.cost(values) - solution.cost < config.followed:
-            minimum = minimize(engine, values, config.robust.minimizer)
+        if engine.cost(values) - solution.cost < _FOLLOWED:
+            minimum = minimize(engine, values, config)
             found += [minimum] if minimum.converged else []
     best, *others = sorted(found, key=lambda each: each.cost)
     here = Reported.of(compiled, best.values).numbers
     scales = np.array([q.scale for q in problem.quantities])
     for each in others:
         there = Reported.of(compiled, each.values).numbers
-        if (np.abs(there - here) > config.different * scales).any():
+        if (np.abs(there - here) > _DIFFERENT * scales).any():
             above = each.cost - best.cost
-            return best, Minimum(there, above) if above < config.close else None
+            return best, Minimum(there, above) if above < CLOSE else None
     return best, None
 
 

@@ -29,7 +29,7 @@ from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.freed import at_solution
 from alidade.pipelines.solvers.layout import Values
-from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.levenberg import Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.posterior import sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
@@ -121,7 +121,7 @@ def _solved(problem: Problem, error_map: ErrorMap, estimate: Estimate) -> tuple[
     Noise levels that contain the map would make it smaller, and are found anew.
     """
     compiled, engine, values = at_solution(error_map.added_to(problem), estimate)
-    solution = minimize(engine, values, LevenbergConfig())
+    solution = minimize(engine, values)
     return compiled, solution, sqrt_information(compiled, engine, solution.values, error_map.names)
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -72,37 +72,21 @@ DEFAULT_WINDOW = 1.0
 _LEAST_VARIANCE = 1e-24
 # Steps freed with each new one, of those marginalised out: a thousand at once take longer than an update.
 _FREED = 10
+# Time from the first step to the first batch solution, s; ratio of the times of successive ones; and the time after
+# which the initialisation phase ends in any case, s: the cost of a batch solution grows with it.
+_FIRST_SOLVE, _SOLVE_GROWTH, _MAX_INITIALISATION = 1.0, 1.15, 600.0
+# Steps before which that phase does not end: few large ones cost little to solve again.
+MIN_STEPS = 100
+# Largest share of a variance that is of second order with which it ends.
+_MAX_CURVATURE = 0.15
+# Time between marginalisations afterwards, s.
+_MARGINALIZE_EVERY = 20.0
+# Largest number of estimates kept per second; time between moments of the joint history, as a share of the time since
+# the first.
+_HISTORY_RATE, _MOMENT_SPACING = 5.0, 0.02
 
 
-@dataclass(frozen=True)
-class IncrementalConfig:
-    """Initialisation phase, marginalisation and history of the incremental solver.
-
-    Attributes:
-        first_solve: time from the first step to the first batch solution, s.
-        solve_growth: ratio of the times of successive batch solutions.
-        max_initialisation: time after which the initialisation phase ends in any case, s: the cost of a batch solution
-            grows with it.
-        min_steps: number of steps before which the phase does not end: few large steps cost little to solve again.
-        max_curvature: largest share of a variance that is of second order with which the phase ends.
-        marginalize_every: time between marginalisations afterwards, s.
-        history_rate: largest number of estimates kept per second.
-        moment_spacing: time between moments of the joint history, as a share of the time since the first.
-    """
-
-    first_solve: float = 1.0
-    solve_growth: float = 1.15
-    max_initialisation: float = 600.0
-    min_steps: int = 100
-    max_curvature: float = 0.15
-    marginalize_every: float = 20.0
-    history_rate: float = 5.0
-    moment_spacing: float = 0.02
-
-
-def solve_incremental(
-    problem: Problem, window: Window = DEFAULT_WINDOW, config: IncrementalConfig = IncrementalConfig()
-) -> Estimate:
+def solve_incremental(problem: Problem, window: Window = DEFAULT_WINDOW) -> Estimate:
     """The filtered estimate after the last step, with its history.
 
     Measurements whose innovation lies outside the gate, measured against the innovation's own covariance, are left
@@ -111,13 +95,12 @@ def solve_incremental(
     Args:
         problem: the graph.
         window: how long states are kept, s or Keyframes; None keeps all.
-        config: of the solver.
 
     Raises:
         InputError: a factor gives no finite numbers, or needs a state that has left the window.
         IndeterminateError: states other than the parameters are not determined.
     """
-    solver = IncrementalSolver(problem, window, config)
+    solver = IncrementalSolver(problem, window)
     start = time.perf_counter()
     for step in problem.steps(1):
         solver.add_step(step)
@@ -129,15 +112,14 @@ class IncrementalSolver:
 
     Attributes:
         problem: the graph, or a later one of the same recording, grown: the steps added are among its own.
-        config: of the solver.
         state: what it knows.
         initialising: whether the run is in its initialisation phase.
         steps_since: the steps added since its past was marginalised out.
         moments: number of moments, or in the initialisation phase of batch solutions, so far.
     """
 
-    def __init__(self, problem: Problem, window: Window, config: IncrementalConfig = IncrementalConfig()) -> None:
-        self.problem, self.config = problem, config
+    def __init__(self, problem: Problem, window: Window) -> None:
+        self.problem = problem
         window = window if window is None or isinstance(window, Keyframes) else float(window)
         self.state = RunState(window, problem.noises)
         self.initialising = True
@@ -199,9 +181,9 @@ class IncrementalSolver:
             self._advance(self._smoother, step)
         since = step.time - (self.steps_since[0].time if self.state.marginal is None else self.state.marginal.time)
         if self.initialising:
-            if since >= max(self.config.first_solve, self.config.solve_growth * self._of[1]):
+            if since >= max(_FIRST_SOLVE, _SOLVE_GROWTH * self._of[1]):
                 self._solve_batch()
-        elif since >= self.config.marginalize_every and isinstance(self._smoother, FixedLagSmoother):
+        elif since >= _MARGINALIZE_EVERY and isinstance(self._smoother, FixedLagSmoother):
             graph, values = self._smoother.active_variables()
             marginal = MarginalState.of(step.time, graph, values, list(graph.keyVector()), self._stamps)
             self._continue_from(marginal)
@@ -412,11 +394,11 @@ class IncrementalSolver:
 
     def _record(self) -> None:
         """Add the estimate now to the history, and after the initialisation phase to the moments."""
-        if not len(self.state.history) or self.time - self.state.history.array[-1, 0] >= 1.0 / self.config.history_rate:
+        if not len(self.state.history) or self.time - self.state.history.array[-1, 0] >= 1.0 / _HISTORY_RATE:
             numbers, covariance = self._constrained()
             self.state.history.add(np.concatenate([[self.time], numbers, np.sqrt(np.diag(covariance))])[None])
             past = self.state.moments.array
-            spacing = self.config.moment_spacing * (self.time - past[0, 0]) if len(past) else np.inf
+            spacing = _MOMENT_SPACING * (self.time - past[0, 0]) if len(past) else np.inf
             if not self.initialising and len(past) and self.time - past[-1, 0] >= spacing:
                 self.state.moments.add(np.concatenate([[self.time], numbers, covariance.ravel()])[None])
                 self.moments += 1
@@ -436,7 +418,7 @@ class IncrementalSolver:
                 # Second order that has once gone far enough does so from then on.
                 beyond = beyond_second_order(solved.compiled, solved.posterior)
                 self._beyond[solved.posterior.reported.free] &= beyond
-            if since < self.config.max_initialisation and not self._is_linear(solved):
+            if since < _MAX_INITIALISATION and not self._is_linear(solved):
                 self._record()
                 return
             history = self.estimate().posterior_history
@@ -458,10 +440,10 @@ class IncrementalSolver:
 
     def _is_linear(self, solved: Solved) -> bool:
         """Whether a smoother can continue from a solution: no weak direction, a small share of second order."""
-        if self.state.trouble or len(self.steps_since) < self.config.min_steps or self.state.gate.too_few_to_decide():
+        if self.state.trouble or len(self.steps_since) < MIN_STEPS or self.state.gate.too_few_to_decide():
             return False
         posterior = solved.posterior
-        return not posterior.directions.weak.shape[1] and posterior.second_order_share() < self.config.max_curvature
+        return not posterior.directions.weak.shape[1] and posterior.second_order_share() < _MAX_CURVATURE
 
     def _all_steps_since(self) -> list[Step]:
         """The steps since the marginal, the marginal as the first of them."""

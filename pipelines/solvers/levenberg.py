@@ -29,40 +29,40 @@ from alidade.pipelines.solvers.linearization import Linearization, System
 # Decrease of the cost over the one predicted above which a step is doubled: along it the cost is no parabola, and falls
 # on, as it does about a saddle, where the ratio is 2.
 _DOUBLE = 1.5
-# Damping of a correction over that of the step.
-_FIRMER = 100.0
+# Error of the predicted decrease of an undamped step below which that step is the last.
+_AS_PREDICTED = 2e-6
+# Predicted decrease of an undamped step, corrected, below which it may raise the cost at a minimum: what the data
+# hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
+_CURVED = 1e-2
+# Predicted decrease of the first damped step below which all is at its minimum that has more information than the
+# damping, where the full step raises the cost even corrected: priors say where the rest is to be (`weak_directions`).
+# .001 is .03 sigma.
+_DETERMINED = 1e-3
+# Damping of corrections and of the first damped step, relative to the diagonal of A'A; that of a correction over that
+# of the step; and the damping below which steps are full ones again.
+_INITIAL_DAMPING, _FIRMER, _MIN_DAMPING = 1e-6, 100.0, 1e-12
 
 
 @dataclass(frozen=True)
 class LevenbergConfig:
-    """Options of the Levenberg-Marquardt minimisation: termination and damping.
+    """Options of the Levenberg-Marquardt minimisation.
 
     Attributes:
         max_iterations: linear systems solved.
         cost_tolerance: stop when the predicted decrease is below it (squared sigmas): no number is off its minimum by
             more than the root of it, in its own sigmas, and by far less once the step is taken. Sigmas are as large as
             the residuals where these are larger than stated.
-        prediction_tolerance: error of the predicted decrease of an undamped step below which that step is the last.
-        curved_tolerance: predicted decrease of an undamped step, corrected, below which it may raise the cost at a
-            minimum: what the data hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
-        determined_tolerance: predicted decrease of the first damped step below which all is at its minimum that has
-            more information than the damping, where the full step raises the cost even corrected: priors say where the
-            rest is to be (`weak_directions`). .001 is .03 sigma.
-        initial_damping: of corrections and of the first damped step, relative to the diagonal of A'A.
-        min_damping: below it steps are full ones again.
         max_damping: above it no step is left.
         corrections: of a step that raises the cost, at most.
     """
 
     max_iterations: int = 60
     cost_tolerance: float = 2e-5
-    prediction_tolerance: float = 2e-6
-    curved_tolerance: float = 1e-2
-    determined_tolerance: float = 1e-3
-    initial_damping: float = 1e-6
-    min_damping: float = 1e-12
     max_damping: float = 1e8
     corrections: int = 6
+
+
+DEFAULT = LevenbergConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,11 +113,11 @@ class Solution(Point):
 
 
 def minimize(
-    engine: Linearization, values: Values, config: LevenbergConfig, known: tuple[System, float] | None = None
+    engine: Linearization, values: Values, config: LevenbergConfig = DEFAULT, known: tuple[System, float] | None = None
 ) -> Solution:
     """Minimise an engine's cost from some values; `known`: the system about these, and the cost."""
     here = Point(engine, values, *known) if known else Point.of(engine, values)
-    damping, growth, iteration, served = 0.0, 2.0, 0, config.initial_damping
+    damping, growth, iteration, served = 0.0, 2.0, 0, _INITIAL_DAMPING
 
     def solution(converged: bool, message: str) -> Solution:
         return Solution(engine, here.values, here.system, here.cost, converged, message, iteration)
@@ -134,7 +134,7 @@ def minimize(
             there, corrections = _reached(engine, here, step, max(predicted, enough), damping, config)
             iteration += corrections
             decrease = here.cost - there.cost
-            is_minimum = _is_minimum(config, enough, damping, predicted, decrease)
+            is_minimum = _is_minimum(enough, damping, predicted, decrease)
             if decrease > 0.0 or (is_minimum and decrease > -enough):
                 here = there
             if is_minimum:
@@ -144,7 +144,7 @@ def minimize(
                 ratio = decrease / predicted if predicted > 0.0 else 1.0
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
                 growth = 2.0
-                if damping < config.min_damping or predicted < config.determined_tolerance:
+                if damping < _MIN_DAMPING or predicted < _DETERMINED:
                     damping = 0.0
                 continue
         damping, growth = (damping * growth if damping > 0.0 else served), 2.0 * growth
@@ -153,13 +153,13 @@ def minimize(
     return solution(False, f"not converged after {iteration} iterations")
 
 
-def _is_minimum(config: LevenbergConfig, enough: float, damping: float, predicted: float, decrease: float) -> bool:
+def _is_minimum(enough: float, damping: float, predicted: float, decrease: float) -> bool:
     """Whether a step, by its damping and the decrease of the cost, shows that where it ends is a minimum."""
     if damping > 0.0:
-        determined = damping <= config.initial_damping and predicted < config.determined_tolerance
-        return determined and (decrease <= 0.0 or damping == config.initial_damping)
-    as_predicted = predicted < 1.0 and abs(decrease - predicted) < config.prediction_tolerance
-    return predicted < enough or (predicted < config.curved_tolerance and decrease < enough) or as_predicted
+        determined = damping <= _INITIAL_DAMPING and predicted < _DETERMINED
+        return determined and (decrease <= 0.0 or damping == _INITIAL_DAMPING)
+    as_predicted = predicted < 1.0 and abs(decrease - predicted) < _AS_PREDICTED
+    return predicted < enough or (predicted < _CURVED and decrease < enough) or as_predicted
 
 
 def _reached(
@@ -171,7 +171,7 @@ def _reached(
         return _lengthened(engine, here.values, step, there.cost), 0
     if there.cost < here.cost or config.corrections == 0:
         return there, 0
-    firm, counted = max(config.initial_damping, _FIRMER * damping), without_rejected(engine, here.values)
+    firm, counted = max(_INITIAL_DAMPING, _FIRMER * damping), without_rejected(engine, here.values)
     back = Point.of(counted, there.values)
     for count in range(1, config.corrections + 1):
         correction, _ = _step(back.system, firm)

@@ -13,53 +13,37 @@ exp(-2 u) and r to stay.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.solvers.chain import Array, Factorization
+from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Values
-from alidade.pipelines.solvers.levenberg import Solution, minimize
-from alidade.pipelines.solvers.linearization import Group, Linearization, System
-from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.posterior import expected_squares
+from alidade.pipelines.solvers.robust import solve_robust, solve_truncated
 
 # (family, row of its measurements) -> expected sum of squares under noise of unit variance.
 ExpectedSquares = Mapping[tuple[str, int], float]
 
 
-@dataclass(frozen=True)
-class NoiseConfig:
-    """Options of the noise estimation: when levels change, and how residuals are read.
-
-    Attributes:
-        max_solutions: solutions with other levels.
-        negligible: change of a level's logarithm below which levels stay.
-        misplaced: ratio of the root mean square to the typical residual beyond which the gate is in the wrong place:
-            outliers pass as measurements, or measurements are rejected. The typical residual is robust to that.
-        min_residuals: of fewer there is no typical one.
-        max_additional: bound of the logarithm of a noise beside others, over what was stated.
-        clipped: of a noise beside others a residual counts as no more than this, in sigmas; `clipped_square` is what
-            the square of a normal number is then expected to be.
-        least: of a level: without any noise residuals are of rounding, which no step makes less.
-        too_small: sigmas by which a sum of squares is too small for its process.
-    """
-
-    max_solutions: int = 8
-    negligible: float = 0.01
-    misplaced: float = 1.3
-    min_residuals: int = 50
-    max_additional: float = 7.0
-    clipped: float = 2.0
-    clipped_square: float = 0.9205
-    least: float = 1e-6
-    too_small: float = 3.0
-
-
-CONFIG = NoiseConfig()
+# Solutions with other levels at most, and the change of a level's logarithm below which levels stay.
+_MAX_SOLUTIONS, _NEGLIGIBLE = 8, 0.01
+# Ratio of the root mean square to the typical residual beyond which the gate is in the wrong place: outliers pass as
+# measurements, or measurements are rejected. The typical residual is robust to that; fewer than so many have none.
+_MISPLACED, _MIN_RESIDUALS = 1.3, 50
+# Bound of the logarithm of a noise beside others, over what was stated. Of it a residual counts as no more than so many
+# sigmas, where the square of a normal number is expected to be as given.
+_MAX_ADDITIONAL, _CLIPPED, _CLIPPED_SQUARE = 7.0, 2.0, 0.9205
+# Level of any noise at least: without noise residuals are of rounding, which no step makes less.
+_LEAST = 1e-6
+# Sigmas by which a sum of squares is too small for its process.
+_TOO_SMALL = 3.0
 
 
 def estimate_noise(
@@ -67,9 +51,7 @@ def estimate_noise(
     solution: Solution,
     levels: tuple[Level, ...],
     loss: TruncatedLoss | None,
-    robust: RobustConfig,
-    expected_squares: Callable[[Linearization, System, Factorization, Values], ExpectedSquares],
-    config: NoiseConfig = CONFIG,
+    config: LevenbergConfig,
 ) -> tuple[Solution, tuple[Level, ...]]:
     """The solution with the noise levels that the recording has, and these.
 
@@ -78,9 +60,7 @@ def estimate_noise(
         solution: of the same with the levels given.
         levels: to begin with.
         loss: of the problem; None: no outliers are expected.
-        robust: how outliers are looked for.
-        expected_squares: of the rows of families at a solution.
-        config: when levels change.
+        config: of every minimisation.
 
     Raises:
         IndeterminateStateError: a state is not determined.
@@ -88,21 +68,21 @@ def estimate_noise(
     first = levels
     if not any(level.noise.estimated or level.least is not None for level in levels):
         return solution, levels
-    for _ in range(config.max_solutions):
+    for _ in range(_MAX_SOLUTIONS):
         if not solution.converged:
             break
         before, values = levels, solution.values
         expected = expected_squares(solution.engine, solution.system, solution.factorization, values)
-        levels, steady = refine(levels, solution.engine, values, expected, levels is first, config)
+        levels, steady = refine(levels, solution.engine, values, expected, levels is first)
         if steady:
             break
         weighted = apply_levels(engine, levels)
         if loss is None:
-            again = minimize(weighted, values, robust.minimizer)
-        elif _far(levels, before, config):
-            again = solve_robust(weighted, values, loss, robust)
+            again = minimize(weighted, values, config)
+        elif _far(levels, before):
+            again = solve_robust(weighted, values, loss, config)
         else:
-            again = solve_truncated(weighted, values, loss, robust)
+            again = solve_truncated(weighted, values, loss, config)
         solution = replace(again, iterations=solution.iterations + again.iterations)
     return solution, levels
 
@@ -145,10 +125,10 @@ def _additional(beside: Array | None, level: float) -> Array:
     return ((level * beside) ** 2)[:, None]
 
 
-def _far(levels: Sequence[Level], others: Sequence[Level], config: NoiseConfig) -> bool:
+def _far(levels: Sequence[Level], others: Sequence[Level]) -> bool:
     """Whether levels are so far from others that outliers of the one are measurements of the other."""
     pairs = zip(levels, others, strict=True)
-    low, high = 1.0 / config.misplaced, config.misplaced
+    low, high = 1.0 / _MISPLACED, _MISPLACED
     return any(not low < a.scale / b.scale < high for a, b in pairs if not a.noise.beside)
 
 
@@ -158,7 +138,6 @@ def refine(
     values: Values,
     expected: ExpectedSquares,
     first: bool,
-    config: NoiseConfig = CONFIG,
 ) -> tuple[tuple[Level, ...], bool]:
     """The levels at a solution, and whether they are those that it was made with.
 
@@ -168,21 +147,20 @@ def refine(
         values: the solution.
         expected: squares of the rows of families there.
         first: whether it was made with the levels stated, which may have put the gate in the wrong place.
-        config: when levels change.
     """
     found, steady = list(levels), True
     for i, level in enumerate(levels):
         groups = [g for g in engine.groups if g.family in level.noise.families]
         redundancy = _redundancy(level.noise, expected)
         if level.least is not None and redundancy >= 1.0:
-            found[i] = _within(level, groups, values, redundancy, config)
+            found[i] = _within(level, groups, values, redundancy)
         elif level.noise.estimated and level.noise.beside and redundancy > 0.0:
-            found[i], kept = _found_beside(level, groups, values, redundancy, config)
+            found[i], kept = _found_beside(level, groups, values, redundancy)
             steady &= kept
             continue
         elif level.noise.estimated and redundancy >= 1.0:
-            found[i] = _refined(level, groups, values, redundancy, first, config)
-        steady &= bool(abs(np.log(found[i].scale / level.scale)) < config.negligible)
+            found[i] = _refined(level, groups, values, redundancy, first)
+        steady &= bool(abs(np.log(found[i].scale / level.scale)) < _NEGLIGIBLE)
     if steady:
         found = [replace(new, scale=old.scale) for new, old in zip(found, levels, strict=True)]
     return tuple(found), steady
@@ -197,22 +175,18 @@ def _redundancy(noise: Noise, expected: ExpectedSquares) -> float:
     )
 
 
-def _refined(
-    level: Level, groups: Sequence[Group], values: Values, redundancy: float, first: bool, config: NoiseConfig
-) -> Level:
+def _refined(level: Level, groups: Sequence[Group], values: Values, redundancy: float, first: bool) -> Level:
     """Improved estimate of a noise level."""
-    square, typical = _size(level.noise, groups, values, config)
-    if first and typical > 0.0 and not config.misplaced**-2 < square / typical < config.misplaced**2:
+    square, typical = _size(level.noise, groups, values)
+    if first and typical > 0.0 and not _MISPLACED**-2 < square / typical < _MISPLACED**2:
         square = typical
-    found = max(level.scale * float(np.sqrt(max(square / redundancy, 0.0))), config.least)
+    found = max(level.scale * float(np.sqrt(max(square / redundancy, 0.0))), _LEAST)
     known = replace(level, found=found, sigma=found * (2.0 * redundancy) ** -0.5)
     scale = float(np.exp(_level(float(np.log(level.scale)), square, redundancy, known.known)))
-    return replace(known, scale=max(scale, level.noise.least, config.least))
+    return replace(known, scale=max(scale, level.noise.least, _LEAST))
 
 
-def _found_beside(
-    level: Level, groups: Sequence[Group], values: Values, redundancy: float, config: NoiseConfig
-) -> tuple[Level, bool]:
+def _found_beside(level: Level, groups: Sequence[Group], values: Values, redundancy: float) -> tuple[Level, bool]:
     """A noise beside others as the residuals have it, and whether that changes little.
 
     With v the variance of a row, f the part of it that is this noise's, and e the residual, all rows alike redundant,
@@ -226,8 +200,8 @@ def _found_beside(
     square = np.concatenate([g.evaluate(values)[0].ravel() for g in groups]) ** 2
     rest, share = variance - unit * level.scale**2, redundancy / variance.size
     rejecting = any(g.loss is not None for g in groups)
-    most, expected = (config.clipped**2, config.clipped_square) if rejecting else (np.inf, 1.0)
-    low, high = -config.max_additional, config.max_additional
+    most, expected = (_CLIPPED**2, _CLIPPED_SQUARE) if rejecting else (np.inf, 1.0)
+    low, high = -_MAX_ADDITIONAL, _MAX_ADDITIONAL
     while high - low > 1e-3:
         middle = 0.5 * (low + high)
         part = unit * np.exp(2.0 * middle)
@@ -238,14 +212,14 @@ def _found_beside(
     part = unit * scale**2
     sigma = float((2.0 * share * ((part / (rest + part)) ** 2).sum() + level.known**-2) ** -0.5)
     changed = float(np.abs((rest + part) / variance - 1.0).max())
-    return replace(level, scale=scale, found=scale, sigma=scale * sigma), changed < 2.0 * config.negligible
+    return replace(level, scale=scale, found=scale, sigma=scale * sigma), changed < 2.0 * _NEGLIGIBLE
 
 
 def _shape(group: Group) -> tuple[int, int]:
     return len(group.model.time), group.model.rows
 
 
-def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float, config: NoiseConfig) -> Level:
+def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float) -> Level:
     """A process at the level that its residuals have, between what its samples say and what was stated.
 
     Where measurements take most of the redundancy its squares hardly determine levels in between: it stays as stated if
@@ -254,7 +228,7 @@ def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: f
     assert level.least is not None
     ratio = sum(_used_square(g, values).sum() for g in groups) / redundancy
     if level.scale == 1.0:
-        if ratio > 1.0 - config.too_small * (2.0 / redundancy) ** 0.5:
+        if ratio > 1.0 - _TOO_SMALL * (2.0 / redundancy) ** 0.5:
             return replace(level, noise=replace(level.noise, families=()), least=None)
         return replace(level, scale=level.least)
     return replace(level, scale=float(np.clip(level.scale * max(ratio, 1.0) ** 0.5, level.least, 1.0)))
@@ -285,7 +259,7 @@ def _used_square(group: Group, values: Values) -> Array:
     return np.where((group.used(residuals) > 0.5)[:, None], group.weighted(residuals) ** 2, 0.0)
 
 
-def _size(noise: Noise, groups: Sequence[Group], values: Values, config: NoiseConfig) -> tuple[float, float]:
+def _size(noise: Noise, groups: Sequence[Group], values: Values) -> tuple[float, float]:
     """Sum of squares of a noise's whitened residuals that are used, and what it would be if all were of typical size.
 
     Of few residuals, and of processes, the latter is 0.
@@ -301,4 +275,4 @@ def _size(noise: Noise, groups: Sequence[Group], values: Values, config: NoiseCo
         rows += int(used.sum()) * len(own)
         every.append(whitened.ravel())
     whole = np.concatenate(every)
-    return square, rows * robust_sigma(whole) ** 2 if len(whole) >= config.min_residuals else 0.0
+    return square, rows * robust_sigma(whole) ** 2 if len(whole) >= _MIN_RESIDUALS else 0.0

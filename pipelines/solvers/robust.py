@@ -9,14 +9,14 @@ plain least squares, and small effects that priors alone hold, out of all bounds
 of a family rejected, it begins again with measurements soft enough that priors hold.
 
 Outliers are a minority. A family of measurements of which more than half are rejected, beyond what chance could make
-of one in which every second is an outlier (binomial in the normal approximation, one sided, p = `max_chance`), has
+of one in which every second is an outlier (binomial in the normal approximation, one sided, p = `_MAX_CHANCE`), has
 another noise than stated, or its model is wrong: all of it counts then, which chi-square shows.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,50 +25,36 @@ from alidade.pipelines import deadline
 from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.levenberg import DEFAULT, LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization, System
 
-
-@dataclass(frozen=True)
-class RobustConfig:
-    """Settings of the search for outliers.
-
-    Attributes:
-        minimizer: termination of every minimisation.
-        rough_tolerance: decrease of chi-square per measurement at which plain least squares is near enough to begin
-            with: residuals move by .05 sigma yet.
-        rough_iterations: of these at most: where they do not do outliers lead, and the surrogates begin anyhow.
-        mu_step: factor from one surrogate to the next, with one reweighted step each (Yang et al.: 1.4).
-        undecided: share of measurements whose weights are neither 0 nor 1 below which the truncated loss follows: what
-            they say of anything is less than that share.
-        last_mu: of the last surrogate at most; its weights are 0 or 1 but for .1 % about the gate.
-        softness: by which sigmas are multiplied where a family has lost most of its measurements, one after the other
-            while it does: so many that priors hold all, or nearly all.
-        hardening_mu, hardening_iterations: of each of the steps, `mu_step` apart, from there to the true sigmas.
-        max_chance: of a family that it loses more than half of its measurements to outliers.
-    """
-
-    minimizer: LevenbergConfig = field(default_factory=LevenbergConfig)
-    rough_tolerance: float = 2e-3
-    rough_iterations: int = 8
-    mu_step: float = 2.5
-    undecided: float = 0.01
-    last_mu: float = 1e3
-    softness: tuple[float, ...] = (1e4, 1e3)
-    hardening_mu: float = 0.2
-    hardening_iterations: int = 2
-    max_chance: float = 1e-3
+# Decrease of chi-square per measurement at which plain least squares is near enough to begin with: residuals move by
+# .05 sigma yet; and its iterations at most: where they do not do outliers lead, and the surrogates begin anyhow.
+_ROUGH_TOLERANCE, _ROUGH_ITERATIONS = 2e-3, 8
+# Factor of mu from one surrogate to the next, with one reweighted step each (Yang et al.: 1.4), and the last mu at
+# most: weights are 0 or 1 then but for .1 % about the gate.
+_MU_STEP, _LAST_MU = 2.5, 1e3
+# Share of measurements whose weights are neither 0 nor 1 below which the truncated loss follows: what they say of
+# anything is less than that share.
+_UNDECIDED = 0.01
+# Factors of sigmas where a family has lost most of its measurements, one after the other while it does: so large that
+# priors hold all, or nearly all; mu and iterations of each of the steps, `_MU_STEP` apart, from there to true sigmas.
+_SOFTNESS, _HARDENING_MU, _HARDENING_ITERATIONS = (1e4, 1e3), 0.2, 2
+# Chance that a family loses more than half of its measurements to outliers.
+_MAX_CHANCE = 1e-3
 
 
-def solve_robust(engine: Linearization, values: Values, loss: TruncatedLoss | None, config: RobustConfig) -> Solution:
+def solve_robust(
+    engine: Linearization, values: Values, loss: TruncatedLoss | None, config: LevenbergConfig = DEFAULT
+) -> Solution:
     """Minimise the truncated loss from a first guess."""
     plain = engine.under(None)
     if loss is None:
-        return minimize(plain, values, config.minimizer)
+        return minimize(plain, values, config)
     count = sum(len(group.model.time) for group in engine.groups if group.is_measurement)
-    most = min(config.rough_iterations, config.minimizer.max_iterations)
-    tolerance = config.rough_tolerance * max(count, 1)
-    rough = replace(config.minimizer, max_iterations=most, cost_tolerance=tolerance, corrections=0)
+    most = min(_ROUGH_ITERATIONS, config.max_iterations)
+    tolerance = _ROUGH_TOLERANCE * max(count, 1)
+    rough = replace(config, max_iterations=most, cost_tolerance=tolerance, corrections=0)
     found = minimize(plain, values, rough)
     iterations = found.iterations
     truncated = engine.under(loss)
@@ -78,7 +64,7 @@ def solve_robust(engine: Linearization, values: Values, loss: TruncatedLoss | No
     same = start is found.values and truncated.cost(start) == found.cost
     final = solve_truncated(engine, start, loss, config, (found.system, found.cost) if same else None)
     iterations += more + final.iterations
-    for softness in config.softness:
+    for softness in _SOFTNESS:
         lost = zip(truncated.groups, final.engine.groups, strict=True)
         if deadline.passed() or not any(before.loss is not None and after.loss is None for before, after in lost):
             break
@@ -89,20 +75,20 @@ def solve_robust(engine: Linearization, values: Values, loss: TruncatedLoss | No
 
 
 def _hardened(
-    engine: Linearization, values: Values, softness: float, loss: TruncatedLoss, config: RobustConfig
+    engine: Linearization, values: Values, softness: float, loss: TruncatedLoss, config: LevenbergConfig
 ) -> Values:
     """Values to which measurements lead whose sigmas are so many times as large first, and then less and less.
 
     A dozen pictures, three of them outliers, are explained by a gyro scale 200 sigmas from its prior, and every way
     from there leads past the minimum. While measurements are soft, priors and process models hold.
     """
-    few = replace(config.minimizer, max_iterations=config.rough_iterations, corrections=0)
+    few = replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0)
     values = minimize(_soft(engine.under(None), softness), values, few).values
-    few = replace(few, max_iterations=config.hardening_iterations)
+    few = replace(few, max_iterations=_HARDENING_ITERATIONS)
     while softness > 1.0 and not deadline.passed():
-        relaxed = _soft(engine.under(replace(loss, mu=config.hardening_mu)), softness)
+        relaxed = _soft(engine.under(replace(loss, mu=_HARDENING_MU)), softness)
         values = minimize(relaxed, values, few).values
-        softness /= config.mu_step
+        softness /= _MU_STEP
     return values
 
 
@@ -116,7 +102,7 @@ def solve_truncated(
     engine: Linearization,
     values: Values,
     loss: TruncatedLoss,
-    config: RobustConfig,
+    config: LevenbergConfig,
     known: tuple[System, float] | None = None,
 ) -> Solution:
     """Least squares on what lies inside the gate near some values, and on all of a family that loses too much.
@@ -125,24 +111,26 @@ def solve_truncated(
     """
     current, iterations = engine.under(loss), 0
     while True:
-        final = minimize(current, values, config.minimizer, known)
+        final = minimize(current, values, config, known)
         iterations += final.iterations
-        wrong = _mostly_rejected(final.engine, final.values, config.max_chance)
+        wrong = _mostly_rejected(final.engine, final.values)
         if not wrong:
             return replace(final, iterations=iterations)
         groups = [replace(g, loss=None) if g.family in wrong else g for g in current.groups]
         current, known = current.with_groups(groups), None
 
 
-def _graduated(engine: Linearization, values: Values, loss: TruncatedLoss, config: RobustConfig) -> tuple[Values, int]:
+def _graduated(
+    engine: Linearization, values: Values, loss: TruncatedLoss, config: LevenbergConfig
+) -> tuple[Values, int]:
     """Values to which one surrogate of the loss after the other leads, and the iterations that takes."""
     largest = max((_norms(g, values).max(initial=0.0) for g in engine.groups if g.loss is not None), default=0.0)
     if largest <= loss.gate:
         return values, 0
     mu, iterations = loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300), 0
-    while mu < config.last_mu and not deadline.passed():
+    while mu < _LAST_MU and not deadline.passed():
         relaxed = engine.under(replace(loss, mu=mu))
-        if _undecided(relaxed, values) < config.undecided:
+        if _undecided(relaxed, values) < _UNDECIDED:
             break
         try:
             step = Tangent(*relaxed.at(values)[0].eliminate().solve())
@@ -150,10 +138,10 @@ def _graduated(engine: Linearization, values: Values, loss: TruncatedLoss, confi
             break
         there = engine.layout.retract(values, step)
         if not relaxed.cost(there) < relaxed.cost(values):
-            few = replace(config.minimizer, max_iterations=config.rough_iterations, corrections=0)
+            few = replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0)
             there = minimize(relaxed, values, few).values
         values, iterations = there, iterations + 1
-        mu *= config.mu_step
+        mu *= _MU_STEP
     return values, iterations
 
 
@@ -192,7 +180,7 @@ def without_onsets(engine: Linearization, solution: Solution) -> Linearization |
     return engine.with_groups(groups) if any(g.excluded is not None for g in groups) else None
 
 
-def _mostly_rejected(engine: Linearization, values: Values, chance: float) -> set[str]:
+def _mostly_rejected(engine: Linearization, values: Values) -> set[str]:
     """Families that lose more than half of their measurements significantly (binomial test against one half)."""
     counts: dict[str, list[int]] = {}
     for group in engine.groups:
@@ -204,5 +192,5 @@ def _mostly_rejected(engine: Linearization, values: Values, chance: float) -> se
     return {
         family
         for family, (rejected, n) in counts.items()
-        if 0.5 * math.erfc((2.0 * rejected - 1.0 - n) / math.sqrt(2.0 * n)) < chance
+        if 0.5 * math.erfc((2.0 * rejected - 1.0 - n) / math.sqrt(2.0 * n)) < _MAX_CHANCE
     }

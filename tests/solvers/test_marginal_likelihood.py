@@ -19,7 +19,7 @@ from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels, widened
-from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+from alidade.pipelines.solvers.robust import solve_robust
 
 SCENARIO = HeadScenario.model_validate(
     {"duration_s": 30.0, "vision_rate_hz": 20.0, "gyro_rate_hz": 100.0, "latitude_deg": None, "sensors": {}}
@@ -35,7 +35,7 @@ def chain() -> tuple[LinearChain, tuple[Level, ...]]:
     """A recording about its solution, and its noises as stated."""
     compiled = Compiled.of(made(simulate_head(SCENARIO, 1)[0]), "chain")
     assert isinstance(compiled.engine, Linearization)
-    solution = solve_robust(compiled.engine, compiled.initial, compiled.problem.loss, RobustConfig())
+    solution = solve_robust(compiled.engine, compiled.initial, compiled.problem.loss)
     return LinearChain.of(compiled.engine, solution.values), compiled.problem.noises
 
 

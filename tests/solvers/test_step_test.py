@@ -21,7 +21,7 @@ from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import LinearChain
-from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+from alidade.pipelines.solvers.robust import solve_robust
 from alidade.pipelines.solvers.step_test import STEP_PRIOR, scan, split
 
 DURATION_S = 30.0
@@ -70,7 +70,7 @@ def test_the_scan_is_exact() -> None:
     compiled = Compiled.of(problem(slipped(recorded(1), 0.5, 12.0)), "chain")
     engine = compiled.engine
     assert isinstance(engine, Linearization)
-    values = solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig()).values
+    values = solve_robust(engine, compiled.initial, compiled.problem.loss).values
     chain, key = LinearChain.of(engine, values), compiled.problem.may_step[0]
     columns = np.flatnonzero(engine.layout.root_columns(key)[:, engine.layout.sizes[3] :].any(axis=0))
     variances = chain.variances(compiled.problem.noises)

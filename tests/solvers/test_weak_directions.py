@@ -14,7 +14,7 @@ from alidade.pipelines.methods.los.simulation import LosScenario, los_config, si
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import solve_incremental
-from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+from alidade.pipelines.solvers.robust import solve_robust
 from alidade.pipelines.solvers.weak_directions import (
     MAX_SIGMA,
     Posterior,
@@ -37,7 +37,7 @@ def posterior(recorded: Problem, until: float) -> Posterior:
     steps = list(recorded.steps(1))
     end = next((i for i, step in enumerate(steps) if step.time >= until), len(steps))
     compiled = Compiled.of(recorded, "chain", steps[: end + 1])
-    solution = solve_robust(compiled.engine, compiled.initial, recorded.loss, RobustConfig())
+    solution = solve_robust(compiled.engine, compiled.initial, recorded.loss)
     assert solution.converged, solution.message
     return constrained_solution(compiled, solution.at_inliers())
 

@@ -13,8 +13,9 @@ from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
+from alidade.pipelines.solvers import incremental as online
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.incremental import IncrementalConfig, IncrementalSolver, solve_incremental
+from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental
 from alidade.pipelines.solvers.window import Keyframes, parse_window
 
 # More than twice as many keyframes as a window of ten holds.
@@ -62,9 +63,10 @@ def test_every_window_ends_where_batch_does(method: str, window: float | None) -
     ("method", "changes"),
     [("head", {"vision_rate_hz": 10.0}), pytest.param("los", {"image_rate_hz": 50.0}, id="los, five pictures a step")],
 )
-def test_so_many_keyframes_are_kept(method: str, changes: dict[str, float]) -> None:
+def test_so_many_keyframes_are_kept(method: str, changes: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(online, "MIN_STEPS", 20)
     problem = made(method, duration_s=6.0, **changes)
-    run = IncrementalSolver(problem, Keyframes(7), IncrementalConfig(min_steps=20))
+    run = IncrementalSolver(problem, Keyframes(7))
     held = []
     for step in problem.steps(1):
         run.add_step(step)
