@@ -296,8 +296,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     shapes = [[(g.family, g.target, len(g.model.time), g.model.rows) for g in e.groups] for e in (own, engine)]
     if not np.array_equal(other.layout.key, solved.compiled.layout.key) or shapes[0] != shapes[1]:
         return {}
-    kept = [new.counting(g.inliers(values)) for g, new in zip(own.groups, engine.groups, strict=True)]
-    moves = influence.moves(engine.with_groups(kept))
+    moves = influence.moves(engine.counting(own.inliers(values)))
     return dict(zip(influence.names, moves.tolist(), strict=True))
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Mask
 from alidade.pipelines.estimation.problem import Estimate, Problem, SqrtInformation
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.linearization import Group, Linearization
-from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels
+from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels, unwidened
 from alidade.pipelines.solvers.noise_estimation import apply_levels
 from alidade.pipelines.solvers.posterior import moved_to, sqrt_information
 
@@ -49,17 +49,16 @@ def at_solution(freed: Problem, estimate: Estimate) -> tuple[Compiled, Lineariza
     used, values = _used(compiled.engine.groups, estimate), compiled.initial
     numbers = {q.name: q.prior_mean for q in compiled.problem.quantities}
     numbers |= zip(estimate.names, estimate.values.tolist(), strict=True)
-    engine = _without_rejected(apply_levels(compiled.engine, levels), used)
+    engine = apply_levels(compiled.engine, levels).counting(used)
     for _ in range(_STEPS):
         values = moved_to(compiled, engine, values, numbers)
     if freed.marginal_likelihood and compiled.engine.is_chain:
-        out = {i: ~used[i] for i, group in enumerate(engine.groups) if group.is_measurement}
-        found = estimate_levels(LinearChain.of(compiled.engine, values), levels, rejected=out)
-        engine = _without_rejected(apply_levels(compiled.engine, found.levels), used)
+        found = estimate_levels(LinearChain.of(compiled.engine, values), levels, unwidened(used))
+        engine = apply_levels(compiled.engine, found).counting(used)
     return compiled, engine, values
 
 
-def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]]:
+def _used(groups: Sequence[Group], estimate: Estimate) -> list[Mask]:
     """Inlier mask (n,) of each group in the solution; all where it has other measurements of the family."""
     used = [np.ones(len(group.model.time), dtype=bool) for group in groups]
     for family, known in estimate.residuals.items():
@@ -73,8 +72,3 @@ def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]
         for i, each in zip(own, np.split(flat, ends), strict=True):
             used[i] = each
     return used
-
-
-def _without_rejected(engine: Linearization, used: Sequence[NDArray[np.bool_]]) -> Linearization:
-    """The engine with measurements that count in full or not at all."""
-    return engine.with_groups([group.counting(own) for group, own in zip(engine.groups, used, strict=True)])

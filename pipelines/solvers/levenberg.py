@@ -106,7 +106,7 @@ class Solution(Point):
 
     def at_inliers(self) -> Solution:
         """The solution's system without what the loss rejects here. Raises IndeterminateStateError."""
-        engine = without_rejected(self.engine, self.values)
+        engine = self.engine.counting(self.engine.inliers(self.values))
         out = replace(self, engine=engine, cost=engine.cost(self.values))
         vars(out).update(factorization=self.factorization)
         return out
@@ -171,7 +171,7 @@ def _reached(
         return _lengthened(engine, here.values, step, there.cost), 0
     if there.cost < here.cost or config.corrections == 0:
         return there, 0
-    firm, counted = max(_INITIAL_DAMPING, _FIRMER * damping), without_rejected(engine, here.values)
+    firm, counted = max(_INITIAL_DAMPING, _FIRMER * damping), engine.counting(engine.inliers(here.values))
     back = Point.of(counted, there.values)
     for count in range(1, config.corrections + 1):
         correction, _ = _step(back.system, firm)
@@ -184,12 +184,6 @@ def _reached(
         if engine.cost(back.values) < here.cost:
             return Point.of(engine, back.values), count
     return there, config.corrections
-
-
-def without_rejected(engine: Linearization, values: Values) -> Linearization:
-    """The measurements that count at some values, in full, whatever they are elsewhere."""
-    groups = [g if g.loss is None else g.counting(g.inliers(values)) for g in engine.groups]
-    return engine.with_groups(groups)
 
 
 def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: float) -> Point:

@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Mask
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Block, Model, Residuals, dimension, select_rows, stack_models, stacking_key
@@ -112,8 +112,8 @@ class Group:
     place: Index
     row: Index
     columns: list[list[Index]]
-    deviates: list[NDArray[np.bool_]]
-    excluded: NDArray[np.bool_] | None = None
+    deviates: list[Mask]
+    excluded: Mask | None = None
 
     def evaluate(self, values: Values) -> Residuals:
         """Whitened residuals (n, m), unweighted, and their Jacobians on demand."""
@@ -130,7 +130,7 @@ class Group:
         shape = len(self.model.time), self.model.rows
         return np.ones(shape) if self.weights is None else self.weights.copy()
 
-    def counting(self, used: NDArray[np.bool_]) -> Group:
+    def counting(self, used: Mask) -> Group:
         """Without its loss: those of its n measurements that are used in full, the others not at all."""
         return replace(self, loss=None, excluded=None if used.all() else ~used)
 
@@ -149,7 +149,7 @@ class Group:
             return self._included(np.ones(len(residuals)))
         return self._included(self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)]))))
 
-    def inliers(self, values: Values) -> NDArray[np.bool_]:
+    def inliers(self, values: Values) -> Mask:
         """Mask (n,) of the measurements that count at some values: neither rejected by the loss nor excluded."""
         if self.loss is None:
             return np.ones(len(self.model.time), dtype=bool) if self.excluded is None else ~self.excluded
@@ -335,6 +335,14 @@ class Linearization:
     def with_groups(self, groups: Sequence[Group]) -> Linearization:
         """The linearisation with other measurements at the same variables."""
         return replace(self, groups=groups)
+
+    def inliers(self, values: Values) -> list[Mask]:
+        """Of each group the mask (n,) of the measurements that count at some values."""
+        return [group.inliers(values) for group in self.groups]
+
+    def counting(self, used: Sequence[Mask]) -> Linearization:
+        """The measurements that are used, (n,) of each group, in full, whatever they are elsewhere; no others."""
+        return self.with_groups([group.counting(own) for group, own in zip(self.groups, used, strict=True)])
 
     def products(self, group: Group, values: Values, flat: Array) -> tuple[Array, Array]:
         """A x (n, m, k) of a group's whitened rows with k tangent vectors laid flat, and its right side (n, m)."""

@@ -21,9 +21,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Mask
 from alidade.factors.model import ROT3
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
 from alidade.pipelines.estimation.problem import APART, Factor, Parameter, StepEstimate
@@ -36,11 +36,11 @@ from alidade.pipelines.solvers.marginal_likelihood import (
     NO_SAY,
     LikelihoodMaximum,
     LinearChain,
-    Outliers,
     Rows,
+    Widening,
     maximise_likelihood,
-    rejected,
     sandwich,
+    unwidened,
     widened,
 )
 
@@ -267,8 +267,8 @@ def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solutio
 def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
     engine, values = compiled.engine, solution.values
     parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.may_step]
-    outliers = rejected(solution.engine, values)
-    transient = {group: _transient(out) for group, out in outliers.items()}
+    used = solution.engine.inliers(values)
+    outliers, transient = unwidened(used), unwidened([~_transient(~own) for own in used])
     base = _Fit.of(engine, values, levels, transient)
     scans = [(p, found) for p in parameters if (found := base.scanned(p)) is not None]
     steps = [_scanned(base, p, found) for p, found in scans if found.fall.max() < NOTHING]
@@ -302,14 +302,11 @@ class _Fit:
     minus_two_log_likelihood: float
 
     @classmethod
-    def of(cls, engine: Linearization, values: Values, levels: Sequence[Level], out: Outliers) -> _Fit:
+    def of(cls, engine: Linearization, values: Values, levels: Sequence[Level], outliers: Widening) -> _Fit:
         chain = LinearChain.of(engine, values)
-        wide, _ = widened(chain, levels, out)
-        by = [
-            np.where(out.get(rows.group, False), NO_SAY**0.5, wide.get(rows.group, np.ones(len(rows.time))))
-            for rows in chain.rows
-        ]
-        variances = [v * w**2 for v, w in zip(chain.variances(levels), by, strict=True)]
+        wide = widened(chain, levels, outliers)
+        widest = [np.where(np.isinf(out), np.inf, own) for out, own in zip(outliers, wide, strict=True)]
+        variances = chain.variances(levels, widest, NO_SAY)
         known = [(np.log(level.scale) / max(level.noise.known, ROUGHLY)) ** 2 for level in levels]
         solved = chain.solved(variances)
         value = np.inf if solved is None else solved.value + float(sum(known))
@@ -322,7 +319,7 @@ class _Fit:
         return scan(self.chain, self.variances, columns) if len(columns) else None
 
 
-def _transient(outliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _transient(outliers: Mask) -> Mask:
     """Mask (n,) of outliers with measurements before and after them: the reference went off and came back."""
     used = np.flatnonzero(~outliers)
     between = np.zeros(len(outliers), dtype=bool)
@@ -332,10 +329,10 @@ def _transient(outliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _maximised(
-    engine: Linearization, values: Values, levels: Sequence[Level], outliers: Outliers, transient: Outliers
+    engine: Linearization, values: Values, levels: Sequence[Level], outliers: Widening, transient: Widening
 ) -> _Fit:
     """Noise levels and values of the largest likelihood, from initial ones."""
-    best = maximise_likelihood(engine, LikelihoodMaximum.near(values, levels, outliers))
+    best = maximise_likelihood(engine, LikelihoodMaximum(values, tuple(levels), outliers))
     return _Fit.of(engine, best.values, best.levels, transient)
 
 
@@ -364,7 +361,7 @@ def _length(step: Array, covariance: Array) -> tuple[float, float]:
 
 
 def _solved_again(
-    without: _Fit, base: _Fit, outliers: Outliers, transient: Outliers, parameter: Parameter, found: Scan, i: int
+    without: _Fit, base: _Fit, outliers: Widening, transient: Widening, parameter: Parameter, found: Scan, i: int
 ) -> StepEstimate | None:
     """A candidate with levels, widening and linearisation of its own; None: it is not determined."""
     engine, values, late = split(base.engine, base.values, parameter.key, float(found.time[i]), found.step[i])
@@ -427,7 +424,7 @@ def _returns(fit: _Fit, columns: Index, time: float, turn: Array) -> bool:
     return bool(soon[at] and back.fall[at] > APART and halved)
 
 
-def _leads_to(rows: Rows, keyframe: int) -> NDArray[np.bool_]:
+def _leads_to(rows: Rows, keyframe: int) -> Mask:
     """Mask (n,) of rows that join a keyframe to the one before."""
     if len(rows.states) != 2:
         return np.zeros(len(rows.time), dtype=bool)
