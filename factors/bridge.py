@@ -301,6 +301,14 @@ def _array(variables: Sequence[Any], block: Block) -> Array:
     return np.array(variables)
 
 
+def value_at(values: gtsam.Values, key: int) -> gtsam.Rot3 | Array:
+    """A variable that is a rotation or a vector."""
+    try:
+        return values.atRot3(key)
+    except RuntimeError:
+        return values.atVector(key)
+
+
 def _name(key: int) -> str:
     """A variable as people write it."""
     symbol = gtsam.Symbol(key)

@@ -220,5 +220,4 @@ def _without(group: Group, out: Mask) -> Group:
     """A group without the measurements that are held out; processes and priors stay."""
     if not group.is_measurement:
         return group
-    weights = np.ones((len(out), group.model.rows)) if group.weights is None else group.weights
-    return replace(group, weights=weights * ~out[:, None])
+    return replace(group, weights=group.all_weights * ~out[:, None])

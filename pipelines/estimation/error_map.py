@@ -8,7 +8,7 @@ mount, are uncorrelated and of rms 1: principal components of the harmonics. So 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +16,6 @@ import gtsam
 import numpy as np
 
 from alidade.factors.error_map import ErrorMapFactor
-from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.priors import vector_prior
 from alidade.pipelines.estimation.problem import (
     Array,
@@ -27,6 +26,7 @@ from alidade.pipelines.estimation.problem import (
     Quantity,
     SqrtInformation,
     Step,
+    changed,
 )
 from alidade.pipelines.estimation.widening import marginalised, widened
 
@@ -107,19 +107,14 @@ class ErrorMap:
 
     def added_to(self, problem: Problem) -> Problem:
         """The problem with the map free, to be solved as a whole."""
-        parameter, finer = self.parameter, problem.finer
-
-        def closer(levels: Sequence[Level]) -> Problem | None:
-            more = finer(levels) if finer is not None else None
-            return None if more is None else self.added_to(more)
-
+        parameter = self.parameter
         return replace(
             problem,
             parameters=(*problem.parameters, parameter),
             steps=lambda chunk: self._steps(problem.steps(chunk), parameter),
             steps_after=None,
             continuation=None,
-            finer=None if finer is None else closer,
+            finer=changed(problem.finer, self.added_to),
             error_map=None,
         )
 

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import takewhile
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from alidade.factors.array import Index, Mask
+from alidade.factors.bridge import value_at
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.priors import pinned
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step, changed
 from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
 
 # Gives the steps before some.
@@ -94,7 +96,12 @@ def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier
     )
     others = known.given({name: mean for name, mean in means.items() if name not in replaced})
     factors = _PriorFactors(parameters, known, replaced)
-    steps, after, continuation, finer = problem.steps, problem.steps_after, problem.continuation, problem.finer
+    steps, after, continuation = problem.steps, problem.steps_after, problem.continuation
+
+    def continued(data: Any, time: float) -> Problem | None:
+        more = continuation(data, time) if continuation is not None else None
+        return None if more is None else _with_prior(more, gaussian_prior, lambda: _until(steps, time))
+
     premise = f"The prior of {len(replaced)} parameters is {gaussian_prior.source}." if gaussian_prior.source else ""
     return replace(
         problem,
@@ -102,10 +109,8 @@ def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier
         gaussian_priors=(*problem.gaussian_priors, others),
         steps=lambda chunk: factors.steps(steps(chunk), before),
         steps_after=None if after is None else lambda time: factors.steps(after(time), lambda: _until(steps, time)),
-        continuation=None
-        if continuation is None
-        else lambda data, time: _grown(continuation(data, time), gaussian_prior, lambda: _until(steps, time)),
-        finer=None if finer is None else lambda levels: _grown(finer(levels), gaussian_prior, tuple),
+        continuation=None if continuation is None else continued,
+        finer=changed(problem.finer, partial(_with_prior, gaussian_prior=gaussian_prior)),
         premises=(*problem.premises, *filter(None, [premise])),
     )
 
@@ -126,10 +131,6 @@ def _require_sense(gaussian_prior: GaussianPrior, own: Mapping[str, Quantity]) -
     correlation = gaussian_prior.covariance[np.ix_(free, free)] / np.outer(sigmas[free], sigmas[free])
     if np.linalg.eigvalsh(correlation).min(initial=1.0) < _LEAST_CORRELATED:
         raise InputError(f"{where}: the covariance is singular: a combination of its numbers is known exactly")
-
-
-def _grown(problem: Problem | None, gaussian_prior: GaussianPrior, before: Earlier) -> Problem | None:
-    return None if problem is None else _with_prior(problem, gaussian_prior, before)
 
 
 def _until(steps: Callable[[int], Iterator[Step]], time: float) -> Iterator[Step]:
@@ -178,7 +179,7 @@ class _PriorFactors:
         """Add the parameters that begin in a step to those that have begun, at the prior mean; returns these."""
         new = [p for p in self.parameters if step.initial.exists(p.key)]
         for p in new:
-            begun.insert(p.key, _value(step.initial, p.key))
+            begun.insert(p.key, value_at(step.initial, p.key))
             if p in self._concerned:
                 self._move(p, begun)
         return new
@@ -189,7 +190,7 @@ class _PriorFactors:
         new = self._begin(step, begun)
         initial = gtsam.Values(step.initial)
         for p in new:
-            initial.update(p.key, _value(begun, p.key))
+            initial.update(p.key, value_at(begun, p.key))
         factors: list[Factor] = []
         for f in step.factors:
             if f.family == "prior" and all(begun.exists(key) for key in f.keys):
@@ -257,14 +258,6 @@ class _PriorFactors:
 
         unit = gtsam.noiseModel.Unit.Create(len(root))
         return Factor("prior", gtsam.CustomFactor(unit, [p.key for p in concerned], evaluate))
-
-
-def _value(values: gtsam.Values, key: int) -> gtsam.Rot3 | Array:
-    """A variable that is a rotation or a vector."""
-    try:
-        return values.atRot3(key)
-    except RuntimeError:
-        return values.atVector(key)
 
 
 def conditional_root(covariance: Array, sigmas: Array) -> Array:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec
 
 import gtsam
 import numpy as np
@@ -35,6 +35,8 @@ EngineName = Literal["auto", "chain", "gtsam"]
 AttitudeRate = Literal["vision", "gyro"]
 # Frames in one vectorised factor of a gtsam graph: past this the Jacobians' zeros cost more than the calls they save.
 CHUNK = 20
+
+Arguments = ParamSpec("Arguments")
 
 # What a method found beside its parameters: name of a table -> its rows, plain numbers and words in SI.
 Findings = Mapping[str, Sequence[Mapping[str, object]]]
@@ -360,22 +362,11 @@ class Problem:
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
         """The problem with rotations reported by the rotation vectors nearest to these numbers (rad, by name)."""
-        continuation, finer = self.continuation, self.finer
-
-        def grown(data: Any, time: float) -> Problem | None:
-            more = continuation(data, time) if continuation is not None else None
-            return None if more is None else more.near(numbers)
-
-        def closer(levels: Sequence[Level]) -> Problem | None:
-            more = finer(levels) if finer is not None else None
-            return None if more is None else more.near(numbers)
-
-        parameters = tuple(parameter.near(numbers) for parameter in self.parameters)
         return replace(
             self,
-            parameters=parameters,
-            continuation=None if continuation is None else grown,
-            finer=None if finer is None else closer,
+            parameters=tuple(parameter.near(numbers) for parameter in self.parameters),
+            continuation=changed(self.continuation, lambda more: more.near(numbers)),
+            finer=changed(self.finer, lambda more: more.near(numbers)),
         )
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
@@ -405,6 +396,20 @@ class Problem:
             covariance[at], covariance[:, at] = 0.0, 0.0
             covariance[np.ix_(at, at)] = known.covariance
         return covariance
+
+
+def changed(
+    make: Callable[Arguments, Problem | None] | None, change: Callable[[Problem], Problem]
+) -> Callable[Arguments, Problem | None] | None:
+    """What makes problems, each of which is then changed; None: it makes none."""
+    if make is None:
+        return None
+
+    def made(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Problem | None:
+        problem = make(*args, **kwargs)
+        return None if problem is None else change(problem)
+
+    return made
 
 
 @dataclass(frozen=True)

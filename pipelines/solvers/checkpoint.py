@@ -19,6 +19,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from alidade.factors.bridge import value_at
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import Array, Factor, Step
@@ -71,7 +72,8 @@ class MarginalState:
         except RuntimeError as error:
             raise undetermined(error) from None
         own = gtsam.Values()
-        _copy(values, keys, own)
+        for key in keys:
+            own.insert(key, value_at(values, key))
         return cls(time, own, gtsam.JacobianFactor(conditional), {k: t for k, t in stamps.items() if k in kept})
 
     @property
@@ -85,15 +87,6 @@ class MarginalState:
     def factor(self) -> Factor:
         """The Gaussian as a factor of a graph."""
         return Factor("prior", gtsam.LinearContainerFactor(self.linear, self.values))
-
-
-def _copy(values: gtsam.Values, keys: Iterable[int], out: gtsam.Values) -> None:
-    """Insert some variables, vectors or rotations, into other values."""
-    for key in keys:
-        try:
-            out.insert(key, values.atRot3(key))
-        except RuntimeError:
-            out.insert(key, values.atVector(key))
 
 
 def require_known_variables(factors: Iterable[Factor], values: gtsam.Values, time: float) -> None:

@@ -165,8 +165,8 @@ def _tested(root: Array, error_map: ErrorMap, ratio: float) -> tuple[float, int,
 
 def _mapped(engine: Linearization, values: Values, error_map: ErrorMap) -> tuple[Linearization, Values]:
     """The linearisation with the numbers of a map as its last shared unknowns, without a prior, and these 0."""
-    (n, d, nodes, c, s), k = engine.layout.sizes, len(error_map.names)
-    known = values.arrays.get(k, np.empty((0, k)))
+    (_, d, _, c, s), k = engine.layout.sizes, len(error_map.names)
+    layout, values, at = engine.layout.with_shared(values, k, np.zeros(k))
     begin = {"state": d + c + s, "pair": 2 * d + c + s, "walk": 2 * c + s, "shared": s}
 
     def added(group: Group) -> Group:
@@ -176,12 +176,10 @@ def _mapped(engine: Linearization, values: Values, error_map: ErrorMap) -> tuple
         return replace(
             group,
             model=ErrorMapFactor(group.model, error_map.functions_at(group.model.time), len(error_map.axes)),
-            gather=[*group.gather, (k, np.array([len(known)]))],
-            at=[*group.at, np.zeros(1, dtype=np.intp)],
+            gather=[*group.gather, (k, layout.row[[at]])],
+            at=[*group.at, np.array([at])],
             columns=[*group.columns, [columns[None]]],
             deviates=[*group.deviates, np.array([False])],
         )
 
-    layout = replace(engine.layout, sizes=(n, d, nodes, c, s + k))
-    arrays = {**values.arrays, k: np.concatenate([known, np.zeros((1, k))])}
-    return replace(engine, layout=layout, groups=[added(group) for group in engine.groups]), Values(arrays)
+    return replace(engine, layout=layout, groups=[added(group) for group in engine.groups]), values

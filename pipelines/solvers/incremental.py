@@ -63,7 +63,7 @@ from alidade.pipelines.solvers.weak_directions import (
     WeakDirections,
     at_prior,
     beyond_second_order,
-    constrained_step,
+    constrained,
 )
 from alidade.pipelines.solvers.window import Keyframes, Window
 
@@ -317,10 +317,7 @@ class IncrementalSolver:
         reported = self._reported()
         variances, axes = np.linalg.eigh(self._smoothed_covariance(reported))
         R = axes.T / np.sqrt(np.clip(variances, _LEAST_VARIANCE, WIDEST**2))[:, None]
-        directions = WeakDirections.of(R, reported.prior, reported.calibrated)
-        values = reported.numbers.copy()
-        values[reported.free] += reported.scale * constrained_step(directions, R, np.zeros(len(R)), reported.u)
-        return replace(reported, numbers=values), directions
+        return constrained(reported, R, np.zeros(len(R)))
 
     def _smoothed_covariance(self, reported: Reported) -> Array:
         """The smoother's covariance (m, m) of the free reported numbers, in units of their usual priors' sigmas."""

@@ -11,7 +11,7 @@ those of node z_j = (delta_j, mu_j), z_0 = 0. Variables of a state that a keyfra
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -194,6 +194,25 @@ class Layout:
             found[self.row[some]] = _read(values, self.key[some])[1]
             arrays[block] = found
         return Values(arrays)
+
+    def with_shared(self, values: Values, block: Block, value: Array) -> tuple[Layout, Values, int]:
+        """The layout with one more shared variable, the last of its columns, all values, and its position."""
+        known = values.arrays.get(block, np.empty((0, width(block))))
+        blocks = self.blocks if block in self.blocks else (*self.blocks, block)
+        numbers = {
+            "key": self.key.max() + 1,
+            "block": blocks.index(block),
+            "row": len(known),
+            "shared": self.sizes[4],
+            "keyframe": -1,
+            "offset": 0,
+            "node": -1,
+            "part": 0,
+        }
+        grown: dict[str, Any] = {name: np.append(getattr(self, name), number) for name, number in numbers.items()}
+        sizes = (*self.sizes[:4], self.sizes[4] + dimension(block))
+        arrays = {**values.arrays, block: np.vstack([known, value])}
+        return replace(self, **grown, blocks=blocks, sizes=sizes), Values(arrays), len(self.key)
 
     def root_columns(self, key: int) -> Array:
         """Columns (d, c + s) by which a variable's tangent follows from the last node and the shared unknowns.

@@ -38,6 +38,7 @@ from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.noise_estimation import apply_levels
+from alidade.pipelines.solvers.posterior import Reported
 
 # Of each group of a linearisation, (n,) by which the sigmas of its measurements are multiplied; infinite: rejected.
 Widening = Sequence[Array]
@@ -809,12 +810,7 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     counts as 1.
     """
     chain, variances = _at(compiled, levels, solution)
-    layout = compiled.layout
-    at, columns = layout.to_gtsam(solution.values, compiled.keys), []
-    for p, key in zip(compiled.problem.parameters, compiled.keys, strict=True):
-        _, J = p.coordinates(at, key)
-        columns.append(J @ layout.root_columns(key)[:, layout.sizes[3] :])
-    reported = np.concatenate(columns)
+    reported = Reported.of(compiled, solution.values).jacobian[:, compiled.layout.sizes[3] :]
     nominal, robust, blocks = sandwich(chain, variances)
     above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
     ratio = sigma_ratio(below, above)

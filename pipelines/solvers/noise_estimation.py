@@ -89,10 +89,15 @@ def estimate_noise(
 
 def apply_levels(engine: Linearization, levels: Sequence[Level]) -> Linearization:
     """The measurements with their noise at these levels, over what they were whitened by."""
-    scaled = [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
+    scaled = acting(levels)
     if not scaled:
         return engine
     return engine.with_groups([_at_levels(group, scaled) for group in engine.groups])
+
+
+def acting(levels: Iterable[Level]) -> list[Level]:
+    """The levels that change the noise by which measurements were whitened."""
+    return [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
 
 
 def _at_levels(group: Group, levels: Sequence[Level]) -> Group:

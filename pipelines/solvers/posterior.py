@@ -391,8 +391,7 @@ def sqrt_information(
             of_device &= off <= UNSEEN**0.5 * np.abs(rows[..., :-1]).max(axis=2)
             prior_R.append(about[of_device])
             prior_d.append(rows[of_device, -1])
-            weights = np.ones(of_device.shape) if group.weights is None else group.weights
-            groups.append(replace(group, weights=weights * ~of_device))
+            groups.append(replace(group, weights=group.all_weights * ~of_device))
         else:
             groups.append(group)
     found = reported.root(engine.with_groups(groups).at(values)[0].eliminate().root)

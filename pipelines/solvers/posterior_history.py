@@ -16,7 +16,7 @@ from alidade.pipelines.solvers.chain import Array, ChainFactorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.posterior import Reported
-from alidade.pipelines.solvers.weak_directions import Posterior, WeakDirections, constrained_step
+from alidade.pipelines.solvers.weak_directions import Posterior, constrained
 
 
 def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHistory | None:
@@ -57,11 +57,8 @@ def _known(
     known = layout.to_gtsam(values, keys)
     here = np.concatenate([p.coordinates(known, key)[0] for p, key in zip(problem.parameters, keys, strict=True)])
     found = end.root(root)
-    directions = WeakDirections.of(found.R, end.prior, end.calibrated)
-    u = (here[end.free] - end.mean) / end.scale
-    numbers = here.copy()
-    numbers[end.free] += end.scale * constrained_step(directions, found.R, found.d, u)
-    return numbers, end.covariance(directions.covariance())
+    now, directions = constrained(replace(end, numbers=here), found.R, found.d)
+    return now.numbers, end.covariance(directions.covariance())
 
 
 def _at_node(layout: Layout, variable: int, node: int) -> int:

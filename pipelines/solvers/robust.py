@@ -20,6 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from alidade.factors.array import Mask
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.disturbances import onsets
@@ -162,12 +163,11 @@ def without_onsets(engine: Linearization, solution: Solution) -> Linearization |
 
     Of vectors alone: one component of a disturbance varies with the attitude.
     """
-    found: dict[str, list[tuple[int, Array, Array, Array]]] = {}
+    found: dict[str, list[tuple[int, Array, Array, Mask]]] = {}
     for i, group in enumerate(solution.engine.groups):
         if group.loss is not None and group.model.rows > 1:
-            residuals = group.evaluate(solution.values)[0]
-            norms = np.linalg.norm(group.weighted(residuals), axis=1)
-            found.setdefault(group.family, []).append((i, group.model.time, norms, group.used(residuals) == 0.0))
+            each = group.model.time, _norms(group, solution.values), ~group.inliers(solution.values)
+            found.setdefault(group.family, []).append((i, *each))
     groups = list(engine.groups)
     for parts in found.values():
         time, norms, rejected = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])

@@ -10,10 +10,11 @@ from typing import cast
 import gtsam
 import numpy as np
 
+from alidade.factors.bridge import value_at
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Factor
-from alidade.pipelines.solvers.noise_estimation import level_weights
+from alidade.pipelines.solvers.noise_estimation import acting, level_weights
 
 # Move of a variable, in its own unit (rad, rad/s, s), above which iSAM2 linearises its factors again.
 _RELINEARIZE_MOVE = 1e-2
@@ -104,7 +105,7 @@ class FixedLagSmoother(Smoother):
 
     def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
         self._first.insert(values)
-        self._vectors.update(key for key in values.keys() if _is_vector(values, key))
+        self._vectors.update(key for key in values.keys() if isinstance(value_at(values, key), np.ndarray))
         self._stamps.update(stamps)
         graph = linear_graph_of(factors, self._first)
         first = self._oldest({key for f in factors for key in f.keys}.union(stamps))
@@ -188,14 +189,6 @@ class FixedLagSmoother(Smoother):
         return graph
 
 
-def _is_vector(values: gtsam.Values, key: int) -> bool:
-    try:
-        values.atVector(key)
-    except RuntimeError:
-        return False
-    return True
-
-
 def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
     """The keys as gtsam's ordering."""
     ordering = gtsam.Ordering()
@@ -256,7 +249,7 @@ def inliers(factor: Factor, values: gtsam.Values, loss: TruncatedLoss | None) ->
 
 def weigh(factors: Sequence[Factor], levels: Sequence[Level]) -> list[Factor]:
     """The factors with their measurements' noise at these levels."""
-    scaled = [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
+    scaled = acting(levels)
     if not scaled:
         return list(factors)
     families = {family for level in scaled for family in level.noise.families}

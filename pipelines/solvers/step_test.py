@@ -454,27 +454,14 @@ def split(
 
     layout = engine.layout
     (at,) = layout.at([key]).tolist()
-    late, begin, columns = len(layout.key), int(layout.shared[at]), layout.sizes[4]
-    array = values.arrays[ROT3]
-    grown = replace(
-        layout,
-        key=np.append(layout.key, layout.key.max() + 1),
-        row=np.append(layout.row, len(array)),
-        shared=np.append(layout.shared, columns),
-        block=np.append(layout.block, layout.block[at]),
-        keyframe=np.append(layout.keyframe, -1),
-        offset=np.append(layout.offset, 0),
-        node=np.append(layout.node, -1),
-        part=np.append(layout.part, 0),
-        sizes=(*layout.sizes[:4], columns + 3),
-    )
-    moved = so3.multiply(array[layout.row[at]], so3.exp(step))
-    arrays = {**values.arrays, ROT3: np.vstack([array, moved])}
-    groups = [_with_late(group, at, late, len(array), columns - begin, time) for group in engine.groups]
+    moved = so3.multiply(values.arrays[ROT3][layout.row[at]], so3.exp(step))
+    grown, values, late = layout.with_shared(values, ROT3, moved)
+    further = int(grown.shared[late] - layout.shared[at])
+    groups = [_with_late(group, at, late, int(grown.row[late]), further, time) for group in engine.groups]
     noise = gtsam.noiseModel.Isotropic.Sigma(3, STEP_PRIOR)
     joined = Factor("prior", gtsam.BetweenFactorRot3(key, int(grown.key[late]), gtsam.Rot3(), noise))
     prior = Linearization.of([joined], grown, chain=False).groups
-    return replace(engine, layout=grown, groups=[*groups, *prior]), Values(arrays), int(grown.key[late])
+    return replace(engine, layout=grown, groups=[*groups, *prior]), values, int(grown.key[late])
 
 
 def _with_late(group: Group, at: int, late: int, row: int, further: int, time: float) -> Group:

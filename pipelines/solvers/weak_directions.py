@@ -212,6 +212,18 @@ def constrained_step(directions: WeakDirections, R: Array, d: Array, u: Array) -
     return np.asarray(there - u)
 
 
+def constrained(reported: Reported, R: Array, d: Array) -> tuple[Reported, WeakDirections]:
+    """The numbers at the minimum of a linear system about them, weak directions at their priors, and its directions.
+
+    Args:
+        reported: where the system is linearised.
+        R, d: square-root information of the move.
+    """
+    directions, numbers = WeakDirections.of(R, reported.prior, reported.calibrated), reported.numbers.copy()
+    numbers[reported.free] += reported.scale * constrained_step(directions, R, d, reported.u)
+    return replace(reported, numbers=numbers), directions
+
+
 def slopes(
     directions: WeakDirections,
     roots: Callable[[Array], Iterable[Array]],
