@@ -450,7 +450,9 @@ class _Solution:
             parts: f of each level, (n,) for each kind of rows.
             signs: (n, m, k) for each kind of rows.
         """
-        e, q = [w[:, None] * r for w, r in zip(self.weights, self.residuals(), strict=True)], len(parts)
+        moved, q = self.spread(self.states[:, None], self.shared[:, None]), len(parts)
+        whitened = zip(self.weights, self.chain.rows, moved, strict=True)
+        e = [w[:, None] * rows.residuals + move[..., 0] for w, rows, move in whitened]
         scaled = [
             np.stack([part[i][:, None] * e[i] for part in parts], axis=2) if q else np.zeros((*e[i].shape, 0))
             for i in range(len(e))
