@@ -112,7 +112,7 @@ class Alone:
             continuation=None,
             attitudes=None,
             at_gyro_rate=None,
-            finer=None,
+            denser_graph=None,
             error_map=None,
         )
         return cls(

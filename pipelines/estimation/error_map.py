@@ -114,7 +114,7 @@ class ErrorMap:
             steps=lambda chunk: self._steps(problem.steps(chunk), parameter),
             steps_after=None,
             continuation=None,
-            finer=changed(problem.finer, self.added_to),
+            denser_graph=changed(problem.denser_graph, self.added_to),
             error_map=None,
         )
 

@@ -322,8 +322,8 @@ class Problem:
         continuation: the graph of a recording that grows, from the data of its end and the time, s, of a keyframe of
             this graph that is in them and from which on there are steps; -inf: from all data, with all steps. It agrees
             with this one on variables, and its steps stay as they are, but for the last one and those of the last
-            `unsettled` s. None if there is no such keyframe. Not every graph can be built from the end alone.
-        unsettled: so long, s, is the end of the graph whose steps still change while the recording grows.
+            `revision_horizon` s. None if there is no such keyframe. Not every graph can be built from the end alone.
+        revision_horizon: length, s, of the end of the graph whose steps still change while the recording grows.
         noises: that are in force, with what sensors' own samples say of them.
         constants: numbers of the recording that formulas need beside the parameters, by name.
         keyframes: where they stand; None: there are no pictures with a clock that is estimated.
@@ -331,8 +331,8 @@ class Problem:
             other minima. None: the method has no such.
         layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
-        may_step: keys of rotations that may jump once, as a mount that slips: a solver tests for it.
-        finer: noise levels -> the graph with closer keyframes that they need; None where this one serves.
+        step_candidates: keys of rotations that are tested for a step at one moment, as of a mount that slips.
+        denser_graph: noise levels -> the graph with denser keyframes that they need; None where this one serves.
         error_map: errors that measurements may have at the places that an estimate finds; None: the method has none.
         gaussian_priors: joint priors from elsewhere than data sheets; the last one about a number is in force.
     """
@@ -348,15 +348,15 @@ class Problem:
     premises: tuple[str, ...] = ()
     steps_after: Callable[[float], Iterator[Step]] | None = None
     continuation: Callable[[Any, float], Problem | None] | None = None
-    unsettled: float = 1.0
+    revision_horizon: float = 1.0
     noises: tuple[Level, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
     keyframes: Keyframes | None = None
     elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
     layout: ChainLayout | None = None
     marginal_likelihood: bool = False
-    may_step: tuple[int, ...] = ()
-    finer: Callable[[Sequence[Level]], Problem | None] | None = None
+    step_candidates: tuple[int, ...] = ()
+    denser_graph: Callable[[Sequence[Level]], Problem | None] | None = None
     error_map: Callable[[Estimate], ErrorMap | None] | None = None
     gaussian_priors: tuple[GaussianPrior, ...] = ()
 
@@ -366,7 +366,7 @@ class Problem:
             self,
             parameters=tuple(parameter.near(numbers) for parameter in self.parameters),
             continuation=changed(self.continuation, lambda more: more.near(numbers)),
-            finer=changed(self.finer, lambda more: more.near(numbers)),
+            denser_graph=changed(self.denser_graph, lambda more: more.near(numbers)),
         )
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:

@@ -41,7 +41,7 @@ def above(temperature: Temperature | None, reference: float | None, at: Array) -
     return None if temperature is None or reference is None else temperature.above(reference, at)
 
 
-def unsettled(temperature: Temperature | None) -> float:
+def longest_gap(temperature: Temperature | None) -> float:
     """Longest time between temperature messages, s, until a temperature can be interpolated."""
     return 0.0 if temperature is None else float(np.diff(temperature.t).max(initial=0.0))
 

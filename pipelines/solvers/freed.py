@@ -45,7 +45,7 @@ def at_solution(freed: Problem, estimate: Estimate) -> tuple[Compiled, Lineariza
         IndeterminateStateError, LinAlgError: the graph does not determine its states.
     """
     levels = estimate.levels
-    compiled = Compiled.of((freed.finer and freed.finer(levels)) or freed)
+    compiled = Compiled.of((freed.denser_graph and freed.denser_graph(levels)) or freed)
     used, values = _used(compiled.engine.groups, estimate), compiled.initial
     numbers = {q.name: q.prior_mean for q in compiled.problem.quantities}
     numbers |= zip(estimate.names, estimate.values.tolist(), strict=True)

@@ -775,11 +775,11 @@ def solve_likelihood(
     problem, engine = compiled.problem, compiled.engine
     used = solution.engine.inliers(solution.values)
     found = LikelihoodMaximum(solution.values, tuple(levels), unwidened(used))
-    if problem.finer is not None:
+    if problem.denser_graph is not None:
         found = maximise_likelihood(engine, found, rounds=1, from_above=True)
-        finer = problem.finer(found.levels)
-        if finer is not None:
-            known, compiled = compiled, Compiled.of(finer, "chain")
+        denser = problem.denser_graph(found.levels)
+        if denser is not None:
+            known, compiled = compiled, Compiled.of(denser, "chain")
             engine = compiled.engine
             late = [g.model.time[np.isinf(w)] for g, w in zip(known.engine.groups, found.widening, strict=True)]
             times = np.concatenate(late)

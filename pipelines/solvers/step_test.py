@@ -254,7 +254,7 @@ def _square(information: Array, x: Array) -> Array:
 
 
 def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
-    """Steps of one of `Problem.may_step` that explain a recording best, the most significant first.
+    """Steps of one of `Problem.step_candidates` that explain a recording best, the most significant first.
 
     None where the recording determines too little for the tests.
     """
@@ -266,7 +266,7 @@ def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solutio
 
 def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
     engine, values = compiled.engine, solution.values
-    parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.may_step]
+    parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.step_candidates]
     used = solution.engine.inliers(values)
     outliers, transient = unwidened(used), unwidened([~_transient(~own) for own in used])
     base = _Fit.of(engine, values, levels, transient)

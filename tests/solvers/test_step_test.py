@@ -71,7 +71,7 @@ def test_the_scan_is_exact() -> None:
     engine = compiled.engine
     assert isinstance(engine, Linearization)
     values = solve_robust(engine, compiled.initial, compiled.problem.loss).values
-    chain, key = LinearChain.of(engine, values), compiled.problem.may_step[0]
+    chain, key = LinearChain.of(engine, values), compiled.problem.step_candidates[0]
     columns = np.flatnonzero(engine.layout.root_columns(key)[:, engine.layout.sizes[3] :].any(axis=0))
     variances = chain.variances(compiled.problem.noises)
     tested = scan(chain, variances, columns)

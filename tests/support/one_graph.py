@@ -44,7 +44,9 @@ def one_graph(problems: Sequence[Problem], shared: Collection[str]) -> Problem:
     kept = {p.key: p for p in reversed(parameters)}
     # Noise as stated, that beside other noise included.
     noises = tuple(replace(n, noise=replace(n.noise, known=0.0), least=None) for n in problems[0].noises)
-    return replace(problems[0], parameters=tuple(kept.values()), steps=steps, attitudes=None, noises=noises, finer=None)
+    return replace(
+        problems[0], parameters=tuple(kept.values()), steps=steps, attitudes=None, noises=noises, denser_graph=None
+    )
 
 
 def _whole(problem: Problem) -> Step:

@@ -157,7 +157,7 @@ class Follower:
             self._wait(str(error))
             return time.thread_time() - started
         cost = time.thread_time() - started
-        self._take(problem, self._settled(steps, problem.unsettled))
+        self._take(problem, self._settled(steps, problem.revision_horizon))
         return cost
 
     def _may_settle(self) -> bool:
@@ -166,15 +166,15 @@ class Follower:
         last_ns = self._growing.last_log_ns(self.source.parts)
         if run is None or held is None or last_ns is None:
             return True
-        settled_s = held.time + run.problem.unsettled + _SAMPLE
+        settled_s = held.time + run.problem.revision_horizon + _SAMPLE
         return last_ns >= self._epoch_ns + self._delay_ns + int(settled_s * 1e9)
 
-    def _settled(self, steps: Iterable[Step], unsettled: float) -> Iterator[Step]:
+    def _settled(self, steps: Iterable[Step], revision_horizon: float) -> Iterator[Step]:
         """The steps that are so much older, s, than the last, which may still grow; the first that is not is held."""
         held: deque[Step] = deque()
         for step in steps:
             held.append(step)
-            while len(held) > 1 and held[0].time <= step.time - unsettled + _ROUNDING:
+            while len(held) > 1 and held[0].time <= step.time - revision_horizon + _ROUNDING:
                 yield held.popleft()
         self._held = held[0] if held else None
 

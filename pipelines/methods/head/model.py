@@ -103,14 +103,14 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         dropped=data.dropped,
         premises=() if data.platform_t is not None else (_AT_REST,),
         continuation=partial(_continuation, config, model),
-        unsettled=temperature.unsettled(data.temperature),
+        revision_horizon=temperature.longest_gap(data.temperature),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.picture, model.clock.begun),
         keyframes=Keyframes(model.clock, _NEAR),
         layout=LAYOUT,
         marginal_likelihood=True,
-        may_step=(model.parameters.helmet.key,),
-        finer=partial(_finer, config, data, model),
+        step_candidates=(model.parameters.helmet.key,),
+        denser_graph=partial(_denser_graph, config, data, model),
         error_map=partial(_error_map, config, model),
     )
 
@@ -137,12 +137,12 @@ def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | 
     )
 
 
-def _finer(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
-    """The graph for noise levels with which pictures may share fewer keyframes; see Problem.finer."""
+def _denser_graph(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
+    """The graph for noise levels with which pictures may share fewer keyframes; see Problem.denser_graph."""
     noises = model.noises | {level.noise.name: level for level in levels}
     if _shared(data, noises) > 0.5 * model.origins[2]:
         return None
-    return replace(_problem(config, data, _prepare(data, config, clock=model.clock, noises=noises)), finer=None)
+    return replace(_problem(config, data, _prepare(data, config, clock=model.clock, noises=noises)), denser_graph=None)
 
 
 def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:

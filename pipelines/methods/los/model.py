@@ -109,7 +109,9 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         dropped=dropped,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
         continuation=partial(_continuation, config, model) if data.error_cov is None else None,
-        unsettled=max(_SETTLED if model.around is None else WINDOWS[0], temperature.unsettled(data.temperature)),
+        revision_horizon=max(
+            _SETTLED if model.around is None else WINDOWS[0], temperature.longest_gap(data.temperature)
+        ),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.sight, model.clock.begun),
         keyframes=None if model.parameters.sight is None else Keyframes(model.clock, _NEAR),
