@@ -171,9 +171,8 @@ class FoundMap:
 
     def known(self, sqrt_info: SqrtInformation, inflations: Array) -> SqrtInformation:
         """Information of a recording, made without the map, with it; inflations (n,) are those of its estimate."""
-        columns = dict(zip(self.names, self.columns / inflations[:, None], strict=True))
         moved = self._moved(sqrt_info) if self.map.moves else sqrt_info
-        return marginalised(moved, np.array([columns[name] for name in sqrt_info.names]))
+        return marginalised(moved, self.names, self.columns / inflations[:, None])
 
     def _moved(self, sqrt_info: SqrtInformation) -> SqrtInformation:
         shift = dict(zip(self.names, self.shift.tolist(), strict=True))

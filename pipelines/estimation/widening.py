@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -33,8 +33,7 @@ def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.
         budget = {name: _with_share(shares, source, float(share[name])) for name, shares in budget.items()}
     sqrt_info = estimate.sqrt_info
     if sqrt_info is not None:
-        whole = dict(zip(estimate.names, columns / estimate.inflations[:, None], strict=True))
-        sqrt_info = marginalised(sqrt_info, np.array([whole[name] for name in sqrt_info.names]))
+        sqrt_info = marginalised(sqrt_info, estimate.names, columns / estimate.inflations[:, None])
     return replace(estimate, covariance=covariance, history=history, budget=budget, sqrt_info=sqrt_info)
 
 
@@ -46,12 +45,12 @@ def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[
     return dict(sorted(whole.items(), key=lambda item: -item[1]))
 
 
-def marginalised(sqrt_info: SqrtInformation, columns: Array) -> SqrtInformation:
-    """R (x - S a - at) = d with a unit normal a (m,) marginalised out.
+def marginalised(sqrt_info: SqrtInformation, names: Sequence[str], columns: Array) -> SqrtInformation:
+    """R (x - S a - at) = d with a unit normal a (m,) marginalised out; `columns` S (n, m) are of the numbers named.
 
     Column by column: rows whitened by (I + r r')^-1/2, r = R s.
     """
-    for step in columns.T:
+    for step in columns[[names.index(name) for name in sqrt_info.names]].T:
         r = sqrt_info.R @ step
         square = float(r @ r)
         if square > 0.0:

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -102,6 +103,11 @@ class Rows:
         beside, fixed = (None if each is None else each[kept] for each in (self.beside, self.fixed))
         parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside, fixed)
         return Rows(self.family, self.group, *parts, self.is_measurement)
+
+    def right(self, some: Any = ..., by_shared: bool = True) -> Array:
+        """Residuals of some of them, and beside these the derivatives by the shared parameters, (n, m, 1 + p) or 1."""
+        residuals = self.residuals[some][..., None]
+        return np.concatenate([residuals, self.shared[some]], axis=2) if by_shared else residuals
 
     def has(self, noise: Noise) -> bool:
         """Whether a noise is part of their variance."""
@@ -343,9 +349,7 @@ class LinearChain:
                     some = np.flatnonzero(counts[k] > again)
                     own, row = live[some], order[begins[k[some]] + again]
                     J, v = rows.states[0][1][row], variances[kind][row][:, None, None] * np.eye(rows.residuals.shape[1])
-                    y = rows.residuals[row][..., None]
-                    if by_shared:
-                        y = np.concatenate([y, rows.shared[row]], axis=2)
+                    y = rows.right(row, by_shared)
                     y = y + J @ x[own]
                     Jt = np.swapaxes(J, 1, 2)
                     S = J @ P[own] @ Jt + v
@@ -374,10 +378,8 @@ class LinearChain:
             (_, before), (now, after) = rows.states
             joined = np.isfinite(variance)
             inverse, now = np.linalg.inv(after[joined]), now[joined]
-            right = rows.residuals[..., None]
-            if by_shared:
-                right = np.concatenate([right, rows.shared], axis=2)
-            F[now], c[now] = -inverse @ before[joined], -inverse @ right[joined]
+            right = rows.right(joined, by_shared)
+            F[now], c[now] = -inverse @ before[joined], -inverse @ right
             Q[now] = variance[joined, None, None] * inverse @ np.swapaxes(inverse, 1, 2)
         return F, c, Q
 

@@ -198,10 +198,10 @@ def _found_beside(level: Level, groups: Sequence[Group], values: Values, redunda
     the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. Where outliers are rejected, what is beyond two sigmas
     counts as that: a pose near iron is not to pass for repeatability.
     """
-    unit = np.concatenate(
-        [np.broadcast_to(_additional(g.beside, level.noise.stated), _shape(g)).ravel() for g in groups]
-    )
-    variance = np.concatenate([g.all_weights.ravel() for g in groups]) ** -2.0
+    weights = [g.all_weights for g in groups]
+    added = [_additional(g.beside, level.noise.stated) for g in groups]
+    unit = np.concatenate([np.broadcast_to(a, w.shape).ravel() for a, w in zip(added, weights, strict=True)])
+    variance = np.concatenate([w.ravel() for w in weights]) ** -2.0
     square = np.concatenate([g.evaluate(values)[0].ravel() for g in groups]) ** 2
     rest, share = variance - unit * level.scale**2, redundancy / variance.size
     rejecting = any(g.loss is not None for g in groups)
@@ -218,10 +218,6 @@ def _found_beside(level: Level, groups: Sequence[Group], values: Values, redunda
     sigma = float((2.0 * share * ((part / (rest + part)) ** 2).sum() + level.known**-2) ** -0.5)
     changed = float(np.abs((rest + part) / variance - 1.0).max())
     return replace(level, scale=scale, found=scale, sigma=scale * sigma), changed < 2.0 * _NEGLIGIBLE
-
-
-def _shape(group: Group) -> tuple[int, int]:
-    return len(group.model.time), group.model.rows
 
 
 def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float) -> Level:

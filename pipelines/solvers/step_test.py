@@ -163,7 +163,7 @@ def _filtered(chain: LinearChain, variances: Sequence[Array]) -> _Pass:
             ((at, J),) = rows.states
             weighed = np.swapaxes(J, 1, 2) / variance[:, None, None]
             np.add.at(H, at, weighed @ J)
-            np.add.at(g, at, weighed @ np.concatenate([rows.residuals[..., None], rows.shared], axis=2))
+            np.add.at(g, at, weighed @ rows.right())
     X, P, Y, R = np.zeros((n, d, q)), np.zeros((n, d, d)), np.zeros((n, d, q)), np.zeros((n, d, d))
     unit = np.eye(d)
     for k in range(n):
@@ -180,7 +180,7 @@ def _beside(chain: LinearChain, variances: Sequence[Array], begin: int, end: int
         if len(rows.states) == 1:
             at = rows.states[0][0]
             some = np.flatnonzero((at >= begin) & (at < end))
-            both = np.concatenate([rows.residuals[some, :, None], rows.shared[some]], axis=2)
+            both = rows.right(some)
             np.add.at(out, at[some] - begin, np.swapaxes(both, 1, 2) @ both / variance[some, None, None])
     return out
 
@@ -218,7 +218,7 @@ def _alone(chain: LinearChain, variances: Sequence[Array]) -> Array:
     out: Array = prior.T @ prior
     for rows, variance in zip(chain.rows, variances, strict=True):
         if not rows.states:
-            both = np.concatenate([rows.residuals[..., None], rows.shared], axis=2)
+            both = rows.right()
             out += np.einsum("nmi,nmj,n->ij", both, both, 1.0 / variance)
     return out
 
