@@ -199,7 +199,7 @@ def dead_band(t: Array, values: Array) -> tuple[float, Array]:
         values: in any unit.
     """
     # Conversions of units leave rounding of doubles, which makes many values of one.
-    largest = max(float(np.abs(values).max()), np.finfo(float).tiny)
+    largest = max(float(np.abs(values).max(initial=0.0)), np.finfo(float).tiny)
     values = largest * np.round(values / largest, 12)
     found = [value for column in values.T if (value := _one_value(column)) is not None]
     side = np.sign(values - np.median(found)) if found else np.zeros_like(values)

@@ -382,7 +382,8 @@ def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) 
         groups = influence.at.engine.measured[family]
         time = np.concatenate([group.model.time for group in groups])[_in_time(groups)]
         nominal = np.einsum("nri,nrj->ij", L, L)
-        whole = noise.variance * (nominal + _correlated(L, noise.correlation[: len(L) - 1]))
+        # Below the level's it counts degrees of freedom that rejected rows and attitudes have taken.
+        whole = max(noise.variance, 1.0) * (nominal + _correlated(L, noise.correlation[: len(L) - 1]))
         ratio = ratio_by_blocks(time, np.einsum("nrm,nr->nm", L, right), np.diag(whole))
         more = (np.outer(ratio, ratio) * whole - nominal) / np.outer(scale, scale)
         variances, axes = np.linalg.eigh(0.5 * (more + more.T))
