@@ -306,16 +306,12 @@ def _by_driven(by_entry: Array, errors: Array) -> Array:
 @cache
 def _entries(numbers: int) -> Array:
     """What each number of D adds to its entries by rows, (3 d, numbers): 9 of G, 3 of c, 1 of a dead band."""
+    from scipy.linalg import block_diag
+
     parts = [np.eye(9).reshape(3, 3, 9)] if numbers >= 9 else []
     parts += [np.eye(3)[:, None]] if numbers // 3 in (1, 4) else []
     parts += [-np.eye(3)[..., None]] if numbers % 3 == 1 else []
-    columns, rows = (sum(part.shape[axis] for part in parts) for axis in (1, 2))
-    out, row, column = np.zeros((3, columns, rows)), 0, 0
-    for part in parts:
-        d, n = part.shape[1:]
-        out[:, column : column + d, row : row + n] = part
-        row, column = row + n, column + d
-    return out.reshape(-1, rows)
+    return np.concatenate([block_diag(*(part[axis] for part in parts)) for axis in range(3)])
 
 
 def _distinct(rows: Array) -> Array:

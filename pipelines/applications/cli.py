@@ -794,7 +794,7 @@ def _tell(
 def _show(
     as_json: bool, text: Callable[[], str], report: "Callable[[], Report] | None", *lines: str, everything: bool = False
 ) -> None:
-    """Print JSON and nothing else; or a report, if there is one, and lines."""
+    """Print a command's result: as JSON alone, or as its report, if it has one, followed by lines."""
     if as_json:
         print(text().removesuffix("\n"))
         return

@@ -401,7 +401,7 @@ class Problem:
 def changed(
     make: Callable[Arguments, Problem | None] | None, change: Callable[[Problem], Problem]
 ) -> Callable[Arguments, Problem | None] | None:
-    """What makes problems, each of which is then changed; None: it makes none."""
+    """Compose a function that makes a problem (or None) with a change of what it makes."""
     if make is None:
         return None
 

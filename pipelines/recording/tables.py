@@ -342,7 +342,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _trajectory(form: TableForm) -> series.PoseSeries | None:
-    """A trajectory in TUM's form: eight columns by blanks, the last four a unit quaternion; None for other tables."""
+    """Read a table as a TUM trajectory: eight columns apart by blanks, the last four a unit quaternion; else None."""
     if form.delimiter != " " or len(form.names) != len(_TUM):
         return None
     _, first = next(_rows(form), (0, []))

@@ -194,7 +194,7 @@ def _ros2(saved: SavedCalibration) -> str:
 
 
 def _noise_rows(saved: SavedCalibration) -> dict[str, Any]:
-    """Noise that was measured, by sensor."""
+    """Rows of a calibration's table of measured noise, by the sensor's name, `accel` or `gyro`."""
     return {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
 
 

@@ -55,11 +55,11 @@ _ABSORBED = 0.02
 # Of a correlated share: white noise beside it keeps V regular.
 _MIN_SHARE, _MAX_SHARE = 1e-6, 1.0 - 1e-6
 # Frequencies with a band of their own, and by what the bands beyond grow: their spectrum is even to a twentieth.
-_SINGLE, _BAND = 64, 1.05
+_UNBANDED, _BAND = 64, 1.05
 # Variance over the largest below which a direction is rounding.
-_SAME = 1e-12
+_LEAST_SQUARE = 1e-12
 # Correlation lengths after which exp(-lag / length) is left out.
-_LENGTHS = 8.0
+_LONGEST_LAG = 8.0
 # Blocks of a recording by which variances are judged, each with as many measurements as there are numbers at least.
 _BLOCKS = 16
 # Coefficients of a prior's row below this share of its largest are rounding.
@@ -248,7 +248,7 @@ class ColouredNoise:
         share: of the variance that is correlated.
         length: of the correlation, in measurements.
         variance: over that of the weights.
-        fall: of -2 log L against white noise.
+        fall: decrease of -2 log L relative to white noise.
     """
 
     share: float
@@ -287,11 +287,11 @@ class ColouredNoise:
     @property
     def correlation(self) -> Array:
         """Autocorrelation (K,) at the lags 1 ... K, until it is gone."""
-        return np.asarray(self.share * np.exp(-np.arange(1.0, _LENGTHS * self.length + 2.0) / self.length))
+        return np.asarray(self.share * np.exp(-np.arange(1.0, _LONGEST_LAG * self.length + 2.0) / self.length))
 
     @property
     def together(self) -> float:
-        """How many measurements count as one in a mean."""
+        """Number of correlated measurements that determine a mean as well as one independent measurement."""
         return 1.0 + 2.0 * float(self.correlation.sum())
 
 
@@ -318,8 +318,8 @@ class _Spectrum:
 
         rows = dct(np.concatenate([whitened[..., None], basis], axis=2), axis=0, norm="ortho")
         n, columns = len(rows), rows.shape[2]
-        wide = _SINGLE * _BAND ** np.arange(np.log(max(n / _SINGLE, 1.0)) / np.log(_BAND))
-        edges = np.unique(np.r_[np.arange(min(n, _SINGLE)), wide.astype(int), n])
+        wide = _UNBANDED * _BAND ** np.arange(np.log(max(n / _UNBANDED, 1.0)) / np.log(_BAND))
+        edges = np.unique(np.r_[np.arange(min(n, _UNBANDED)), wide.astype(int), n])
         bands = [rows[a:b].reshape(-1, columns) for a, b in pairwise(edges.tolist())]
         middle = 0.5 * (edges[1:] + edges[:-1] - 1)
         products = np.array([band.T @ band for band in bands])
@@ -410,7 +410,7 @@ def _basis(influence: Influence, family: str) -> Array:
     L, _ = _influences(influence, family)
     flat = (L / influence.reported.scale).reshape(-1, L.shape[2])
     squares, axes = np.linalg.eigh(flat.T @ flat)
-    some = squares > _SAME * squares.max(initial=0.0)
+    some = squares > _LEAST_SQUARE * squares.max(initial=0.0)
     return np.asarray((flat @ (axes[:, some] / np.sqrt(squares[some]))).reshape(*L.shape[:2], -1))
 
 

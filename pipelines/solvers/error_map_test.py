@@ -140,7 +140,7 @@ def _rows(information: SqrtInformation, error_map: ErrorMap) -> tuple[Array, Arr
 
 
 def _with_history(estimate: Estimate, compiled: Compiled, posterior: Posterior) -> Estimate:
-    """The estimate with the histories of the solution with the map in place of its own: without it the map shows."""
+    """Replace an estimate's history by that of the solution with the map: without it the map would show there."""
     n = len(estimate.names)
     bias = smoothed(compiled, posterior, posterior.covariance)
     if bias is not None:

@@ -96,7 +96,7 @@ def apply_levels(engine: Linearization, levels: Sequence[Level]) -> Linearizatio
 
 
 def acting(levels: Iterable[Level]) -> list[Level]:
-    """The levels that change the noise by which measurements were whitened."""
+    """Levels whose noise differs from that by which the measurements were whitened."""
     return [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
 
 

@@ -225,7 +225,7 @@ def test_a_gyro_that_warms_up(errors: int) -> None:
 
 @pytest.mark.parametrize("errors", [7, 10, 16, 19])
 def test_gyro_that_subtracts_its_dead_band(errors: int) -> None:
-    """With what it subtracts added to the size of readings it tells the true rate."""
+    """Readings, larger in size by what it subtracts, are the true rate."""
     scale, band = 1e-2 * SCALE, 5e-3
     others = np.zeros(errors - 7)
     path = GyroPath(T, RATE @ (np.eye(3) + symmetric(scale)).T + BIAS - band * BEYOND, BIAS_HAT, DRIVERS[errors])

@@ -321,7 +321,7 @@ class Motion:
     detour: Array
 
     def _phase(self, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """The pose that a moment comes after, how far the turn from it has gone (0 to 1), and the turn's duration."""
+        """Index of the static pose before times t, s, the share (0 to 1) of the turn from it, and its duration, s."""
         k = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
         following = np.minimum(k + 1, len(self.start) - 1)
         duration = np.where(following > k, self.start[following] - self.stop[k], 1.0)

@@ -250,7 +250,7 @@ def bend_rows(bundle: Bundle, sights: Sights, rows: Rows) -> Array:
 
 
 def bending(miss: Array, by_deformation: Array, own: Array, white: Array) -> tuple[float, Array]:
-    """The most likely sigma of a corner, each way, as a share of a tag's size, and the (q, q) covariance it brings.
+    """Most likely sigma of a printed corner along x and y, as a share of the tag's size, and its (q, q) covariance.
 
     Errors are linear in the deformations x, and x in their gradient g = J x, J the information on x with all else
     eliminated: along the axes of J a component of g has the variance l + l^2 level^2, l its information.
