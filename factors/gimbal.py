@@ -22,7 +22,7 @@ _DEGREE = 3
 # Moments whose samples are held at a time: few enough for the processor's cache.
 _TOGETHER = 500
 # Times worked on at once.
-_BLOCK = 100_000
+_BLOCK = 10_000
 
 
 class GimbalPath:
