@@ -242,12 +242,14 @@ class Plot:
         caption: what is seen, with units.
         figure: the first figure.
         beside: figures that belong to it, beside it or below.
+        printed: whether on paper too.
     """
 
     title: str
     caption: str
     figure: Figure
     beside: tuple[Figure, ...] = ()
+    printed: bool = True
 
     @property
     def figures(self) -> tuple[Figure, ...]:

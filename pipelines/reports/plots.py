@@ -183,11 +183,15 @@ def variables(calibration: Calibration) -> list[tuple[str, str, list[Quantity]]]
 
 
 def histories(calibration: Calibration) -> list[Plot]:
-    """One figure per variable: its numbers over time with a band of one sigma; none without a history."""
+    """One figure per variable: its numbers over time with a band of one sigma; none without a history.
+
+    Those of nuisance parameters are on paper only where one contradicts its prior.
+    """
     history = calibration.estimate.history
     if history is None or not len(history.time):
         return []
     column = {name: i for i, name in enumerate(calibration.estimate.names)}
+    conflicts = {each.evidence["parameter"] for each in calibration.findings if each.kind == "prior_conflict"}
     plots = []
     for title, _, members in variables(calibration):
         unit, factor = human_unit(members[0])
@@ -213,6 +217,7 @@ def histories(calibration: Calibration) -> list[Plot]:
                 + "".join(f", {line}" for line in _OTHERS if line in shown)
                 + ".",
                 out,
+                printed=any(not q.assumed or q.name in conflicts for q in members),
             )
         )
     return plots

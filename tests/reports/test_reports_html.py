@@ -14,13 +14,14 @@ from alidade.factors import so3
 from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Attitudes, Parameter, Quantity, Residuals
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import head_plots
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.reports.calibration_report import report_html
-from alidade.pipelines.reports.plots import common_plots
+from alidade.pipelines.reports.plots import common_plots, histories
 from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.settings import Config
 from tests.support.browser import drawn, needs_browser
@@ -96,6 +97,20 @@ def test_mean_innovation_squared_is_drawn() -> None:
     plot = next(p for p in common_plots(calibration) if "squared" in p.title)
     mean = plot.figure.marks[1].y
     assert 2.0 < mean.min() < 3.0 < mean.max() < 4.0
+
+
+def test_nuisance_parameters_over_time_are_on_paper_only_where_one_contradicts_its_prior() -> None:
+    calibration = make_calibration()
+    mount, offset, *others = calibration.problem.parameters
+    nuisance = replace(offset, quantities=tuple(replace(q, group="assumption") for q in offset.quantities))
+    calibration = replace(calibration, problem=replace(calibration.problem, parameters=(mount, nuisance, *others)))
+    evidence = {"parameter": "time_offset", "value": 0.3, "sigma": 0.01, "z": 6.0, "inseparable": [], "effect": {}}
+    conflict = Finding("prior_conflict", Severity.INCONSISTENT, evidence)
+    for findings, count in (((), 1), ((conflict,), 0)):
+        plots = histories(replace(calibration, findings=findings))
+        assert [plot.title for plot in plots if not plot.printed] == ["time_offset over time"][:count]
+        page = report_html(replace(calibration, findings=findings))
+        assert page.count('class="card figure screen"') == count
 
 
 @pytest.mark.parametrize(
