@@ -132,10 +132,12 @@ def test_a_minute_at_rest_is_not_marginalised_while_noise_moves_the_mount() -> N
 
 @pytest.mark.slow
 def test_a_second_axis_after_45_s_of_one() -> None:
+    """No picture is so near to the gate that one of both solvers alone rejects it, which moves skews by .3 sigma."""
     since = {"yaw": 0.0, "pitch": 45.0, "roll": 45.0}
-    problem, truth = _made(4, duration_s=60.0, head=beginning(SCENARIO.head, since))
+    problem, truth = _made(5, duration_s=60.0, head=beginning(SCENARIO.head, since))
     batch, incremental = solve_batch(problem), solve_incremental(problem)
-    assert _apart(incremental, batch) < 0.3
+    assert incremental.rejected == batch.rejected
+    assert _apart(incremental, batch) < 0.1
     assert np.abs((incremental.values - truth) / np.maximum(incremental.sigmas, 1e-12))[MOUNT].max() < 4.0
 
 
