@@ -40,6 +40,11 @@ class ErrorMapFactor(Model):
         return int(self.model.rows)
 
     @property
+    def sqrt_information(self) -> Array:
+        """Of the model."""
+        return np.asarray(self.model.sqrt_information)
+
+    @property
     def blocks(self) -> tuple[Block, ...]:
         """Blocks of the model and c."""
         return (*self.model.blocks, self.functions.shape[1] * self.axes)

@@ -11,11 +11,14 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from alidade.factors.error_map import ErrorMapFactor
+from alidade.factors.model import Model
+from alidade.factors.through_gimbal import GimbalMap, ThroughGimbalFactor
 from alidade.pipelines.estimation.priors import vector_prior
 from alidade.pipelines.estimation.problem import (
     Array,
@@ -51,6 +54,8 @@ class ErrorMap:
         functions: (n, k) of mean 0 and rms 1.
         places: where each measurement was made, name -> (n,), rad, to be drawn.
         moves: whether it moves an estimate; else it may be an error of other sensors as well, and widens sigmas alone.
+        slopes: (n, k, places) derivatives of the functions by the places, where these are the angles of a gimbal that
+            the gyro drives; else None.
     """
 
     name: str
@@ -62,6 +67,7 @@ class ErrorMap:
     functions: Array
     places: Mapping[str, Array]
     moves: bool = True
+    slopes: Array | None = None
 
     @classmethod
     def of(
@@ -74,16 +80,22 @@ class ErrorMap:
         harmonics: Array,
         places: Mapping[str, Array],
         moves: bool = True,
+        slopes: Array | None = None,
     ) -> ErrorMap | None:
-        """The map over measurements with harmonics (n, h); None where it is fixed, or nothing varies."""
+        """The map over measurements with harmonics (n, h), and slopes (n, h, places) of these.
+
+        None where it is fixed, or nothing varies.
+        """
         centred = harmonics - harmonics.mean(axis=0)
-        U, sizes, _ = np.linalg.svd(centred, full_matrices=False)
+        U, sizes, V = np.linalg.svd(centred, full_matrices=False)
         kept = sizes > max(_LEAST * sizes.max(initial=0.0), np.finfo(float).eps * len(time))
         if prior == 0.0 or not kept.any():
             return None
         order = np.argsort(time, kind="stable")
         functions, places = U[:, kept] * np.sqrt(len(time)), {place: x[order] for place, x in places.items()}
-        return cls(name, axes, prior, prior, families, time[order], functions[order], places, moves)
+        if slopes is not None:
+            slopes = np.einsum("nhp,kh->nkp", slopes[order], V[kept] * (np.sqrt(len(time)) / sizes[kept, None]))
+        return cls(name, axes, prior, prior, families, time[order], functions[order], places, moves, slopes)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -97,9 +109,17 @@ class ErrorMap:
         quantities = (Quantity(name, UNIT, *numbers, group="assumption", sheet=SHEET) for name in self.names)
         return Parameter(int(gtsam.symbol("M", 0)), tuple(quantities))
 
-    def functions_at(self, time: Array) -> Array:
-        """Functions (m, k) of the measurements at their times (m,), s."""
-        return self.functions[np.minimum(np.searchsorted(self.time, time), len(self.time) - 1)]
+    def of_model(self, family: str, model: Any) -> Model | None:
+        """A family's model with the map among its variables; None where the map has no part in it."""
+        at = np.minimum(np.searchsorted(self.time, model.time), len(self.time) - 1)
+        mapped = ErrorMapFactor(model, self.functions[at], len(self.axes)) if family in self.families else None
+        if self.slopes is None or (mapped is None and family != "gyro"):
+            return mapped
+        gimbal = np.column_stack(list(self.places.values()))[at]
+        errors = GimbalMap(self.functions[at], self.slopes[at])
+        if mapped is None:
+            return ThroughGimbalFactor(model, gimbal, errors)
+        return ThroughGimbalFactor(mapped, gimbal, errors, model.encoder, (len(model.blocks),))
 
     def error(self, c: Array) -> Array:
         """Errors (n, axes) of the measurements."""
@@ -128,11 +148,14 @@ class ErrorMap:
             yield replace(step, initial=initial, factors=factors)
 
     def _with_map(self, factor: Factor, key: int) -> Factor:
-        measured = factor.measurement
-        if measured is None or factor.family not in self.families:
+        bound = factor.bound
+        model = None if bound is None else self.of_model(factor.family, bound.model)
+        if bound is None or model is None:
             return factor
-        model = ErrorMapFactor(measured.model, self.functions_at(measured.model.time), len(self.axes))
-        return Factor.of(factor.family, model.on(*measured.tied, key, loss=measured.loss), factor.beside)
+        mapped = model.on(*bound.tied, key, loss=bound.loss)
+        if factor.measurement is None:
+            return replace(factor, process=mapped)
+        return replace(factor, measurement=mapped)
 
 
 @dataclass(frozen=True, eq=False)

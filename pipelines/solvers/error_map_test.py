@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors.chi_square import quantile
-from alidade.factors.error_map import ErrorMapFactor
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.error_map import ErrorMap, FoundMap
 from alidade.pipelines.estimation.problem import Array, Estimate, History, PosteriorHistory, Problem, SqrtInformation
@@ -170,12 +169,13 @@ def _mapped(engine: Linearization, values: Values, error_map: ErrorMap) -> tuple
     begin = {"state": d + c + s, "pair": 2 * d + c + s, "walk": 2 * c + s, "shared": s}
 
     def added(group: Group) -> Group:
-        if not group.is_measurement or group.family not in error_map.families:
+        model = error_map.of_model(group.family, group.model)
+        if model is None:
             return group
         columns = begin[group.target] + np.arange(k)
         return replace(
             group,
-            model=ErrorMapFactor(group.model, error_map.functions_at(group.model.time), len(error_map.axes)),
+            model=model,
             gather=[*group.gather, (k, layout.row[[at]])],
             at=[*group.at, np.array([at])],
             columns=[*group.columns, [columns[None]]],

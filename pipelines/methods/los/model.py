@@ -20,7 +20,9 @@ from alidade.factors.chi_square import gate
 from alidade.factors.gimbal import WINDOWS, GimbalPath, LocalMotion
 from alidade.factors.los import LosContext, LosDirectionFactor
 from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import Model
 from alidade.factors.preintegration import GyroPath
+from alidade.factors.through_gimbal import GimbalErrors, ThroughGimbalFactor
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
@@ -80,12 +82,18 @@ class _Model:
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
+    encoder: Array  # (K,) sigma of their noise in the picture, rad
     around: LosContext | None  # of the keyframes, when errors of the sensors are variables
     loss: TruncatedLoss
     parameters: LosParameters
     reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
     noises: dict[str, Level]  # by name
     clock: Clock  # by which stamps of the recording were moved to the keyframes' times
+
+    @property
+    def gimbal_errors(self) -> GimbalErrors:
+        """Of mounting and encoders, where errors of the sensors are variables."""
+        return GimbalErrors(self.parameters.names, tuple(self.mount.tolist()))
 
 
 def problem(data: LosData, config: Config) -> Problem:
@@ -122,12 +130,19 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
 
 def _error_map(config: Config, model: _Model, _: Estimate) -> ErrorMap | None:
     """Errors of LOS errors that depend on the gimbal angles."""
-    alone = np.concatenate([np.sin(model.angles), np.cos(model.angles)], axis=1)
-    products = [alone[:, i] * alone[:, j] for i in (0, 2) for j in (1, 3)]
-    places = {"azimuth": model.angles[:, 0], "elevation": model.angles[:, 1]}
-    harmonics = np.column_stack([alone, *products])
+    sine, cosine, each = np.sin(model.angles), np.cos(model.angles), np.eye(2)
+    alone, slopes = np.hstack([sine, cosine]), np.hstack([cosine[..., None] * each, -sine[..., None] * each])
+    i, j = [0, 0, 2, 2], [1, 3, 1, 3]
+    by_both = slopes[:, i] * alone[:, j, None] + alone[:, i, None] * slopes[:, j]
     return ErrorMap.of(
-        LOS_MAP.name, "xz", stated_figure(config, LOS_MAP), _FAMILIES, model.chain.time, harmonics, places
+        LOS_MAP.name,
+        "xz",
+        stated_figure(config, LOS_MAP),
+        _FAMILIES,
+        model.chain.time,
+        np.hstack([alone, alone[:, i] * alone[:, j]]),
+        {"azimuth": model.angles[:, 0], "elevation": model.angles[:, 1]},
+        slopes=np.hstack([slopes, by_both]),
     )
 
 
@@ -221,6 +236,7 @@ def _prepare(
         measured=measured,
         sqrt_information=_sqrt_information(used.covariance),
         angles=angles,
+        encoder=used.encoder,
         around=around,
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
         parameters=parameters,
@@ -242,6 +258,7 @@ class _Used:
         measured: (K, 3) phx, phz, roll, rad.
         covariance: (K, 3, 3) of these; NaN where not measured.
         angles: (K, 2) azimuth and elevation, rad.
+        encoder: (K,) sigma of their noise, rad.
         sigma: of a LOS error, as is usual, rad.
     """
 
@@ -251,6 +268,7 @@ class _Used:
     measured: Array
     covariance: Array
     angles: Array
+    encoder: Array
     sigma: float
 
     @classmethod
@@ -258,7 +276,8 @@ class _Used:
         cls, data: LosData, config: Config, gimbal: GimbalPath, margin: float, start: float
     ) -> tuple[_Used, dict[str, int]]:
         """Pictures used, from `start` on and `margin` s away from gaps, and the numbers left out by reason."""
-        covariance = _covariance(data, gimbal, config)
+        encoder = _encoder_sigma(data.image_t, gimbal, config)
+        covariance = _covariance(data, gimbal, config, encoder)
         rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), margin)
         late = data.image_t[rows] >= start
         rows, starts = rows[late], starts[late]
@@ -266,7 +285,8 @@ class _Used:
         time = data.image_t[rows]
         chains = np.split(np.arange(len(time)), np.flatnonzero(starts)[1:])
         sigma = float(np.sqrt(np.median(covariance[rows, 0, 0])))
-        return cls(time, starts, chains, data.error[rows], covariance[rows], gimbal.at(time), sigma), dropped
+        measured, angles = data.error[rows], gimbal.at(time)
+        return cls(time, starts, chains, measured, covariance[rows], angles, encoder[rows], sigma), dropped
 
 
 def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> tuple[Clock, Array]:
@@ -280,7 +300,13 @@ def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> 
     return clock, used.time - found[np.cumsum(used.starts) - 1]
 
 
-def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
+def _encoder_sigma(time: Array, gimbal: GimbalPath, config: Config) -> Array:
+    """Sigma (K,), rad, of the encoders' noise in angles at times (K,)."""
+    _, weights = gimbal.weights(time)
+    return np.asarray(first_given(config.noise.encoder, DEFAULT_NOISE.encoder) * np.linalg.norm(weights, axis=1))
+
+
+def _covariance(data: LosData, gimbal: GimbalPath, config: Config, encoder: Array) -> Array:
     """Covariance (K, 3, 3) of phx, phz, roll: tracker's or config's, and the encoders'; NaN where not measured."""
     if data.error_cov is None:
         los = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
@@ -289,13 +315,11 @@ def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
     else:
         covariance = data.error_cov.copy()
     covariance[~np.isfinite(data.error[:, 2]), 2, :] = np.nan
-    _, weights = gimbal.weights(data.image_t)
     elevation = gimbal.at(data.image_t)[:, 1]
     # Azimuth turns the picture about an axis that is elevated against its own up.
     by_azimuth = np.stack([np.zeros_like(elevation), np.cos(elevation), np.sin(elevation)], axis=1)
-    encoder = first_given(config.noise.encoder, DEFAULT_NOISE.encoder) ** 2 * (weights**2).sum(axis=1)
     shape = np.diag([1.0, 0.0, 0.0]) + by_azimuth[:, :, None] * by_azimuth[:, None, :]
-    return covariance + encoder[:, None, None] * shape
+    return covariance + encoder[:, None, None] ** 2 * shape
 
 
 def _sqrt_information(covariance: Array) -> Array:
@@ -341,6 +365,7 @@ def _step(model: _Model, keyframes: range) -> Step:
         step.factors.extend(vector_prior(each, np.zeros(len(each.quantities))) for each in p.all)
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step, keyframes)
+    step.factors[:] = [_driving(model, factor) for factor in step.factors]
     step.factors.extend(_picture_factors(model, keyframes))
     if chain.bias.nodes > 1 and model.parameters.sight is not None:
         # All pictures take it.
@@ -360,6 +385,16 @@ def _start_factor(model: _Model, k: int) -> Factor:
     sigmas = np.array([_WIDE, _WIDE if rolls else _HELD, _WIDE])
     initial = model.chain.initial[k]
     return rotation_about(model.chain.state(k), initial, so3.matrix(initial) / sigmas[:, None])
+
+
+def _driving(model: _Model, factor: Factor) -> Factor:
+    """The factor; increments of the gyro, that drives the gimbal, with noise that its errors do not change."""
+    increments, sight = factor.process, model.parameters.sight
+    if increments is None or sight is None or factor.family != "gyro":
+        return factor
+    at = np.searchsorted(model.chain.time, increments.model.time)
+    driving = ThroughGimbalFactor(increments.model, model.angles[at], model.gimbal_errors)
+    return replace(factor, process=driving.on(*increments.tied, model.parameters.angles.key, sight.key))
 
 
 def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
@@ -385,11 +420,13 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str)
         len(p.gyro.quantities) if p.gyro is not None and p.sight is not None else 0,
     )
     columns: list[int | list[int]] = [[model.chain.state(i) for i in k], p.angles.key]
+    bound: Model = rows_model
     if p.sight is not None:
+        bound = ThroughGimbalFactor(rows_model, model.angles[some], model.gimbal_errors, model.encoder[some], (1, 3))
         # From stamp to picture the bias has no time to matter but as a whole. Each keyframe's own, where it may walk
         # far, would follow the picture's noise, the better the larger the time offset, which would grow without bounds.
         columns += [FIRST_BIAS, p.sight.key, *model.chain.error_keys]
-    return Factor.of(family, rows_model.on(*columns, loss=model.loss))
+    return Factor.of(family, bound.on(*columns, loss=model.loss))
 
 
 def _advice(weights: Mapping[str, float]) -> Motion:

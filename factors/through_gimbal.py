@@ -1,0 +1,201 @@
+"""Noise that reaches attitudes and pictures through the angles of a gimbal.
+
+The angles from which a camera's attitude is computed contain noise: the gimbal turns with what the gyro that drives it
+reads, that gyro's noise included, and encoders have noise of their own. Both are accounted for as long as the gimbal is
+what it is taken for. An error that turns the camera by e f about an axis a, f a function of the gimbal angles, adds
+
+    e Y dg,    Y dg = a (grad f) dg + f sum_k (a_k x a) dg_k,
+
+to how a step dg of the angles turns the attitudes that follow from them, a_k the axes of the gimbal's turns between the
+gyro and a. With errors e_i an increment of the gyro has the noise (1 + K) n, K n = sum e_i Y_i dg, dg the commands by
+which n drives the gimbal. A picture with the noise v has v + sum e_i Y_i dg, dg what of v is the encoders': E(dg | v).
+
+Errors that are unknowns would be chosen to make that noise smaller, and be biased by a number of sigmas that grows with
+the square root of the recording's length. Less K times the residual the noise is the same whatever the errors are, to
+first order in them; so they are counted from a first guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from alidade.factors.los import SIGHT_ERRORS
+from alidade.factors.model import Array, Block, Model, Residuals, Stacked, dimension
+
+# The turns of gimbal and camera, from the gyro on.
+_AZIMUTH, _ELEVATION, _NONPERPENDICULARITY, _COLLIMATION, _ROLL = range(5)
+# The camera's axes in the order of the pictures' rows, phx, phz and roll, which are larger by its turns about them.
+_X, _Z, _Y = range(3)
+# Which turn a mounting angle adds to; those that stand before the gimbal change nothing.
+_TURNS = {
+    "delta_px": _ELEVATION,
+    "axis_nonperpendicularity": _NONPERPENDICULARITY,
+    "collimation": _COLLIMATION,
+    "camera_roll": _ROLL,
+}
+_ENCODERS = SIGHT_ERRORS.index("azimuth sin")
+# An error: number of its block and column there, first guess, turn, f (n or 1,), its derivatives by the angles
+# (n or 1, 2).
+Error = tuple[int, int, float, int, Array, Array]
+
+
+@dataclass(frozen=True)
+class GimbalErrors(Stacked):
+    """Errors of a gimbal's mounting and encoders.
+
+    Attributes:
+        names: of the mounting angles.
+        mount: their first guess, rad.
+    """
+
+    names: tuple[str, ...]
+    mount: tuple[float, ...]
+    stacked: ClassVar = ()
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """The mounting angles, rad, and SIGHT_ERRORS."""
+        return len(self.names), len(SIGHT_ERRORS)
+
+    def each(self, gimbal: Array) -> Iterator[Error]:
+        """The errors at gimbal angles (n, 2); what an encoder reads is larger by s sine + c cosine."""
+        for column, name in enumerate(self.names):
+            if name in _TURNS:
+                yield 0, column, self.mount[column], _TURNS[name], np.ones(1), np.zeros((1, 2))
+        sine, cosine = np.sin(gimbal), np.cos(gimbal)
+        for turn in (_AZIMUTH, _ELEVATION):
+            only, column = np.eye(2)[turn], _ENCODERS + 2 * turn
+            yield 1, column, 0.0, turn, -sine[:, turn], -cosine * only
+            yield 1, column + 1, 0.0, turn, -cosine[:, turn], sine * only
+
+
+@dataclass(frozen=True)
+class GimbalMap(Stacked):
+    """LOS errors that depend on the gimbal angles, see alidade.factors.error_map.
+
+    Attributes:
+        functions: (n, k) of each measurement.
+        slopes: (n, k, 2) their derivatives by azimuth and elevation.
+    """
+
+    functions: Array
+    slopes: Array
+    stacked: ClassVar = ("functions", "slopes")
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """The numbers c, of phx and phz function by function."""
+        return (2 * self.functions.shape[1],)
+
+    def each(self, _: Array) -> Iterator[Error]:
+        """The errors; phx and phz are measured larger, as if the camera had turned."""
+        for j in range(self.functions.shape[1]):
+            for axis, turn in enumerate((_ELEVATION, _COLLIMATION)):
+                yield 0, 2 * j + axis, 0.0, turn, self.functions[:, j], self.slopes[:, j]
+
+
+@dataclass(frozen=True)
+class ThroughGimbalFactor(Model):
+    """A model of increments or pictures whose noise is the same whatever the errors of the gimbal are.
+
+    Blocks: those of the model and, unless these are among them, those of the errors.
+
+    Attributes:
+        model: of n measurements: increments of the gyro that drives the gimbal, in its axes; or, with `encoder`,
+            pictures: phx, phz and perhaps the roll, with `sqrt_information`.
+        gimbal: (n, 2) azimuth and elevation, rad.
+        errors: of the gimbal.
+        encoder: (n,) sigma of the encoders' noise within the pictures', rad.
+        held: which of the model's blocks are those of the errors; empty: none.
+    """
+
+    model: Any
+    gimbal: Array
+    errors: GimbalErrors | GimbalMap
+    encoder: Array | None = None
+    held: tuple[int, ...] = ()
+    shapes: ClassVar = {"gimbal": (2,), "encoder": ()}
+    stacked: ClassVar = ("model", "gimbal", "errors", "encoder")
+
+    @property
+    def time(self) -> Array:
+        """(n,) s."""
+        return np.asarray(self.model.time)
+
+    @property
+    def rows(self) -> int:
+        """Rows of the model."""
+        return int(self.model.rows)
+
+    @property
+    def sqrt_information(self) -> Array:
+        """Of a model of pictures."""
+        return np.asarray(self.model.sqrt_information)
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Blocks of the model and of the errors."""
+        return (*self.model.blocks, *(() if self.held else self.errors.blocks))
+
+    def __call__(self, *blocks: Array) -> Residuals:
+        """Residual (1 - K) r of the model's r, (n, m)."""
+        count = len(self.model.blocks)
+        held = self.held or tuple(range(count, len(blocks)))
+        residuals, jacobians = self.model(*blocks[:count])
+        errors = list(self.errors.each(self.gimbal))
+        e = np.stack([blocks[held[block]][:, column] - guess for block, column, guess, *_ in errors])
+        to_steps, to_residuals = self._units()
+        Y = self._by_steps([error[3:] for error in errors])
+        K = to_residuals @ np.einsum("en,ekjn->nkj", e, Y) @ to_steps
+
+        def all_jacobians() -> tuple[Array, ...]:
+            steps = np.einsum("njm,nm->jn", to_steps, residuals)
+            by_errors = to_residuals @ (Y * steps).sum(axis=2).transpose(2, 1, 0)
+            own = np.concatenate(jacobians(), axis=2)
+            own -= K @ own
+            added = np.zeros((*residuals.shape, sum(block.shape[1] for block in blocks[count:])))
+            ends = np.cumsum([dimension(block) for block in self.blocks])[:-1]
+            out = np.split(np.concatenate([own, added], axis=2), ends, axis=2)
+            for i, (block, column, *_) in enumerate(errors):
+                out[held[block]][:, :, column] -= by_errors[:, :, i]
+            return tuple(out)
+
+        return residuals - np.einsum("nij,nj->ni", K, residuals), all_jacobians
+
+    def _units(self) -> tuple[Array, Array]:
+        """Gimbal steps by whitened residuals (n, 2, m), and whitened residuals by turns of the camera (n, m, 3)."""
+        (sa, se), (ca, ce) = np.sin(self.gimbal).T, np.cos(self.gimbal).T
+        zero = np.zeros_like(sa)
+        if self.encoder is None:
+            camera = np.array([[ca, sa * se, -sa * ce], [sa, -ca * se, ca * ce], [zero, ce, se]]).transpose(2, 0, 1)
+            # What alidade.factors.gimbal.command does.
+            azimuth = camera[:, :, _Z] / -ce[:, None]
+            return np.stack([azimuth, -camera[:, :, _X]], axis=1), camera
+        by_angles = np.array([[zero, ce, se], [zero + 1.0, zero, zero]]).transpose(2, 1, 0)
+        to_residuals = self.sqrt_information @ np.eye(3)[: self.rows]
+        return (self.encoder**2)[:, None, None] * (to_residuals @ by_angles).swapaxes(1, 2), to_residuals
+
+    def _by_steps(self, errors: list[tuple[int, Array, Array]]) -> Array:
+        """Y (errors, 3, 2, n), in the camera, of errors with turn, f and derivatives by the angles."""
+        se, ce = np.sin(self.gimbal[:, 1]), np.cos(self.gimbal[:, 1])
+        out = np.zeros((len(errors), 3, 2, len(se)))
+        for Y, (turn, value, slopes) in zip(out, errors, strict=True):
+            if turn == _AZIMUTH:
+                Y[_Z], Y[_Y] = ce * slopes.T, se * slopes.T
+            elif turn == _ELEVATION:
+                Y[_X] = slopes.T
+                Y[_Z, 0], Y[_Y, 0] = -se * value, ce * value
+            elif turn == _NONPERPENDICULARITY:
+                Y[_Z], Y[_Y] = -se * slopes.T, ce * slopes.T
+                Y[_X, 0] = -value
+            elif turn == _COLLIMATION:
+                Y[_Z] = slopes.T
+                Y[_X, 0], Y[_Y, 1] = se * value, -value
+            else:
+                Y[_Y] = slopes.T
+                Y[_X, 0], Y[_Z, 1] = -ce * value, value
+        return out
