@@ -72,7 +72,6 @@ class LocalMotion(Stacked):
     Attributes:
         rate: (n, 4, 3) of the gyro, coefficients by powers of the time from the stamps, rad/s^(k + 1).
         read: (n, 2) azimuth and elevation that the encoders read at the stamps, rad: between samples by the commands.
-        gimbal: (n, 2) these smoothed.
         rest: (n, 3, 2) coefficients, from the first power on, of the readings less the commanded angles, rad/s^k.
         rest_by_delay: (n, 3, 2) derivative of the rest by the encoders' delay: commands by the gyro read later, for the
             angles that the readings were then.
@@ -82,12 +81,11 @@ class LocalMotion(Stacked):
 
     rate: Array
     read: Array
-    gimbal: Array
     rest: Array
     rest_by_delay: Array
     windows: tuple[float, float]
     drivers: Array | None = None
-    stacked: ClassVar = ("rate", "read", "gimbal", "rest", "rest_by_delay", "drivers")
+    stacked: ClassVar = ("rate", "read", "rest", "rest_by_delay", "drivers")
 
     @classmethod
     def around(
@@ -111,7 +109,6 @@ class LocalMotion(Stacked):
         return cls(
             _local_cubics(at, gyro_t, gyro, windows[0]),
             reached + GimbalPath(gimbal.t, rest).at(at),
-            reached + resting[:, 0],
             resting[:, 1:].copy(),
             _local_cubics(at, gyro_t, sums[:, 2:], windows[1])[:, 1:].copy(),
             windows,

@@ -58,22 +58,20 @@ _PLACES = {
 
 @dataclass(frozen=True)
 class LosContext(Stacked):
-    """Motion, times and predicted LOS errors of n pictures, which the derivatives by sensor errors need.
+    """Motion and times of n pictures, which the derivatives by sensor errors need.
 
     Attributes:
         motion: of gyro and gimbal near the stamps.
         elapsed: (n,) since the recording's first stamp, s.
         tracked: (n,) time since the picture's target was found, s.
-        predicted: (n, 2) phx, phz at the initial values, rad, without the picture's own noise.
         stamp_shift: (n,) correction that the stamps already contain, s.
     """
 
     motion: LocalMotion
     elapsed: Array
     tracked: Array
-    predicted: Array
     stamp_shift: Array
-    stacked: ClassVar = ("motion", "elapsed", "tracked", "predicted", "stamp_shift")
+    stacked: ClassVar = ("motion", "elapsed", "tracked", "stamp_shift")
 
     def late(self, sight: Array) -> Array:
         """Time (n,), s, from the shifted stamps to the exposures, by SIGHT_ERRORS (n, 10)."""
@@ -93,9 +91,7 @@ class LosDirectionFactor(Model):
     - a picture was exposed at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay
       later than its stamp; gyro and gimbal propagate attitude and angles there from the shifted stamp;
     - an encoder reads angle + s sin(angle) + c cos(angle);
-    - phx and phz are measured larger by los_scale times `context.predicted`. Scaling what the attitudes predict instead
-      would reward small attitude changes, which cost the gyro less, with a large scale: the mode of all variables
-      together lacks the determinant that pays for it;
+    - phx and phz are measured larger by los_scale times themselves;
     - the target's frame turns at (target_rate_x, 0, target_rate_z), about its own axes, from where it was found.
 
     Attributes:
@@ -140,7 +136,7 @@ class LosDirectionFactor(Model):
     ) -> Residuals:
         """Residual sqrt_information * (measured - predicted), (n, 2) or (n, 3)."""
         if self.context is None or bias is None or sight is None:
-            residual, derivatives = self._residuals(tRm, angles, self.gimbal, 0.0)
+            residual, _, derivatives = self._residuals(tRm, angles, self.gimbal, 0.0)
             return residual, lambda: derivatives()[:2]
         motion, elapsed, tracked = self.context.motion, self.context.elapsed, self.context.tracked
         late = self.context.late(sight)
@@ -149,8 +145,7 @@ class LosDirectionFactor(Model):
         rotation = np.stack([sight[:, 3], np.zeros_like(late), sight[:, 4]], axis=1) * tracked[:, None]
         carried = so3.multiply(tRm, turn)
         seen = so3.multiply(so3.exp(-rotation), carried)
-        predicted = self.context.predicted
-        residual, derivatives = self._residuals(seen, angles, gimbal, sight[:, 2:3] * predicted)
+        residual, predicted, derivatives = self._residuals(seen, angles, gimbal, sight[:, 2:3])
 
         def jacobians() -> tuple[Array, ...]:
             by_attitude, by_angles, by_gimbal = derivatives()
@@ -160,7 +155,7 @@ class LosDirectionFactor(Model):
             by_sight = [
                 by_exposure,
                 by_exposure * -elapsed[:, None, None],
-                -self.sqrt_information[:, :, :2] @ predicted[..., None],
+                -self.sqrt_information[:, :, :2] @ predicted[:, :2, None],
                 by_attitude @ moving[:, :, ::2],
                 (by_gimbal[..., None] * by_encoder[:, None]).reshape(*by_gimbal.shape[:2], 4),
                 by_gimbal @ by_delay[..., None],
@@ -229,12 +224,16 @@ class LosDirectionFactor(Model):
         return out
 
     def _residuals(
-        self, tRm: Array, angles: Array, gimbal: Array, excess: Array | float
-    ) -> tuple[Array, Callable[[], tuple[Array, Array, Array]]]:
-        """Residuals with phx, phz measured too large by `excess`, and derivatives by tRm, angles and gimbal angles."""
+        self, tRm: Array, angles: Array, gimbal: Array, scale: Array | float
+    ) -> tuple[Array, Array, Callable[[], tuple[Array, Array, Array]]]:
+        """Residuals with phx, phz measured larger by `scale` (n, 1), phx, phz and roll, and derivatives.
+
+        The derivatives are by tRm, angles and gimbal angles.
+        """
         camera = self._camera(tRm, angles, gimbal)
-        error = self.measured - _picture(camera[:, :3])[:, : self.rows]
-        error[:, :2] -= excess
+        picture, scales = _picture(camera[:, :3]), np.ones((len(tRm), 3))
+        scales[:, :2] += scale
+        error = self.measured - (scales * picture)[:, : self.rows]
         if self.rows == 3:
             error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
 
@@ -242,12 +241,13 @@ class LosDirectionFactor(Model):
             turns, places = self._places
             # A passive turn by da moves the picture by Exp(-da axis), a right perturbation of tRm by Exp(-cRm delta).
             cRt = camera[:, :3].transpose(2, 0, 1)
-            weighted = self.sqrt_information @ _picture_jacobian(camera[:, :3])[:, : self.rows]
+            by_camera = scales[..., None] * _picture_jacobian(camera[:, :3])
+            weighted = self.sqrt_information @ by_camera[:, : self.rows]
             by_turn = weighted @ camera[:, 3:].transpose(2, 0, 1)
             columns = [turns.index("azimuth"), turns.index("elevation")]
             return weighted @ cRt @ so3.matrix(tRm), by_turn @ places, by_turn[:, :, columns]
 
-        return np.einsum("nij,nj->ni", self.sqrt_information, error), derivatives
+        return np.einsum("nij,nj->ni", self.sqrt_information, error), picture, derivatives
 
 
 def _carried(

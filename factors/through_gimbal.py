@@ -28,6 +28,8 @@ from alidade.factors.model import Array, Block, Model, Residuals, Stacked, dimen
 
 # The turns of gimbal and camera, from the gyro on.
 _AZIMUTH, _ELEVATION, _NONPERPENDICULARITY, _COLLIMATION, _ROLL = range(5)
+# Beside them: a LOS error larger by a scale, as if the camera turned by so much more with every step.
+_LOS_SCALE = 5
 # The camera's axes in the order of the pictures' rows, phx, phz and roll, which are larger by its turns about them.
 _X, _Z, _Y = range(3)
 # Which turn a mounting angle adds to; those that stand before the gimbal change nothing.
@@ -37,7 +39,7 @@ _TURNS = {
     "collimation": _COLLIMATION,
     "camera_roll": _ROLL,
 }
-_ENCODERS = SIGHT_ERRORS.index("azimuth sin")
+_SCALE, _ENCODERS = SIGHT_ERRORS.index("los_scale"), SIGHT_ERRORS.index("azimuth sin")
 # An error: number of its block and column there, first guess, turn, f (n or 1,), its derivatives by the angles
 # (n or 1, 2).
 Error = tuple[int, int, float, int, Array, Array]
@@ -66,6 +68,7 @@ class GimbalErrors(Stacked):
         for column, name in enumerate(self.names):
             if name in _TURNS:
                 yield 0, column, self.mount[column], _TURNS[name], np.ones(1), np.zeros((1, 2))
+        yield 1, _SCALE, 0.0, _LOS_SCALE, np.ones(1), np.zeros((1, 2))
         sine, cosine = np.sin(gimbal), np.cos(gimbal)
         for turn in (_AZIMUTH, _ELEVATION):
             only, column = np.eye(2)[turn], _ENCODERS + 2 * turn
@@ -195,6 +198,8 @@ class ThroughGimbalFactor(Model):
             elif turn == _COLLIMATION:
                 Y[_Z] = slopes.T
                 Y[_X, 0], Y[_Y, 1] = se * value, -value
+            elif turn == _LOS_SCALE:
+                Y[_X, 1], Y[_Z, 0] = value, ce * value
             else:
                 Y[_Y] = slopes.T
                 Y[_X, 0], Y[_Z, 1] = -ce * value, value

@@ -31,8 +31,6 @@ _PASSES = 5
 _HELD = 1e-3
 # A clock is guessed from fewer pairs.
 _CLOCK_PAIRS = 500
-# Between the knots of a line that follows what the gyro's noise and bias add up to, s.
-_SLOW = 30.0
 
 
 def los_direction(measured: Array) -> Array:
@@ -89,46 +87,6 @@ def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath, tar
     tRm = _carried(time, cRm, measured, gyro)
     target = so3.rotate(so3.exp((time - time[0])[:, None] * target_rate), [0.0, 1.0, 0.0])
     return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), target))
-
-
-def predicted_errors(
-    chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measured: Array, gyro: GyroPath
-) -> Array:
-    """phx, phz (n, 2), rad, as gyro and gimbal carry them on, brought near the measured ones by slow broken lines.
-
-    The lines have so few numbers that next to nothing of a picture's noise is in them; cRm (n, 4) are to be of smoothed
-    gimbal angles, without the encoders' noise.
-    """
-    out = np.empty((len(time), 2))
-    for chain in chains:
-        t = time[chain]
-        carried = carried_errors(t, cRm[chain], measured[chain], gyro, np.zeros(3))
-        out[chain] = carried + _broken_line(t, measured[chain, :2] - carried)
-    return out
-
-
-def _broken_line(t: Array, values: Array) -> Array:
-    """Least-squares fit (n, d) of a piecewise linear function with given knots to values (n, d) at times (n,).
-
-    Its normal equations are tridiagonal: knots and times without the product of their numbers.
-    """
-    from scipy.linalg import solveh_banded
-
-    count = 2 + int((t[-1] - t[0]) / _SLOW)
-    at = np.clip((t - t[0]) / max(t[-1] - t[0], 1e-9) * (count - 1), 0.0, count - 1.0)
-    i = np.minimum(at.astype(int), count - 2)
-    after = at - i
-    before = 1.0 - after
-
-    def summed(left: Array, right: Array) -> Array:
-        return np.asarray(np.bincount(i, left, count) + np.bincount(i + 1, right, count), dtype=float)
-
-    diagonal = summed(before**2, after**2)
-    right = np.stack([summed(before * column, after * column) for column in values.T], axis=1)
-    # A knot that no time is near stays at zero.
-    bands = np.stack([diagonal + 1e-12 * diagonal.max(), np.bincount(i, before * after, count)])
-    knots = solveh_banded(bands, right, lower=True)
-    return np.asarray(before[:, None] * knots[i] + after[:, None] * knots[i + 1])
 
 
 def guess(

@@ -41,7 +41,6 @@ from alidade.pipelines.methods.los.initial_values import (
     guess,
     guess_picture_clock,
     initial_attitudes,
-    predicted_errors,
     seen,
     select_pictures,
 )
@@ -223,12 +222,10 @@ def _prepare(
     )
     around, angles, clock = None, used.angles, clock or Clock(float(data.image_t[0]))
     if motion is not None:
-        angles, zero = motion.read, np.zeros((len(time), 1))
-        smooth = motion.moved(motion.gimbal, zero, zero + delay)[0]
-        errors = predicted_errors(chains, time, camera(smooth, mount, parameters.names), measured, chain.gyro)
+        angles = motion.read
         clock, watched = _watched(used, clock, before, start)
         elapsed = clock.elapsed(time)
-        around = LosContext(motion, elapsed, watched, errors, clock.late(elapsed))
+        around = LosContext(motion, elapsed, watched, clock.late(elapsed))
     model = _Model(
         chain=chain,
         mount=mount,

@@ -161,6 +161,21 @@ def test_clocks_that_drift_for_a_quarter_of_an_hour() -> None:
     assert runs * mean < quantile(1 - 5e-3, runs * size)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_hour_is_as_right_as_a_minute(seed: int) -> None:
+    """The gyro's noise moves the gimbal: errors of the gimbal that are variables would be 7 sigmas off."""
+    scenario = LosScenario(
+        duration_s=3600.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0, image_rate_hz=5.0, sensors=Sensors()
+    )
+    data, truth = simulate_los(scenario, seed)
+    estimate = solve_batch(problem(data, _config(scenario)), error_map=True)
+    assert estimate.error_map is None
+    size = len(estimate.names)
+    assert quantile(5e-3, size) < _nees(estimate, truth) < quantile(1 - 5e-3, size)
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+
+
 def test_a_clock_is_guessed_over_an_hour() -> None:
     """One that has gone wrong by as much as half a swing takes."""
     scenario = _drifting(3600.0, 5e-4).model_copy(
