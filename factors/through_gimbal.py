@@ -2,7 +2,7 @@
 
 The angles from which a camera's attitude is computed contain noise: the gimbal turns with what the gyro that drives it
 reads, that gyro's noise included, and encoders have noise of their own. Both are accounted for as long as the gimbal is
-what it is taken for. An error that turns the camera by e f about an axis a, f a function of the gimbal angles, adds
+as assumed. An error that turns the camera by e f about an axis a, f a function of the gimbal angles, adds
 
     e Y dg,    Y dg = a (grad f) dg + f sum_k (a_k x a) dg_k,
 

@@ -141,7 +141,7 @@ def _error_map(config: Config, model: _Model, _: Estimate) -> ErrorMap | None:
         model.chain.time,
         np.hstack([alone, alone[:, i] * alone[:, j]]),
         {"azimuth": model.angles[:, 0], "elevation": model.angles[:, 1]},
-        slopes=np.hstack([slopes, by_both]),
+        slopes=None if model.around is None else np.hstack([slopes, by_both]),
     )
 
 
