@@ -17,6 +17,8 @@ from alidade.factors.model import Array, Stacked
 WINDOWS = (0.2, 0.1, 0.05, 0.025)
 # Samples left out to choose it, and the part by which prediction errors differ by chance.
 _TRIED, _AS_GOOD = 500, 1.05
+# Between angles by which commands and what follows them are compared, s.
+_FOLLOWED = 0.1
 # Of the polynomials.
 _DEGREE = 3
 # Moments whose samples are held at a time: few enough for the processor's cache.
@@ -76,6 +78,7 @@ class LocalMotion(Stacked):
         rest_by_delay: (n, 3, 2) derivative of the rest by the encoders' delay: commands by the gyro read later, for the
             angles that the readings were then.
         windows: half the time over which rates and rest are smoothed, s.
+        following: the share of its commands by the gyro that the gimbal follows, noise of the gyro included.
         drivers: (n, d) of the gyro, see alidade.factors.gyro; None where it has none.
     """
 
@@ -84,6 +87,7 @@ class LocalMotion(Stacked):
     rest: Array
     rest_by_delay: Array
     windows: tuple[float, float]
+    following: float
     drivers: Array | None = None
     stacked: ClassVar = ("rate", "read", "rest", "rest_by_delay", "drivers")
 
@@ -95,16 +99,20 @@ class LocalMotion(Stacked):
         gyro: Array,
         gimbal: GimbalPath,
         drivers: Array | None = None,
-        windows: tuple[float, float] | None = None,
+        before: LocalMotion | None = None,
     ) -> LocalMotion:
         """The motion around times (n,), s, of a gyro's samples (N,), (N, 3), and drivers (N, d), and of a gimbal.
 
-        Windows are chosen unless given.
+        Of a recording that grows windows and following stay as they were `before`.
         """
         sums = _commanded(gyro_t, gyro, gimbal)
         commanded = GimbalPath(gyro_t, sums[:, :2])
         rest = gimbal.angles - commanded.at(gimbal.t)
-        windows = windows or (_smoothing(at, gyro_t, gyro), _smoothing(at, gimbal.t, rest))
+        if before is None:
+            windows = _smoothing(at, gyro_t, gyro), _smoothing(at, gimbal.t, rest)
+            following = _following(gimbal, commanded)
+        else:
+            windows, following = before.windows, before.following
         resting, reached = _local_cubics(at, gimbal.t, rest, windows[1]), commanded.at(at)
         return cls(
             _local_cubics(at, gyro_t, gyro, windows[0]),
@@ -112,6 +120,7 @@ class LocalMotion(Stacked):
             resting[:, 1:].copy(),
             _local_cubics(at, gyro_t, sums[:, 2:], windows[1])[:, 1:].copy(),
             windows,
+            following,
             None if drivers is None else np.stack([np.interp(at, gyro_t, each) for each in drivers.T], axis=1),
         )
 
@@ -182,6 +191,23 @@ def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
         steps = np.diff(t[some])[:, None] * command(mean, middle), command(np.diff(rates, axis=0), middle)
         out[i + 1 : i + _BLOCK + 1] = out[i] + np.cumsum(np.hstack(steps), axis=0)
     return out
+
+
+def _following(gimbal: GimbalPath, commanded: GimbalPath) -> float:
+    """Share of commanded angles that a gimbal follows, 0 to 1, by what moves it within tenths of a second.
+
+    Slower motion says nothing of the gyro's noise, faster one is lost in that of pictures. Least absolute deviations
+    of third differences, on which slews to another target have no influence.
+    """
+    t = np.arange(gimbal.t[0], gimbal.t[-1], _FOLLOWED)
+    read, asked = (np.diff(path.at(t), 3, axis=0).ravel() for path in (gimbal, commanded))
+    moving = asked != 0.0
+    ratio, weight = read[moving] / asked[moving], np.abs(asked[moving])
+    order = np.argsort(ratio)
+    total = np.cumsum(weight[order])
+    if not len(total):
+        return 0.0
+    return float(np.clip(ratio[order][np.searchsorted(total, 0.5 * total[-1])], 0.0, 1.0))
 
 
 def _smoothing(at: Array, t: Array, values: Array) -> float:

@@ -11,8 +11,8 @@ gyro and a. With errors e_i an increment of the gyro has the noise (1 + K) n, K 
 which n drives the gimbal. A picture with the noise v has v + sum e_i Y_i dg, dg what of v is the encoders': E(dg | v).
 
 Errors that are unknowns would be chosen to make that noise smaller, and be biased by a number of sigmas that grows with
-the square root of the recording's length. Less K times the residual the noise is the same whatever the errors are, to
-first order in them; so they are counted from a first guess.
+the square root of the recording's length. Multiplied with the inverse of 1 + K, residuals have the same noise whatever
+the errors are. K is linear in them, so they are counted from a first guess.
 """
 
 from __future__ import annotations
@@ -113,6 +113,7 @@ class ThroughGimbalFactor(Model):
         gimbal: (n, 2) azimuth and elevation, rad.
         errors: of the gimbal.
         encoder: (n,) sigma of the encoders' noise within the pictures', rad.
+        following: the share of the gyro's commands that the gimbal follows.
         held: which of the model's blocks are those of the errors; empty: none.
     """
 
@@ -120,6 +121,7 @@ class ThroughGimbalFactor(Model):
     gimbal: Array
     errors: GimbalErrors | GimbalMap
     encoder: Array | None = None
+    following: float = 1.0
     held: tuple[int, ...] = ()
     shapes: ClassVar = {"gimbal": (2,), "encoder": ()}
     stacked: ClassVar = ("model", "gimbal", "errors", "encoder")
@@ -145,7 +147,7 @@ class ThroughGimbalFactor(Model):
         return (*self.model.blocks, *(() if self.held else self.errors.blocks))
 
     def __call__(self, *blocks: Array) -> Residuals:
-        """Residual (1 - K) r of the model's r, (n, m)."""
+        """Residual (1 + K)^-1 r of the model's r, (n, m)."""
         count = len(self.model.blocks)
         held = self.held or tuple(range(count, len(blocks)))
         residuals, jacobians = self.model(*blocks[:count])
@@ -154,12 +156,13 @@ class ThroughGimbalFactor(Model):
         to_steps, to_residuals = self._units()
         Y = self._by_steps([error[3:] for error in errors])
         K = to_residuals @ np.einsum("en,ekjn->nkj", e, Y) @ to_steps
+        whitening = np.linalg.inv(np.eye(self.rows) + K)
+        residuals = np.einsum("nij,nj->ni", whitening, residuals)
 
         def all_jacobians() -> tuple[Array, ...]:
             steps = np.einsum("njm,nm->jn", to_steps, residuals)
-            by_errors = to_residuals @ (Y * steps).sum(axis=2).transpose(2, 1, 0)
-            own = np.concatenate(jacobians(), axis=2)
-            own -= K @ own
+            by_errors = whitening @ to_residuals @ (Y * steps).sum(axis=2).transpose(2, 1, 0)
+            own = whitening @ np.concatenate(jacobians(), axis=2)
             added = np.zeros((*residuals.shape, sum(block.shape[1] for block in blocks[count:])))
             ends = np.cumsum([dimension(block) for block in self.blocks])[:-1]
             out = np.split(np.concatenate([own, added], axis=2), ends, axis=2)
@@ -167,7 +170,7 @@ class ThroughGimbalFactor(Model):
                 out[held[block]][:, :, column] -= by_errors[:, :, i]
             return tuple(out)
 
-        return residuals - np.einsum("nij,nj->ni", K, residuals), all_jacobians
+        return residuals, all_jacobians
 
     def _units(self) -> tuple[Array, Array]:
         """Gimbal steps by whitened residuals (n, 2, m), and whitened residuals by turns of the camera (n, m, 3)."""
@@ -176,8 +179,8 @@ class ThroughGimbalFactor(Model):
         if self.encoder is None:
             camera = np.array([[ca, sa * se, -sa * ce], [sa, -ca * se, ca * ce], [zero, ce, se]]).transpose(2, 0, 1)
             # What alidade.factors.gimbal.command does.
-            azimuth = camera[:, :, _Z] / -ce[:, None]
-            return np.stack([azimuth, -camera[:, :, _X]], axis=1), camera
+            steps = np.stack([camera[:, :, _Z] / ce[:, None], camera[:, :, _X]], axis=1)
+            return -self.following * steps, camera
         by_angles = np.array([[zero, ce, se], [zero + 1.0, zero, zero]]).transpose(2, 1, 0)
         to_residuals = self.sqrt_information @ np.eye(3)[: self.rows]
         return (self.encoder**2)[:, None, None] * (to_residuals @ by_angles).swapaxes(1, 2), to_residuals

@@ -118,8 +118,8 @@ class ErrorMap:
         gimbal = np.column_stack(list(self.places.values()))[at]
         errors = GimbalMap(self.functions[at], self.slopes[at])
         if mapped is None:
-            return ThroughGimbalFactor(model, gimbal, errors)
-        return ThroughGimbalFactor(mapped, gimbal, errors, model.encoder, (len(model.blocks),))
+            return ThroughGimbalFactor(model, gimbal, errors, following=model.following)
+        return ThroughGimbalFactor(mapped, gimbal, errors, model.encoder, held=(len(model.blocks),))
 
     def error(self, c: Array) -> Array:
         """Errors (n, axes) of the measurements."""

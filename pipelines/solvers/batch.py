@@ -187,7 +187,7 @@ def solve_batch(
     if device:
         estimate = replace(estimate, sqrt_info=_information_of(solved, device, elsewhere))
     if error_map:
-        estimate = with_error_map(solved.compiled.problem, solved.engine, solved.values, estimate)
+        estimate = with_error_map(solved.compiled.problem, solved.posterior, estimate)
     done = time.perf_counter()
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
 

@@ -41,15 +41,15 @@ _WHAT = "the test for errors that depend on the attitude"
 _SIGMAS = np.append(0.0, np.geomspace(1e-2, 1e3, 500))
 
 
-def with_error_map(problem: Problem, engine: Linearization, values: Values, estimate: Estimate) -> Estimate:
+def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -> Estimate:
     """The estimate with the errors that measurements have by where they are made, if they have any.
 
     Args:
         problem: as it was solved, without a map.
-        engine: of its factors at the solution, rejected measurements left out.
-        values: of the solution.
+        posterior: of the solution, rejected measurements left out.
         estimate: the same as reported.
     """
+    engine, values = posterior.at.engine, posterior.at.values
     error_map = problem.error_map(estimate) if problem.error_map is not None and estimate.converged else None
     if error_map is None or not engine.is_chain or deadline.passed(_WHAT):
         return estimate
@@ -60,14 +60,17 @@ def with_error_map(problem: Problem, engine: Linearization, values: Values, esti
     if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
         return estimate
     try:
-        return _freed(problem, error_map, estimate, ratio)
+        return _freed(problem, error_map, posterior, estimate, ratio)
     except (IndeterminateStateError, np.linalg.LinAlgError):
         deadline.passed(_WHAT)
         return estimate
 
 
-def _freed(problem: Problem, error_map: ErrorMap, estimate: Estimate, ratio: float) -> Estimate:
-    """The solution with the map free, its prior as wide as the map."""
+def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float) -> Estimate:
+    """The solution with the map free, its prior as wide as the map.
+
+    What the recording does not determine `without` the map it does not with it.
+    """
     compiled, solution, information = _solved(problem, error_map, estimate)
     chi_square, dof, rms = _tested(_rows(information, error_map)[1], error_map, ratio)
     if rms > error_map.prior:
@@ -88,8 +91,9 @@ def _freed(problem: Problem, error_map: ErrorMap, estimate: Estimate, ratio: flo
     spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
     at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
     shift = np.array([at[name] for name in estimate.names]) - estimate.values
-    columns = np.zeros((len(estimate.names), spread.shape[1]))
-    columns[[estimate.names.index(name) for name in others]] = gain @ spread
+    columns, rows_of = np.zeros((len(estimate.names), spread.shape[1])), [estimate.names.index(n) for n in others]
+    columns[rows_of] = gain @ spread
+    shift[rows_of] = _along_strong(shift[rows_of, None], others, without)[:, 0]
     found = FoundMap(
         error_map,
         error_map.error(information.at[own]),

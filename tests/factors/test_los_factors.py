@@ -300,3 +300,19 @@ def test_rate_jacobians_and_rows() -> None:
     blocks = [np.broadcast_to(np.random.default_rng(7).normal(size=4), (N, 4))]
     assert_jacobians(_rate_factor(np.arange(N)), blocks)
     assert_rows_are_independent(_rate_factor, blocks)
+
+
+@pytest.mark.parametrize("following", [0.0, 0.6, 1.0])
+def test_share_of_its_commands_that_a_gimbal_follows(following: float) -> None:
+    """With noise in all, and a slew to another target halfway."""
+    rng = np.random.default_rng(8)
+    t = np.arange(0.0, 30.0, 0.01)
+    gyro = 0.1 * np.sin(np.array([1.1, 0.7, 1.9]) * t[:, None]) + 3e-4 * rng.standard_normal((len(t), 3))
+    angles = np.full((len(t), 2), 0.3)
+    for i in range(1, len(t)):
+        angles[i] = angles[i - 1] + 0.01 * following * command(
+            0.5 * (gyro[i - 1 : i] + gyro[i : i + 1]), angles[i - 1 : i]
+        )
+    slewed = angles + 0.3 * np.clip(t - 15.0, 0.0, 1.0)[:, None] + 5e-6 * rng.standard_normal(angles.shape)
+    motion = LocalMotion.around(TIMES, t, gyro, GimbalPath(t, slewed))
+    assert motion.following == pytest.approx(following, abs=0.02)

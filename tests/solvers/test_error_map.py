@@ -77,7 +77,7 @@ def test_vision_errors_by_attitude_widen_sigmas_and_move_nothing() -> None:
 
     solved = solve(Compiled.of(_session("head", 5e-3, 2, 20.0).problem()))
     plain = whole_estimate(solved)
-    found = with_error_map(solved.compiled.problem, solved.engine, solved.values, plain)
+    found = with_error_map(solved.compiled.problem, solved.posterior, plain)
     assert found.error_map is not None
     assert found.error_map.map.name == "vision_map"
     assert np.array_equal(plain.values, found.values)

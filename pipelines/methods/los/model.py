@@ -208,8 +208,8 @@ def _prepare(
     del gyro  # Another as large follows.
     motion = None
     if parameters.sight is not None:
-        windows = None if before is None or before.around is None else before.around.motion.windows
-        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving, windows)
+        moved = None if before is None or before.around is None else before.around.motion
+        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving, moved)
     chain = GyroChain.over(
         time,
         used.starts,
@@ -386,11 +386,12 @@ def _start_factor(model: _Model, k: int) -> Factor:
 
 def _driving(model: _Model, factor: Factor) -> Factor:
     """The factor; increments of the gyro, that drives the gimbal, with noise that its errors do not change."""
-    increments, sight = factor.process, model.parameters.sight
-    if increments is None or sight is None or factor.family != "gyro":
+    increments, sight, around = factor.process, model.parameters.sight, model.around
+    if increments is None or sight is None or around is None or factor.family != "gyro":
         return factor
     at = np.searchsorted(model.chain.time, increments.model.time)
-    driving = ThroughGimbalFactor(increments.model, model.angles[at], model.gimbal_errors)
+    errors, following = model.gimbal_errors, around.motion.following
+    driving = ThroughGimbalFactor(increments.model, model.angles[at], errors, following=following)
     return replace(factor, process=driving.on(*increments.tied, model.parameters.angles.key, sight.key))
 
 
@@ -419,7 +420,9 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str)
     columns: list[int | list[int]] = [[model.chain.state(i) for i in k], p.angles.key]
     bound: Model = rows_model
     if p.sight is not None:
-        bound = ThroughGimbalFactor(rows_model, model.angles[some], model.gimbal_errors, model.encoder[some], (1, 3))
+        bound = ThroughGimbalFactor(
+            rows_model, model.angles[some], model.gimbal_errors, model.encoder[some], held=(1, 3)
+        )
         # From stamp to picture the bias has no time to matter but as a whole. Each keyframe's own, where it may walk
         # far, would follow the picture's noise, the better the larger the time offset, which would grow without bounds.
         columns += [FIRST_BIAS, p.sight.key, *model.chain.error_keys]
