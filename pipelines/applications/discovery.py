@@ -16,15 +16,13 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
-from alidade.pipelines.recording.pairing import INTERVAL, MAX_MOUNT, Pairing, pair
+from alidade.pipelines.recording.pairing import BELONGS, INTERVAL, MAX_MOUNT, Pairing, pair
 from alidade.pipelines.recording.plausibility import is_there
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
 from alidade.pipelines.recording.topics import Setting, Topic, TopicSource, wanted
 from alidade.pipelines.settings import Config
 
-# Rates and attitudes belong together above this correlation of their norms.
-_BELONGS = 0.7
 # Correlations are compared up to this one.
 _HIGHEST = 1.0 - 1e-9
 # Names are alike above this ratio of difflib.
@@ -230,7 +228,7 @@ class _Search:
             for a in self._candidates(attitude)
             for g in self._candidates(gyro)
             if a.name != g.name
-            if (found := self._pairing(g.name, a)) is not None and found.correlation > _BELONGS
+            if (found := self._pairing(g.name, a)) is not None and found.correlation > BELONGS
         ]
         if not fitting:
             return set()

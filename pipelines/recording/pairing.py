@@ -21,6 +21,8 @@ Stamps = NDArray[np.int64]
 
 # Delays looked for, s; steps and length of the grid they are looked for on.
 _LARGEST_DELAY, _FINEST, _MOST = 2.0, 0.002, 1 << 17
+# Rates and attitudes belong together above this correlation of their norms.
+BELONGS = 0.7
 # Interval over which attitudes are differenced, s.
 INTERVAL = 0.1
 # Search of a delay: half range, s; half ranges of the successive refinements, s; least number of rates.

@@ -52,10 +52,12 @@ _PRIOR = "prior of "
 # Smaller shares are summed, and so are those after so many.
 _LEAST_SHARE, _MOST_PARTS = 0.02, 4
 REST = "everything else"
-_FAR = (
-    "check the orientation and the axis order of the sensor (`axes:` of its topic turns it, `[x, -y, -z]` by 180 deg "
-    "about x), or widen the prior"
-)
+# By the unit of the parameter.
+_FAR = {
+    "rad": "check the orientation and the axis order of the sensor (`axes:` of its topic turns it, `[x, -y, -z]` by "
+    "180 deg about x), or widen the prior",
+    "s": "check that both sensors are stamped by one clock, or widen the prior",
+}
 
 
 def headline(findings: Sequence[Finding], quantities: Quantities, verdicts: Mapping[str, str]) -> str:
@@ -244,7 +246,7 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
     prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
     numbers = f"{format_estimate(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
     if not (q.assumed or q.tight):
-        return f"{q.name} is far from its prior", f"{numbers}; {_FAR}"
+        return f"{q.name} is far from its prior", f"{numbers}; {_FAR.get(q.unit, 'if the device is so, widen it')}"
     inseparable = f" (or {', '.join(e['inseparable'])}, inseparable from it)" if e["inseparable"] else ""
     what = f"{q.name} contradicts its {'data sheet' if q.sheet else 'prior'}{inseparable}"
     return what, numbers + _shift(e["effect"], q.name, quantities, "its departure")

@@ -23,7 +23,8 @@ from tests.support.pages import Page
 NOTE, WEAK, INCONSISTENT, UNOBSERVABLE = Severity
 MOUNT = Quantity("helmet_mount_z", "rad", 0.35, 0.35, 1e-2)
 SCALE = Quantity("gyro_scale_x", "", 1e-2, 1e-2, np.inf, group="assumption", sheet="gyro.scale")
-QUANTITIES = {q.name: q for q in (MOUNT, SCALE)}
+OFFSET = Quantity("time_offset", "s", 0.05, 0.05, 5e-3)
+QUANTITIES = {q.name: q for q in (MOUNT, SCALE, OFFSET)}
 CONFLICT = {"parameter": SCALE.name, "value": 0.06, "sigma": 1e-3, "z": 6.0}
 REJECTED = Finding("rejection", INCONSISTENT, {"family": "vision", "share": 0.31, "noise_factor": 4.12})
 
@@ -62,6 +63,13 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "helmet_mount_z is far from its prior: 177.617 ± 0.057 deg, prior 0 ± 20 deg (z = 8.9); check the orientation "
         "and the axis order of the sensor (`axes:` of its topic turns it, `[x, -y, -z]` by 180 deg about x), or widen "
         "the prior.",
+    ),
+    (
+        "prior_conflict",
+        NOTE,
+        {"parameter": "time_offset", "value": -1.0257, "sigma": 1e-3, "z": -20.5, "inseparable": (), "effect": {}},
+        "time_offset is far from its prior: -1025.7 ± 1.0 ms, prior 0 ± 50 ms (z = -20.5); check that both sensors are "
+        "stamped by one clock, or widen the prior.",
     ),
     (
         "contradiction",

@@ -14,6 +14,8 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.camera_clock import Clock, Miss, first_span, guess_clock, turns_near
 from alidade.pipelines.estimation.priors import prior_sigmas
 from alidade.pipelines.estimation.problem import Array, Parameter
+from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.recording.pairing import BELONGS, pair
 
 # Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
 _GUESS_SPAN = 0.3
@@ -67,6 +69,8 @@ def guess_picture_clock(
 ) -> Clock:
     """Clock that fits the helmet's gyro to the pictures best, estimated with gyro bias and mount.
 
+    It is near the delay at which the norms of both rates are correlated most: a fit from zero ends within a swing.
+
     Args:
         gyro, platform: of helmet and platform, integrated without any bias taken off; None: the platform is at rest.
         elapsed: (n,) stamps of the pictures since the recording's first, s.
@@ -104,8 +108,12 @@ def guess_picture_clock(
         return miss
 
     first = elapsed <= first_span(1.0 / prior[-1])
-    bias, mount = guess(gyro, begun + elapsed[first], carried(begun + elapsed[first], measured[first]), sigma)
-    x = np.concatenate([np.zeros(3), bias, np.zeros(2)])
+    at, seen = begun + elapsed[first], measured[first]
+    others = () if platform is None else ((nanoseconds(platform.t, 0), platform.read),)
+    found = pair(nanoseconds(gyro.t, 0), gyro.read, nanoseconds(at, 0), seen, others)
+    offset = found.offset_s if found is not None and found.correlation > BELONGS else 0.0
+    bias, mount = guess(gyro, at + offset, carried(at + offset, seen), sigma)
+    x = np.concatenate([np.zeros(3), bias, [offset, 0.0]])
     return guess_clock(begun, float(elapsed[-1]), x, prior, sigma, missing)[0]
 
 

@@ -269,6 +269,18 @@ def test_keyframes_stand_where_pictures_of_a_drifting_clock_were_taken() -> None
     assert off.max() < 0.02
 
 
+@pytest.mark.parametrize("early", [0.7, -1.4])
+def test_keyframes_stand_where_pictures_of_another_clock_were_taken(early: float) -> None:
+    """Fitted from zero, the clock stays a swing off."""
+    settings = scenario()
+    data, truth = simulate_head(settings, 1)
+    moved = replace(data, vision_t=data.vision_t - early)
+    graph = problem(moved, load_config(head_config(settings).encode()))
+    assert graph.keyframes is not None
+    late = graph.keyframes.clock.late(moved.vision_t - moved.vision_t[0])
+    assert np.abs(late - early - truth["time_offset"]).max() < 0.02
+
+
 def test_errors_fit_their_covariance_over_ten_minutes_of_a_clock_that_drifts() -> None:
     run = Run(_drifting(600.0, -1.5e-3), 2, solve_batch)
     assert run.nees < chi2.ppf(1 - 1e-3, len(run.error))
