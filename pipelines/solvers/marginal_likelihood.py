@@ -787,6 +787,8 @@ def solve_likelihood(
             times = np.concatenate(late)
             used = [~(np.isin(g.model.time, times) & g.is_measurement) for g in engine.groups]
             found = LikelihoodMaximum(_with_parameters(compiled, known, found.values), found.levels, unwidened(used))
+            # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
+            found = replace(found, values=_solution_at(engine, found, config).values)
     for number in range(_MOST_SOLUTIONS):
         before = found.levels
         found = maximise_likelihood(engine, found, 1 if number else _ROUNDS, from_above=not number)

@@ -55,6 +55,18 @@ def test_with_its_true_data_sheet_the_mount_is_right(recording: Path, tmp_path: 
     assert all(p.value > 5.0 * p.sigma for p in scales)
 
 
+def test_its_last_twenty_seconds_alone_agree(recording: Path) -> None:
+    """About states that follow vision's noise, levels at which the gyro's scale is -1 seem likelier."""
+    session = alidade.open(recording, method="head", config=alidade.Config(sensors={"gyro": {"scale": 0.1}}))
+    data = session.method.faults.segment(session.data, 38.0, 57.0)
+    found = replace(session, data=data).calibrate(report=False)
+    assert found.status != "inconsistent"
+    assert abs(found.parameters["gyro_scale_y"].value) < 0.1
+    mount = [found.parameters[f"helmet_mount_{axis}"] for axis in "xyz"]
+    off = [(p.value - np.deg2rad(true)) / p.sigma for p, true in zip(mount, MOUNT_DEG, strict=True)]
+    assert np.abs(off).max() < 3.0
+
+
 @pytest.mark.parametrize(("name", "jump_s"), [("u1", None), ("u2", 33.46)])
 def test_markers_that_slip_by_two_degrees_half_way(name: str, jump_s: float | None, shared_data: Path) -> None:
     """In u2 motion capture itself turns by 1 deg between two attitudes, in which the gyro has nothing."""
