@@ -221,13 +221,14 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, posterior.at
     names = tuple(q.name for q in problem.quantities)
+    fit = chi_square(leverages(engine, found.system, found.factorization, values))
     correlations = dict[str, Array]()
     if solved.levels and not problem.marginal_likelihood:
         correlations = autocorrelations(engine, values, len(posterior.reported.free))
     influence, noises, added = None, dict[str, ColouredNoise](), dict[str, Array]()
     if budget or correlations:
         influence = Influence.of(posterior)
-        noises = coloured_noises(influence, correlations)
+        noises = coloured_noises(influence, correlations, fit.families)
         added = added_covariance(influence, noises)
     nominal = posterior.covariance
     covariance = nominal.copy()
@@ -255,7 +256,7 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
         message=solved.message,
         residuals=residuals,
         innovations=innovations,
-        chi_square=chi_square(leverages(engine, found.system, found.factorization, values)),
+        chi_square=fit,
         history=None if history is None else history.history.inflated(wide),
         posterior_history=history,
         smoothed=smoothed(compiled, posterior, covariance),

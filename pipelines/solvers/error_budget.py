@@ -19,8 +19,10 @@ correlated by exp(-k / T), has the restricted likelihood (Harville, J. Am. Stat.
 
     -2 log L = (n - m) log q + log det V + log det Q'V^-1 Q,    q = min_x (y - Q x)'V^-1 (y - Q x)
 
-V = (1 - f) I + f exp(-|i - j| / T), Q an orthonormal basis of what the m numbers move the n residuals y by;
-v = q / (n - m). But for both ends the cosine transform makes V diagonal.
+V = (1 - f) I + f exp(-|i - j| / T), Q an orthonormal basis of what the m numbers move the n residuals y by. But for
+both ends the cosine transform makes V diagonal. v = q / r, r the redundancy of the residuals: states have absorbed some
+of them as well, and what is rejected is none of them. The weights have v = 1, as found, stated or sampled; a v below it
+is of correlated noise that states have absorbed.
 """
 
 from __future__ import annotations
@@ -247,7 +249,7 @@ class ColouredNoise:
     Attributes:
         share: of the variance that is correlated.
         length: of the correlation, in measurements.
-        variance: over that of the weights.
+        variance: over that of the weights, at least 1.
         fall: decrease of -2 log L relative to white noise.
     """
 
@@ -257,12 +259,13 @@ class ColouredNoise:
     fall: float
 
     @classmethod
-    def fitted(cls, whitened: Array, basis: Array, together: float) -> ColouredNoise:
+    def fitted(cls, whitened: Array, basis: Array, redundancy: float, together: float) -> ColouredNoise:
         """The noise of largest restricted likelihood.
 
         Args:
             whitened: residuals (n, r), in time order; each column is a noise of its own.
             basis: (n, r, m), orthonormal, of what a fit has absorbed of them.
+            redundancy: sum of their squares that white noise of the weights' variance leaves, on average.
             together: first guess of how many of them count as one.
         """
         from scipy.optimize import minimize
@@ -281,8 +284,8 @@ class ColouredNoise:
         options = {"xatol": 0.02, "fatol": 0.02, "initial_simplex": simplex}
         best = minimize(cost, start, method="Nelder-Mead", options=options)
         share, length = numbers(best.x)
-        white, variance = spectrum.likelihood(0.0, 1.0)[0], spectrum.likelihood(share, length)[1]
-        return cls(share, length, variance, white - float(best.fun))
+        white, square = spectrum.likelihood(0.0, 1.0)[0], spectrum.likelihood(share, length)[1]
+        return cls(share, length, max(square / redundancy, 1.0), white - float(best.fun))
 
     @property
     def correlation(self) -> Array:
@@ -326,7 +329,7 @@ class _Spectrum:
         return cls(np.cos(np.pi * middle / n), np.diff(edges).astype(float), products, whitened.shape)
 
     def likelihood(self, share: float, length: float) -> tuple[float, float]:
-        """-2 log L of coloured noise, see the module, and its variance."""
+        """-2 log L and q of coloured noise, see the module."""
         a, (n, r) = float(np.exp(-1.0 / length)), self.size
         power = 1.0 - share + share * (1.0 - a**2) / (1.0 + a**2 - 2.0 * a * self.cosine)
         sums = np.tensordot(1.0 / power, self.products, axes=1)
@@ -334,7 +337,7 @@ class _Spectrum:
         left = float(sums[0, 0] - across @ np.linalg.solve(absorbed, across))
         square, count = max(left, np.finfo(float).tiny), n * r - len(across)
         log_det = r * float(self.count @ np.log(power)) + float(np.linalg.slogdet(absorbed)[1])
-        return count * float(np.log(square)) + log_det, square / count
+        return count * float(np.log(square)) + log_det, square
 
 
 def autocorrelations(engine: Linearization, values: Values, fitted: int) -> dict[str, Array]:
@@ -353,12 +356,21 @@ def autocorrelations(engine: Linearization, values: Values, fitted: int) -> dict
     return found
 
 
-def coloured_noises(influence: Influence, correlations: Mapping[str, Array]) -> dict[str, ColouredNoise]:
-    """Family of measurements -> its noise where that is coloured; see `autocorrelations` for first guesses."""
+def coloured_noises(
+    influence: Influence, correlations: Mapping[str, Array], squares: Mapping[str, tuple[float, float]]
+) -> dict[str, ColouredNoise]:
+    """Family of measurements -> its noise where that is coloured.
+
+    Args:
+        influence: of the residuals.
+        correlations: first guesses, see `autocorrelations`.
+        squares: family -> sum of its whitened squares, and their redundancy.
+    """
     found = {}
     for family, lags in correlations.items():
         whitened = _residuals(influence.at.engine.measured[family], influence.at.values)
-        noise = ColouredNoise.fitted(whitened, _basis(influence, family), 1.0 + 2.0 * float(lags.sum()))
+        together = 1.0 + 2.0 * float(lags.sum())
+        noise = ColouredNoise.fitted(whitened, _basis(influence, family), squares[family][1], together)
         if noise.fall > quantile(_COLOURED, 2):
             found[family] = noise
     return found
@@ -380,10 +392,9 @@ def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) 
     for family, noise in noises.items():
         L, right = _influences(influence, family)
         groups = influence.at.engine.measured[family]
-        time = np.concatenate([group.model.time for group in groups])[_in_time(groups)]
+        time = np.concatenate([group.model.time for group in groups])[_in_time(groups, influence.at.values)]
         nominal = np.einsum("nri,nrj->ij", L, L)
-        # Below the level's it counts degrees of freedom that rejected rows and attitudes have taken.
-        whole = max(noise.variance, 1.0) * (nominal + _correlated(L, noise.correlation[: len(L) - 1]))
+        whole = noise.variance * (nominal + _correlated(L, noise.correlation[: len(L) - 1]))
         ratio = ratio_by_blocks(time, np.einsum("nrm,nr->nm", L, right), np.diag(whole))
         more = (np.outer(ratio, ratio) * whole - nominal) / np.outer(scale, scale)
         variances, axes = np.linalg.eigh(0.5 * (more + more.T))
@@ -393,15 +404,14 @@ def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) 
 
 
 def _residuals(groups: Sequence[Group], values: Values) -> Array:
-    """Weighted residuals (n, r) of several groups in time order; zero where a measurement is rejected."""
-    found = [g.weighted(g.evaluate(values)[0]) * g.inliers(values)[:, None] for g in groups]
-    return np.asarray(np.concatenate(found)[_in_time(groups)])
+    """Weighted residuals (n, r) of the measurements of several groups that count, in time order."""
+    return np.concatenate([g.weighted(g.evaluate(values)[0]) for g in groups])[_in_time(groups, values)]
 
 
 def _influences(influence: Influence, family: str) -> tuple[Array, Array]:
-    """L (n, r, m) of a family in time order, and minus its weighted residuals (n, r)."""
+    """L (n, r, m) of a family's measurements that count, in time order, and minus their weighted residuals (n, r)."""
     groups = influence.at.engine.measured[family]
-    found, order = [influence.rows(group) for group in groups], _in_time(groups)
+    found, order = [influence.rows(group) for group in groups], _in_time(groups, influence.at.values)
     return np.concatenate([each[0] for each in found])[order], np.concatenate([each[1] for each in found])[order]
 
 
@@ -476,9 +486,10 @@ def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
     return np.maximum(ratio, 1.0) if certain else np.ones(len(ratio))
 
 
-def _in_time(groups: Sequence[Group]) -> NDArray[np.intp]:
-    """Order of the measurements of several groups in time."""
-    return np.argsort(np.concatenate([group.model.time for group in groups]), kind="stable")
+def _in_time(groups: Sequence[Group], values: Values) -> NDArray[np.intp]:
+    """The measurements of several groups that count, in order of time."""
+    order = np.argsort(np.concatenate([group.model.time for group in groups]), kind="stable")
+    return order[np.concatenate([group.inliers(values) for group in groups])[order]]
 
 
 def _lagged(whitened: Array, lags: int) -> Array:

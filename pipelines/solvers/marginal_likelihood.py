@@ -239,16 +239,16 @@ class LinearChain:
         """Gate of the squared innovations of each kind of rows."""
         return [gate(rows.residuals.shape[1]) ** 2 for rows in self.rows]
 
-    def factors(self, widening: Widening | None, rejected: float = np.inf) -> list[Array]:
-        """Factors (n,) of the variances of each kind of rows, `rejected` of measurements that are."""
+    def factors(self, widening: Widening | None, of_rejected: float = np.inf) -> list[Array]:
+        """Factors (n,) of the variances of each kind of rows, `of_rejected` that of measurements that are rejected."""
         each = [np.ones(len(rows.time)) if widening is None else widening[rows.group] for rows in self.rows]
-        return [np.where(np.isinf(wide), rejected, wide**2) for wide in each]
+        return [np.where(np.isinf(wide), of_rejected, wide**2) for wide in each]
 
     def variances(
-        self, levels: Sequence[Level], widening: Widening | None = None, rejected: float = np.inf
+        self, levels: Sequence[Level], widening: Widening | None = None, of_rejected: float = np.inf
     ) -> list[Array]:
         """Variances (n,) of each kind of rows, over the stated ones, widened as `factors` has it."""
-        factors = self.factors(widening, rejected)
+        factors = self.factors(widening, of_rejected)
         return [rows.variance(levels) * factor for rows, factor in zip(self.rows, factors, strict=True)]
 
     def solved(self, variances: Sequence[Array]) -> _Solution | None:

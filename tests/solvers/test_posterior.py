@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
+from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
+from alidade.factors.array import Mask
 from alidade.factors.chi_square import quantile
+from alidade.factors.model import Model, Residuals
 from alidade.pipelines.estimation.problem import Array, Factor, Problem
 from alidade.pipelines.solvers.chain import ChainFactorization, Factorization
 from alidade.pipelines.solvers.engines import Compiled
@@ -20,6 +24,7 @@ from alidade.pipelines.solvers.error_budget import (
     added_by_shares,
     added_covariance,
     autocorrelation,
+    coloured_noises,
     error_budget,
     most_influential,
     ratio_by_blocks,
@@ -27,7 +32,7 @@ from alidade.pipelines.solvers.error_budget import (
 )
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Point
-from alidade.pipelines.solvers.linearization import NOT_MEASURED, Linearization
+from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization
 from alidade.pipelines.solvers.posterior import (
     Reported,
     chi_square,
@@ -359,24 +364,69 @@ def test_correlated_residuals_of_one_family_leave_what_another_determines() -> N
             assert variance <= (noise.together - 1.0) * own * (1.0 + 1e-6) + 1e-30
 
 
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A model with residuals of its own."""
+
+    model: Model
+    residuals: Array
+
+    def __call__(self, *blocks: Array) -> Residuals:
+        return self.residuals, self.model(*blocks)[1]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.model, name)
+
+
+def with_a_part_rejected(name: str, family: str, residuals: Array | None = None) -> tuple[Influence, Group, Mask]:
+    """Influence where a random 30 % of a family do not count, its group, and which do; residuals may be drawn."""
+    case, groups = dense(name), []
+    for each in case.linearization.groups:
+        if each.family == family:
+            used = np.random.default_rng(3).random(len(each.model.time)) > 0.3
+            # As where the rest is, whose influences these are; what is rejected lies far off.
+            model: Any = each.model if residuals is None else Drawn(each.model, np.where(used[:, None], residuals, 1e3))
+            each = replace(each.counting(used), weights=None, model=model)
+            found = each, used
+        groups.append(each)
+    point = Point.of(case.linearization.with_groups(groups), case.values)
+    return Influence.of(replace(case.posterior, at=point)), *found
+
+
 def test_added_variance_is_that_of_drawn_noise() -> None:
-    """Autocorrelated noise through the influence of one family has the variance that is said."""
-    case = dense("head")
-    reported = case.reported
-    influence = Influence.of(case.posterior)
+    """Autocorrelated noise through the influence of the measurements that count has the variance that is said."""
     noise = ColouredNoise(share=0.7, length=5.0, variance=1.5, fall=np.inf)
-    (family,) = {g.family for g in case.linearization.groups if g.is_measurement}
-    added = added_covariance(influence, {family: noise})[family]
-    (group,) = [g for g in case.linearization.groups if g.is_measurement]
-    L, _ = influence.rows(group)
-    n = len(L)
-    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-    g = 1.5 * np.where(apart, 0.7 * np.exp(-apart / 5.0), 1.0) - np.eye(n)
+    influence, group, used = with_a_part_rejected("head", "vision")
+    added, reported = added_covariance(influence, {"vision": noise})["vision"], influence.reported
+    L = influence.rows(group)[0][used]
+    np.testing.assert_array_equal(noise.correlation, 0.7 * np.exp(-np.arange(1.0, 42.0) / 5.0))  # to e^-8 of the share
+    g = 1.5 * toeplitz(np.concatenate([[1.0], noise.correlation, np.zeros(len(L) - 42)])) - np.eye(len(L))
     exact = np.einsum("irk,ij,jrm->km", L, g, L) / np.outer(reported.scale, reported.scale)
     variances, axes = np.linalg.eigh(exact)
     exact = (axes * np.maximum(variances, 0.0)) @ axes.T
     own = added / np.outer(reported.scale, reported.scale)
-    np.testing.assert_allclose(own, exact, rtol=1e-3, atol=1e-4 * np.abs(exact).max())  # to where it is cut off
+    np.testing.assert_allclose(own, exact, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
+
+
+def test_noise_is_as_coloured_as_drawn_whatever_is_rejected() -> None:
+    """Of an autoregression with white noise beside it, 30 % of which are left out at random.
+
+    The lag between those that are left is geometric, so that they are one, too, with the same share and variance.
+    """
+    family, share, a, fits = "accelerometer", 0.7, np.exp(-1.0 / 5.0), []
+    (group,) = [g for g in dense("tumble with gyro").linearization.groups if g.family == family]
+    for seed in range(10):
+        drawn = np.random.default_rng(seed).standard_normal((2, len(group.model.time) + 200, 3))
+        colour = lfilter([np.sqrt(1.0 - a**2)], [1.0, -a], drawn[0], axis=0)[200:]
+        residuals = np.sqrt(share) * colour + np.sqrt(1.0 - share) * drawn[1, 200:]
+        influence, part, used = with_a_part_rejected("tumble with gyro", family, 2.0**0.5 * residuals)
+        absorbed = np.linalg.matrix_rank(influence.rows(part)[0].reshape(-1, len(influence.names)), 1e-9)
+        squares = {family: (np.nan, 3.0 * float(used.sum()) - float(absorbed))}
+        fits.append(coloured_noises(influence, {family: np.empty(0)}, squares)[family])
+    b = 0.7 * a / (1.0 - 0.3 * a)
+    assert np.median([fit.share for fit in fits]) == pytest.approx(share, rel=0.05)
+    assert np.median([fit.together for fit in fits]) == pytest.approx(1.0 + 2.0 * share * b / (1.0 - b), rel=0.1)
+    assert np.median([fit.variance for fit in fits]) == pytest.approx(2.0, abs=0.06)
 
 
 @pytest.mark.parametrize(("share", "length"), [(1.0, 5.0), (0.7, 5.0)])
@@ -393,13 +443,14 @@ def test_noise_is_as_coloured_as_drawn_whatever_a_fit_absorbs(share: float, leng
         colour = lfilter([np.sqrt(1.0 - a**2)], [1.0, -a], drawn[0])[200:]
         noise = np.sqrt(share) * colour + np.sqrt(1.0 - share) * drawn[1, 200:]
         coloured, plain = ((each - basis @ (basis.T @ each))[:, None] for each in (noise, drawn[1, :n]))
-        fits.append(ColouredNoise.fitted(coloured, basis[:, None], 1.0))
+        # In units in which the noise drawn has a variance of 2: what lies below the weights' is not found.
+        fits.append(ColouredNoise.fitted(2.0**0.5 * coloured, basis[:, None], n - basis.shape[1], 1.0))
         naive.append(1.0 + 2.0 * float(autocorrelation(coloured).sum()))
-        white.append(ColouredNoise.fitted(plain, basis[:, None], 1.0).fall)
+        white.append(ColouredNoise.fitted(plain, basis[:, None], n - basis.shape[1], 1.0).fall)
     true = 1.0 + 2.0 * share * a / (1.0 - a)
     assert np.median([fit.together for fit in fits]) == pytest.approx(true, rel=0.2)
     assert np.mean(naive) < 0.65 * true
-    assert np.median([fit.variance for fit in fits]) == pytest.approx(1.0, abs=0.15)
+    assert np.median([fit.variance for fit in fits]) == pytest.approx(2.0, abs=0.3)
     assert np.max(white) < quantile(0.999, 2)
 
 
