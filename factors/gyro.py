@@ -103,7 +103,13 @@ def by_platform_errors(derivatives: Derivatives, variable: Array | None) -> tupl
 
 
 def carried(
-    gyro: GyroPath, start: Array, middle: Array, stop: Array, bias: Array, errors: Array | None
+    gyro: GyroPath,
+    start: Array,
+    middle: Array,
+    stop: Array,
+    bias: Array,
+    errors: Array | None,
+    turns: Increments | None = None,
 ) -> tuple[Array, Array, Derivatives]:
     """Increments over windows so short that what the gyro reads too much is constant in them.
 
@@ -113,12 +119,13 @@ def carried(
         middle: (n,) s, where the errors are evaluated; does not move with the windows' ends.
         bias: (n, 3) rad/s.
         errors: (n, 6 to 19); None for a perfect gyro.
+        turns: the gyro's increments over the windows, where they are known.
 
     Returns:
         The increments (n, 4), the true rate at their ends (n, 3) in the turned frame, and how bias and errors turn
         the increments further (on the right).
     """
-    turns = gyro.increments(start, stop)
+    turns = turns or gyro.increments(start, stop)
     rate = turns.rate if errors is None else gyro.rate(middle)
     drivers = None if errors is None or errors.shape[1] == SCALE else gyro.drivers(middle)
     excess, by_excess = rate_error(bias - gyro.bias_hat, errors, rate, drivers)
@@ -274,7 +281,10 @@ def rate_error(
     excess = _apply(N, excess)
 
     def derivatives() -> tuple[Array, ...]:
-        by_errors = by_symmetric(N[..., None] * (rate - excess)[:, None, None])
+        # N e_a v_b + N e_b v_a for each number of S about the axes a and b, v the rate that there is.
+        true = (rate - excess)[:, None]
+        by_errors = N[..., _ROW] * true[..., _COLUMN]
+        by_errors[..., 3:] += N[..., _COLUMN[3:]] * true[..., _ROW[3:]]
         if D is None:
             return N, by_errors
         by_d = N[..., None] * needed(drivers)[:, None, None]

@@ -21,7 +21,7 @@ from alidade.factors import so3
 from alidade.factors.ellipsoid import by_slope, drifted
 from alidade.factors.gyro import SCALE, Derivatives, carried, needed, rate_error
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
-from alidade.factors.preintegration import GyroPath
+from alidade.factors.preintegration import GyroPath, Increments
 
 # Half width of the cubic fit for the angular acceleration, s. Differences over 10 ms have noise at 400 Hz that makes a
 # lever arm 2 % too short, those over 30 ms an error that makes it .5 % too long.
@@ -159,7 +159,7 @@ class UpFactor(Model):
         own = others[0] if self.errors else None
         slopes = others if self.earth is not None else others[:-1]
         triads = drifted(triads, self.drivers, slopes)
-        ahead, _, by_gyro = _carried(self.gyro, self.anchor, self.time, self.time, bias, filter_, own)
+        ahead, _, by_gyro = _carried(self.gyro, self.anchor, self.time, self.time, bias, filter_, own, self._turns)
         aRn, by_earth = _earth_rotation(self.elapsed, self.earth, others)
         bRn = so3.multiply(so3.inverse(so3.multiply(aRb, ahead)), aRn)
         up = strength * so3.rotate(bRn, _UP)
@@ -203,6 +203,11 @@ class UpFactor(Model):
         return per_unit * (so3.cross(change, arm) + so3.cross(rate, around)), derivatives
 
     @cached_property
+    def _turns(self) -> Increments:
+        """Increments from anchors to stamps, which no variable moves."""
+        return self.gyro.increments(self.anchor, self.time)
+
+    @cached_property
     def _read(self) -> tuple[Array, Array, Array | None, Array | None]:
         """Rates and drivers at the stamps, each with its slope: a cubic's (Savitzky, Golay, Anal. Chem. 36, 1964).
 
@@ -228,7 +233,14 @@ class UpFactor(Model):
 
 
 def _carried(
-    gyro: GyroPath, anchor: Array, stamps: Array, at: Array, bias: Array, filter_: Array, errors: Array | None
+    gyro: GyroPath,
+    anchor: Array,
+    stamps: Array,
+    at: Array,
+    bias: Array,
+    filter_: Array,
+    errors: Array | None,
+    turns: Increments | None = None,
 ) -> tuple[Array, Array, Derivatives]:
     """Increments (n, 4) from anchors to the times `at`, near stamps, with the gyro's filter (n, 1) undone.
 
@@ -236,7 +248,7 @@ def _carried(
         The increments, the rate at their ends (n, 3) in the turned frame, and how filter, bias and errors turn them
         further (on the right).
     """
-    dV, rate, by_gyro = carried(gyro, anchor, 0.5 * (anchor + stamps), at, bias, errors)
+    dV, rate, by_gyro = carried(gyro, anchor, 0.5 * (anchor + stamps), at, bias, errors, turns)
     acceleration, jerk = gyro.acceleration(at)
     turned = filter_ * acceleration
     lag, to_end = so3.exp(turned), so3.right_jacobian(turned)

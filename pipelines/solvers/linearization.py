@@ -317,11 +317,19 @@ class Linearization:
 
     def cost(self, values: Values) -> float:
         """Twice the sum of the losses."""
-        return sum(group.cost(group.evaluate(values)[0]) for group in self.groups)
+        return self.cost_of(self.unweighted(values))
+
+    def cost_of(self, unweighted: Sequence[Array]) -> float:
+        """Twice the sum of the losses, by the unweighted whitened residuals (n, m) of each group."""
+        return sum(group.cost(own) for group, own in zip(self.groups, unweighted, strict=True))
+
+    def unweighted(self, values: Values) -> list[Array]:
+        """Whitened residuals (n, m) of each group without weights of noise and loss, outliers included."""
+        return [group.evaluate(values)[0] for group in self.groups]
 
     def residuals(self, values: Values) -> list[Array]:
         """Weighted whitened residuals (n, m) of each group, outliers included."""
-        return [group.weighted(group.evaluate(values)[0]) for group in self.groups]
+        return [group.weighted(own) for group, own in zip(self.groups, self.unweighted(values), strict=True)]
 
     @property
     def measured(self) -> dict[str, list[Group]]:

@@ -16,6 +16,7 @@ another noise than stated, or its model is wrong: all of it counts then, which c
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -125,37 +126,41 @@ def _graduated(
     engine: Linearization, values: Values, loss: TruncatedLoss, config: LevenbergConfig
 ) -> tuple[Values, int]:
     """Values to which one surrogate of the loss after the other leads, and the iterations that takes."""
-    largest = max((_norms(g, values).max(initial=0.0) for g in engine.groups if g.loss is not None), default=0.0)
+    residuals = engine.unweighted(values)
+    each = zip(engine.groups, residuals, strict=True)
+    largest = max((_norms(g, own).max(initial=0.0) for g, own in each if g.loss is not None), default=0.0)
     if largest <= loss.gate:
         return values, 0
     mu, iterations = loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300), 0
     while mu < _LAST_MU and not deadline.passed():
         relaxed = engine.under(replace(loss, mu=mu))
-        if _undecided(relaxed, values) < _UNDECIDED:
+        if _undecided(relaxed, residuals) < _UNDECIDED:
             break
         try:
-            step = Tangent(*relaxed.at(values)[0].eliminate().solve())
+            system, cost = relaxed.at(values)
+            step = Tangent(*system.eliminate().solve())
         except (IndeterminateStateError, np.linalg.LinAlgError):
             break
-        there = engine.layout.retract(values, step)
-        if not relaxed.cost(there) < relaxed.cost(values):
+        values, iterations = engine.layout.retract(here := values, step), iterations + 1
+        residuals = engine.unweighted(values)
+        if not relaxed.cost_of(residuals) < cost:
             few = replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0)
-            there = minimize(relaxed, values, few).values
-        values, iterations = there, iterations + 1
+            values = minimize(relaxed, here, few, (system, cost)).values
+            residuals = engine.unweighted(values)
         mu *= _MU_STEP
     return values, iterations
 
 
-def _undecided(engine: Linearization, values: Values) -> float:
-    """Share of measurements whose weight under a surrogate is neither 0 nor 1."""
-    weights = [group.used(group.evaluate(values)[0]) for group in engine.groups if group.loss is not None]
-    whole = np.concatenate(weights)
+def _undecided(engine: Linearization, residuals: Sequence[Array]) -> float:
+    """Share of measurements whose weight under a surrogate is neither 0 nor 1, by the residuals of each group."""
+    each = zip(engine.groups, residuals, strict=True)
+    whole = np.concatenate([group.used(own) for group, own in each if group.loss is not None])
     return float(((whole > 0.0) & (whole < 1.0)).mean())
 
 
-def _norms(group: Group, values: Values) -> Array:
-    """Whitened norms (n,) of measurements."""
-    return np.linalg.norm(group.weighted(group.evaluate(values)[0]), axis=1)
+def _norms(group: Group, residuals: Array) -> Array:
+    """Norms (n,) of measurements by their unweighted whitened residuals (n, m)."""
+    return np.linalg.norm(group.weighted(residuals), axis=1)
 
 
 def without_onsets(engine: Linearization, solution: Solution) -> Linearization | None:
@@ -166,7 +171,8 @@ def without_onsets(engine: Linearization, solution: Solution) -> Linearization |
     found: dict[str, list[tuple[int, Array, Array, Mask]]] = {}
     for i, group in enumerate(solution.engine.groups):
         if group.loss is not None and group.model.rows > 1:
-            each = group.model.time, _norms(group, solution.values), ~group.inliers(solution.values)
+            residuals = group.evaluate(solution.values)[0]
+            each = group.model.time, _norms(group, residuals), group.used(residuals) <= 0.5
             found.setdefault(group.family, []).append((i, *each))
     groups = list(engine.groups)
     for parts in found.values():
