@@ -51,6 +51,7 @@ from alidade.pipelines.reports.results_table import (
     ResultCard,
     ResultGroup,
     ResultRow,
+    group_of,
     matrix_texts,
     result_cards,
     result_table,
@@ -149,6 +150,10 @@ def _plots(c: Calibration) -> list[Plot]:
 def summary_of(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
     """The verdict in one sentence, what to do in another, and badges."""
     rows = [(card, group, row) for card in cards for group, row in card.rows if row.require and row.sigma > 0.0]
+    missed = [name for name, verdict in c.verdicts.items() if verdict in ("weak", "unobservable")]
+    if missed and all(row.ratio <= 1.0 for _, _, row in rows):  # what is derived of parameters may miss nothing
+        groups = [group_of(c, c.method.describe(name).removesuffix("."), "", [name]) for name in missed]
+        rows = [(ResultCard("", (group,)), group, group.rows[0]) for group in groups]
     worst = max(rows, key=lambda found: found[2].ratio, default=None)
     text, action = sentences.short_verdict(c.findings, c.quantities, c.verdicts, worst and _named(*worst))
     steps = (action,) if action else ()
@@ -158,8 +163,13 @@ def summary_of(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
 def _named(card: ResultCard, group: ResultGroup, row: ResultRow) -> sentences.Worst:
     """The number nearest to its requirement, in words."""
     what = f"{group.title[:1].lower()}{group.title[1:]}"
-    name = f"{what} {row.label}, {card.title.lower()}" if len(row.names) > 1 else f"{row.names[0]} ({what})"
-    return sentences.Worst(name, rounded(row.sigma), rounded(row.require or 0.0), group.unit, row.ratio)
+    label = f" {row.label}" if len(group.rows) > 1 else ""
+    name = f"{what}{label}, {card.title.lower()}" if len(row.names) > 1 else f"{row.names[0]} ({what})"
+    for digits in range(2, 7):  # as many as distinguish the two
+        sigma, require = rounded(row.sigma, digits), rounded(row.require or 0.0, digits)
+        if sigma != require:
+            break
+    return sentences.Worst(name, sigma, require, group.unit, row.ratio)
 
 
 def _badges(c: Calibration) -> tuple[Badge, ...]:
@@ -180,7 +190,11 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
                 Badge(f"{100.0 * share:.0f} % of {family} rejected", "warn", "measurements that fit no solution")
             )
     found += [
-        Badge(f"{n.name} {n.used / n.stated:.2g} × {_STATED.get(n.source, 'stated')}", "warn", f"noise, by {n.source}")
+        Badge(
+            f"{n.name} {rounded(n.used / n.stated)} × {_STATED.get(n.source, 'stated')}",
+            "warn",
+            f"noise, by {n.source}",
+        )
         for n in c.noises
         if n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE
     ]

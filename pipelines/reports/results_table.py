@@ -24,6 +24,8 @@ from alidade.pipelines.reports.result_json import truth_errors
 
 _G, _DEG = 9.80665, math.degrees(1.0)
 _BIAS_UNITS = {"accel": ("mg", 1e3 / _G), "gyro": ("deg/s", _DEG), "mag": ("µT", 1e6)}
+# Unit of the scale of a sensor in counts, as data sheets have it, and what counts per SI unit are multiplied by.
+_COUNT_UNITS = {"accel": ("counts/g", _G), "gyro": ("counts/(deg/s)", 1.0 / _DEG), "mag": ("counts/µT", 1e-6)}
 # Units that a method's cards may name, and what SI numbers are multiplied by; others are shown in their usual unit.
 _CARD_UNITS = {"deg": _DEG, "deg/s": _DEG, "deg/h": 3600.0 * _DEG, "ms": 1e3, "µT": 1e6}
 # Scale errors below this are shown in ppm.
@@ -110,7 +112,7 @@ def result_cards(c: Calibration) -> list[ResultCard]:
         for group, unit, names in groups:
             there = [name for name in names if name in c.values and name not in shown]
             if there:
-                found.append(_group(c, group, unit, there))
+                found.append(group_of(c, group, unit, there))
                 shown |= set(there)
         if found:
             cards.append(ResultCard(title, tuple(found)))
@@ -118,7 +120,7 @@ def result_cards(c: Calibration) -> list[ResultCard]:
     for title, _, members in variables(c):
         left = [q.name for q in members if q.group is None and q.name not in shown]
         if left:
-            others.append(_group(c, title, "", left))
+            others.append(group_of(c, title, "", left))
     return [*cards, *([ResultCard("Others", tuple(others))] if others else [])]
 
 
@@ -163,7 +165,8 @@ def _rows(card: ResultCard) -> Iterator[Row]:
             )
 
 
-def _group(c: Calibration, title: str, unit: str, names: Sequence[str]) -> ResultGroup:
+def group_of(c: Calibration, title: str, unit: str, names: Sequence[str]) -> ResultGroup:
+    """Parameters of one kind, in the unit that is named or else in their usual one."""
     quantities = {q.name: q for q in quantities_of(c.problem, c.estimate)}
     known = (unit, _CARD_UNITS[unit]) if unit in _CARD_UNITS else None
     human, factor = known or human_unit(quantities[names[0]])
@@ -186,35 +189,38 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
     names = [name for name in c.estimate.names if name.startswith((f"{sensor}_k", f"{sensor}_b")) and name[-1] in "123"]
     symmetric = f"{sensor}_k21" not in names
     unit = c.quantities[f"{sensor}_k11"].unit
-    plain = unit in ("", "1")
+    plain, in_counts, of_field = unit in ("", "1"), unit.endswith("/count"), unit.startswith("1/")
     common = {each.name: each for each in c.derived}.get(f"{sensor}_scale")
-    relative = common is not None or not plain
+    relative = common is not None or of_field
+    absolute = in_counts and not relative
 
     def parts(values: Array) -> Array:
         K, bias = sensor_model(sensor, dict(zip(names, values.tolist(), strict=True)))
         found = parts_of(K)
         mean = found[:3].mean()
-        return np.concatenate([found[:3] / (mean if relative else 1.0) - 1.0, found[3:], bias, [mean]])
+        scale = found[:3] if absolute else found[:3] / (mean if relative else 1.0) - 1.0
+        return np.concatenate([scale, found[3:], bias, [mean]])
 
     try:
         rows = _derived(c, names, parts)
     except ValueError:  # K is no sensor's
-        return ResultCard(SENSOR_NAMES[sensor].capitalize(), (_group(c, "K and b", "", names),))
-    scale = [row.times(100.0) for row in rows[:3]]
-    percent = "%"
-    if plain and max(abs(row.value) + row.sigma for row in scale) < 100.0 * _PPM:
-        scale, percent = [row.times(1e4) for row in scale], "ppm"
-    in_counts = unit.endswith("/count")
-    bias_unit, factor = ("counts", 1.0) if in_counts else _BIAS_UNITS[sensor]
+        return ResultCard(SENSOR_NAMES[sensor].capitalize(), (group_of(c, "K and b", "", names),))
+    title = "Scale error about mean" if relative else "Scale" if absolute else "Scale error"
+    scale_unit, factor = _COUNT_UNITS[sensor] if absolute else ("%", 100.0)
+    if plain and max(abs(row.value) + row.sigma for row in rows[:3]) < _PPM:
+        scale_unit, factor = "ppm", 1e6
+    bias_unit, bias_factor = ("counts", 1.0) if in_counts else _BIAS_UNITS[sensor]
     groups = [
-        ResultGroup("Scale error about mean" if relative else "Scale error", percent, tuple(scale)),
+        ResultGroup(title, scale_unit, tuple(row.times(factor) for row in rows[:3])),
         ResultGroup("Non-orthogonality", "deg", tuple(row.times(_DEG) for row in rows[3:6])),
         ResultGroup("Misalignment", "deg", tuple(row.times(_DEG) for row in rows[6:9])),
-        ResultGroup("Bias", bias_unit, tuple(row.times(factor) for row in rows[9:12])),
+        ResultGroup("Bias", bias_unit, tuple(row.times(bias_factor) for row in rows[9:12])),
     ]
     if symmetric:
         groups[2] = ResultGroup("Misalignment", "", (), "0 by definition: it defines the body's axes")
-    if common is not None and not unit.startswith("1/"):
+    if of_field:
+        groups.insert(0, ResultGroup("Mean scale", f"{bias_unit}/field", (rows[12].times(bias_factor),)))
+    elif common is not None:
         groups.insert(0, _overall(rows[12], common, in_counts))
     return ResultCard(SENSOR_NAMES[sensor].capitalize(), tuple(groups))
 
@@ -225,7 +231,8 @@ def _overall(row: ResultRow, common: DerivedNumber, in_counts: bool) -> ResultGr
     by_strength = common.verdict != "observable" or row.sigma <= (require or np.inf)
     row = replace(row, require=require, verdict=common.verdict if by_strength else row.verdict)
     if in_counts:
-        return ResultGroup("Mean scale", "counts/µT", (row.times(1e-6),))
+        unit, factor = _COUNT_UNITS["mag"]
+        return ResultGroup("Mean scale", unit, (row.times(factor),))
     return ResultGroup("Mean scale error", "%", (replace(row, value=row.value - 1.0).times(100.0),))
 
 

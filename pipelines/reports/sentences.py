@@ -202,7 +202,7 @@ def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[
             continue
         yield from (sentence(finding, quantities) for finding in each[: None if kind == "remark" else _MAX_NAMED])
         if kind != "remark" and len(each) > _MAX_NAMED:
-            yield f"{len(each) - _MAX_NAMED} more of this kind are in result.json."
+            yield f"{len(each) - _MAX_NAMED} more of this kind in result.json."
         if sheets := _sheets(each, quantities):
             yield sheets
 
@@ -283,7 +283,8 @@ def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) ->
 
 def _jump(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
     size, sigma = (to_digits_of(math.degrees(e[name]), math.degrees(e["sigma"])) for name in ("size", "sigma"))
-    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}: mount or reference: the motion does not decide."
+    what = "the motion does not show whether the mount or the reference"
+    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}; {what}."
 
 
 def _when(e: Mapping[str, Any]) -> str:
@@ -323,14 +324,14 @@ def _error_map(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str
     size = f"{rounded(factor * e['rms'])} {unit} rms, data sheet {rounded(factor * e['prior'])}"
     test = f"chi-square {rounded(e['chi_square'], 3)}, dof {e['dof']}"
     shift = _shift(e["effect"], "", quantities, "correcting them")
-    return f"{e['name']}: errors depend on {of}, {size} ({test}){shift}. Sigmas include what is not known of them."
+    return f"{e['name']}: errors depend on {of}, {size} ({test}){shift}. Sigmas include their uncertainty."
 
 
 def _slow_error(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    warning = "Warning: a sensor errs slowly" if e["ratio"] > SLOW_ERROR_WARNING else "A sensor errs slowly"
+    warning = "Warning: errors of a sensor" if e["ratio"] > SLOW_ERROR_WARNING else "Errors of a sensor"
     return (
-        f"{warning}, as with the pose, which no noise explains: by blocks of 5 s the sigma of {e['parameter']} is "
-        f"{e['ratio']:.2g} times the nominal one. Sigmas include it."
+        f"{warning} vary slowly, for example with the pose, unlike noise: from blocks of 5 s the sigma of "
+        f"{e['parameter']} is {e['ratio']:.2g} times the nominal one. Sigmas include it."
     )
 
 

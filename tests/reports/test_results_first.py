@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 from dataclasses import replace
 from functools import cache
@@ -128,6 +129,17 @@ def test_the_verdict_is_one_sentence_whatever_fails() -> None:
     assert len(summary.text) < 200
     assert len(summary.next_steps) == 1
     assert summary.next_steps[0].startswith("What to do: ")
+
+
+def test_a_verdict_names_a_parameter_where_nothing_derived_misses_its_requirement() -> None:
+    """Figures that differ in the third digit are shown with three."""
+    simulated = alidade.simulate("tumble", seed=1)
+    sigma = calibrated("tumble").parameters["mag_k12"].sigma
+    summary = calibration_report(alidade.calibrate(simulated, config={"require": {"mag_k12": 0.998 * sigma}})).summary
+    assert summary is not None
+    assert summary.text.startswith("1 of 9 parameters miss their required accuracy, worst mag_k12 (magnetometer cross-")
+    stated, required = re.findall(r"± ([\d.]+) .*where ([\d.]+) is required", summary.text)[0]
+    assert float(stated) > float(required) == pytest.approx(float(stated), rel=5e-3)
 
 
 def test_scale_angles_and_bias_have_the_sigmas_of_draws() -> None:

@@ -95,7 +95,7 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "jump",
         Severity.WEAK,
         {"since_s": 117.5, "time_s": 117.6, "size": 0.0105, "sigma": 0.0018},
-        "Vision jumped by 0.60 ± 0.10 deg at 118 s: mount or reference: the motion does not decide.",
+        "Vision jumped by 0.60 ± 0.10 deg at 118 s; the motion does not show whether the mount or the reference.",
     ),
     (
         "device_change",
@@ -158,14 +158,14 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
             "effect": {},
         },
         "vision_map: errors depend on the attitude, 0.10 deg rms, data sheet 0.10 (chi-square 48.0, dof 23). Sigmas "
-        "include what is not known of them.",
+        "include their uncertainty.",
     ),
     (
         "slow_error",
         NOTE,
         {"parameter": "helmet_mount_z", "ratio": 2.46},
-        "Warning: a sensor errs slowly, as with the pose, which no noise explains: by blocks of 5 s the sigma of "
-        "helmet_mount_z is 2.5 times the nominal one. Sigmas include it.",
+        "Warning: errors of a sensor vary slowly, for example with the pose, unlike noise: from blocks of 5 s the "
+        "sigma of helmet_mount_z is 2.5 times the nominal one. Sigmas include it.",
     ),
     (
         "misfit",
@@ -284,7 +284,7 @@ def test_what_is_not_observable_comes_before_a_prior_conflict() -> None:
 def test_many_of_a_kind_are_counted() -> None:
     found = [replace(REJECTED, evidence={**REJECTED.evidence, "family": f"f{i}"}, severity=NOTE) for i in range(5)]
     assert len(notes(found, QUANTITIES)) == 4
-    assert notes(found, QUANTITIES)[-1] == "2 more of this kind are in result.json"
+    assert notes(found, QUANTITIES)[-1] == "2 more of this kind in result.json"
 
 
 def test_causes_are_those_that_explain() -> None:
@@ -337,7 +337,7 @@ def test_badges_say_what_they_compare() -> None:
     assert summary is not None
     said = [badge.text for badge in summary.badges]
     assert "misfit: residuals 2 × the noise" in said
-    assert "gyro_density 3 × the default" in said
+    assert "gyro_density 3.0 × the default" in said
 
 
 def test_without_a_solution_nothing_is_said_to_be_good() -> None:

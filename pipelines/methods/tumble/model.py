@@ -232,8 +232,8 @@ def prepare(data: TumbleData, config: Config) -> Model:
         sensors.append(_magnetometer(data, config, field, alone=data.accel is None))
         if sensors[-1].unit == "1":
             premises.append(
-                "No position, so that the field's strength is unknown and called 1: K and b give the field in units of "
-                "it; state latitude_deg and longitude_deg, or field.strength, in the config for T."
+                "No position: the field's strength is unknown, and K and b are in units of it; for T state "
+                "latitude_deg and longitude_deg, or field.strength, in the config."
             )
     premises += [note for sensor in sensors if not sensor.is_si and (note := _maybe_a_unit(sensor))]
     gyro, more = _gyro(data, sensors)

@@ -271,9 +271,11 @@ def test_bias_of_readings_in_counts_is_shown_in_counts() -> None:
     in_g = replace(simulated, data=replace(simulated.data, accel=simulated.data.accel / 9.80665, accel_density=None))
     calibration = Session.of(TUMBLE, in_g).calibrate()
     (card,) = result_cards(calibration)
-    bias = card.groups[-1]
+    scale, *_, bias = card.groups
     K, b = triad_of("accel", calibration.values)
-    assert bias.unit == "counts"
+    assert (scale.title, scale.unit, bias.unit) == ("Scale", "counts/g", "counts")
+    counts = 9.80665 / np.linalg.norm(np.linalg.inv(K), axis=1) ** -1
+    assert [row.value for row in scale.rows] == pytest.approx(counts.tolist())
     assert [row.value for row in bias.rows] == pytest.approx((-np.linalg.solve(K, b)).tolist())
     assert any("if it is in g, state `units: {accel: g}`" in note for note in calibration.notes)
 
@@ -536,7 +538,7 @@ def test_the_command_finds_it_by_itself_and_says_what_there_is(tmp_path: Path, a
     assert "tumble: yes" in alidade("info", tmp_path / "phone.mcap").out
     run = alidade("calibrate", tmp_path / "phone.mcap", "--out", tmp_path / "out")
     assert run.code == 0
-    assert "field's strength is unknown and called 1" in run.out.replace("\n", " ")
+    assert "field's strength is unknown, and K and b are in units of it" in run.out.replace("\n", " ")
     yaml = (tmp_path / "out" / "calibration.yaml").read_text()
     assert "hard iron" in yaml
     assert "* mag + [mag_b1, mag_b2, mag_b3]" in yaml
