@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Self
 
 # Longer lines help nobody; names in a hostile recording can be as long as it likes.
 _LONGEST = 2000
@@ -25,6 +27,14 @@ class InputError(Exception):
 
 class NotARecordingError(InputError):
     """A file that is no recording, and will not become one."""
+
+    @classmethod
+    def of(cls, path: Path, why: str = "") -> Self:
+        """The error of a file of no known format."""
+        return cls(
+            f"{path}: not an MCAP file, ROS bag, PX4 or ArduPilot log, or table{why}; numbers of other files go in as "
+            "arrays: alidade.open in Python"
+        )
 
 
 def printable(text: str, longest: int = 200) -> str:

@@ -132,7 +132,7 @@ def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:
         ) from error
     except Exception as error:  # the library's constructors raise anything where a value is not what its tag says
         said = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{where}: unreadable YAML: a value that is not what its tag says ({said})") from error
+        raise InputError(f"{where}: unreadable YAML: a value is not valid ({said})") from error
 
 
 class _TooLargeError(Exception):

@@ -436,6 +436,8 @@ def first_error(error: ValidationError, model: type[BaseModel]) -> tuple[tuple[i
         return path, f"unknown key {key}{nearest(str(path[-1]), _known_at(model, path[:-1]))}"
     if first["type"] == "missing":
         return path[:-1], f"{key}: is missing"
+    if first["type"] in ("model_type", "dict_type", "model_attributes_type"):
+        return path, f"{key}: must be a section of keys, not {reprlib.repr(given)}"
     text = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     return path, f"{key}: {text}{'' if isinstance(given, dict) else f', not {reprlib.repr(given)}'}"
 

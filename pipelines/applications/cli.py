@@ -485,7 +485,7 @@ def info(
     """
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
-    from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
+    from alidade.pipelines.applications.table_discovery import propose_columns
     from alidade.pipelines.config import configured
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
@@ -495,7 +495,7 @@ def info(
         recording, settings = configured(open_recording(session, strict), config)
         columns = None if settings.columns else propose_columns(recording)
         if columns is not None and columns.columns:
-            recording, settings = with_columns(recording, settings)
+            recording, settings = columns.applied(recording, settings)
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:

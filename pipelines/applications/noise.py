@@ -123,8 +123,8 @@ def noise(
     if not names:
         kinds = f"{', '.join(messages.IMUS)} or {messages.MAGNETIC_FIELD}"
         raise InputError(
-            f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {opened.there()}; tables need "
-            "--auto-columns or --config with their `columns`, rates alone their topic under `topics` in it, as head_imu"
+            f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {opened.there()}; a topic of "
+            "rates alone is named in the config, `topics: {head_imu: TOPIC}`"
         )
     found: list[SensorNoise] = []
     troubles: list[str] = []

@@ -4,11 +4,12 @@
     K, bias, K_gyro, bias_gyro = alidade.imu_static(acc, gyro, t, latitude_deg=48.1)
     R, delay = alidade.hand_eye(gyro, t, wxyz, t_wxyz)
 
-Each is a tuple that has the whole `Calibration` behind it: `alidade.magcal(m).calibration`.
+Each is a tuple that has the whole `Calibration` behind it: `alidade.magcal(m).calibration`. An inconsistent one warns.
 """
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -32,6 +33,8 @@ class _Result:
     calibration: Calibration
 
     def _with(self, calibration: Calibration) -> Self:
+        if calibration.status == "inconsistent":
+            warnings.warn(f"inconsistent, do not use the values: {calibration.headline}", stacklevel=3)
         self.calibration = calibration
         return self
 

@@ -38,7 +38,7 @@ from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, miss
 from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.problem import (
     AttitudeRate,
@@ -53,7 +53,6 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
-from alidade.pipelines.recording.decoding import ENCODING
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.plausibility import HELD
@@ -527,7 +526,7 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     facts = session_facts(recording, config)
     by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
     asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
-    to_ask = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
+    to_ask = {name: (f"`--method {name}`, as topics alone do not choose it",) for name in asked}
     facts = replace(facts, missing={**facts.missing, **to_ask})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
     facts = replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
@@ -605,17 +604,16 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     ]
     if by_name:
         options = " or ".join(f"--method {name}" for name in by_name)
-        raise InputError(f"{recording.path}: what is there serves only a method that is asked for: {options}")
+        raise InputError(f"{recording.path}: these topics serve a method only when it is named: {options}")
     columns = propose_columns(recording)
     if columns is not None and columns.columns:
-        concluded = f"`--auto-columns` takes {', '.join(columns.reasons)}"
-        raise InputError(
-            f"{recording.path}: no `columns:` in the config; {concluded}; `alidade info` shows them to paste"
+        raise NotARecordingError(
+            f"{recording.path}: a table needs `columns:` in the config; `alidade info` proposes them to paste, "
+            "`--auto-columns` uses the proposal"
         )
     raise InputError(
-        f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
-        f"({ENCODING}): `alidade info` lists them for each method, `topics:` in the config can rename"
-        + (f"; nearest is {nearest}" if nearest else "")
+        f"{recording.path}: no usable topics for any method; {recording.there()}; `alidade info` lists what "
+        "each method needs, `topics:` in the config renames" + (f"; nearest is {nearest}" if nearest else "")
     )
 
 

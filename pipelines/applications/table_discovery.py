@@ -89,6 +89,11 @@ class Columns:
             lines += [f"  {key}: {flow_yaml(source.model_dump())}" for key, source in self.topics.items()]
         return "\n".join(lines)
 
+    def applied(self, recording: Recording, config: Config) -> tuple[Recording, Config]:
+        """The recording and config with these columns."""
+        more = config.model_copy(update={"columns": self.columns, "topics": {**self.topics, **config.topics}})
+        return recording.with_config(more.topics.values(), more.columns), more
+
 
 def propose_columns(recording: Recording) -> Columns | None:
     """Proposed meaning of a recording's tables that no config describes; None where there is no such table."""
@@ -119,10 +124,10 @@ def with_columns(recording: Recording, config: Config) -> tuple[Recording, Confi
         return recording, config
     if not found.columns:
         raise InputError(f"{recording.path}: no columns could be concluded: {'; '.join(found.doubts)}")
-    more = config.model_copy(update={"columns": found.columns, "topics": {**found.topics, **config.topics}})
-    recording = recording.with_config(more.topics.values(), more.columns)
-    recording.remark(f"columns taken as concluded: {'; '.join((*found.reasons, *found.doubts))}")
-    return recording, more
+    recording, config = found.applied(recording, config)
+    assumed = f"; assumed: {'; '.join(found.doubts)}" if found.doubts else ""
+    recording.remark(f"columns as `alidade info` proposes them{assumed}")
+    return recording, config
 
 
 class _Table:
@@ -131,6 +136,7 @@ class _Table:
     def __init__(self, table: CsvFile, is_named: bool) -> None:
         self.path, self._form = table.path, table.form
         self._file = table.path.name if is_named else None
+        self._where = f"{table.path.name}: " if is_named else ""
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
@@ -150,15 +156,15 @@ class _Table:
             try:
                 out[topic] = TableTopic(file=self._file, **time, **chosen)
             except ValueError as error:
-                self.doubts.append(f"{self.path.name}: {topic}: {error}")
+                self.doubts.append(f"{self._where}{topic}: {error}")
 
         if not time:
             rate = next((found[1] for line in self._form.preamble if (found := _RATE.search(line))), None)
             time = {"rate": float(rate or 100.0)}
             if rate is None:
-                self.doubts.append(f"{self.path.name}: no column of time, no rate stated: 100 Hz assumed; state `rate`")
+                self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
             else:
-                self.reasons.append(f"{self.path.name}: no column of time; {rate} Hz by its preamble")
+                self.reasons.append(f"{self._where}no column of time; {rate} Hz by its preamble")
         units = {kind: self._unit(kind, columns) for kind, columns in named.items()}
         imu = {kind: self._names(columns) for kind, columns in named.items() if kind != "field"}
         if imu:
@@ -182,9 +188,9 @@ class _Table:
             add("/fix", **place, height=self._called(r"^(alt|height|elev)") or "")
         for topic, table in out.items():
             kinds = [kind for kind in (*_WORDS, "wxyz", "joints", "latitude_deg") if getattr(table, kind)]
-            self.reasons.append(f"{self.path.name}: {topic} has {' and '.join(kinds)}")
+            self.reasons.append(f"{self._where}{topic} has {' and '.join(kinds)}")
         if not out:
-            self.doubts.append(f"{self.path.name}: nothing known in {', '.join(self._form.names[:20])}")
+            self.doubts.append(f"{self._where}nothing known in {', '.join(self._form.names[:20])}")
         return out
 
     def _numbers(self, i: int) -> Array:
@@ -211,19 +217,17 @@ class _Table:
         chosen: int | None = next(iter(called), 0 if unnamed and increasing[:1] == [0] else None)
         if chosen is None:
             still = [name for name in self._form.names if _TIME.search(_bare(name))]
-            self.doubts += [
-                f"{self.path.name}: {name} is no time: it does not increase from row to row" for name in still
-            ]
+            self.doubts += [f"{self._where}{name} is no time: it does not increase from row to row" for name in still]
             return {}
         name = self._names([chosen])[0]
         if ":" in str(self._texts[chosen][0]):
-            self.reasons.append(f"{self.path.name}: {name} is the time, as a date or clock time")
+            self.reasons.append(f"{self._where}{name} is the time, as a date or clock time")
             return {"time": name}
         full = self._form.names[chosen]
         stated = self._stated(chosen) or _unit_word(_bare(full))
         unit = stated if stated in TIME_UNITS else _time_unit(self._values[chosen])
         by = "header" if stated == unit else "steps"
-        self.reasons.append(f"{self.path.name}: {name} is the time, in {unit} by its {by}")
+        self.reasons.append(f"{self._where}{name} is the time, in {unit} by its {by}")
         return {"time": name} if unit == "s" else {"time": name, "unit": unit}
 
     def _stated(self, i: int) -> str:
@@ -245,7 +249,7 @@ class _Table:
         first = 1 if self._increases(0) else 0
         if self._form.names[0] == "column 1" and len(self._values) == first + 3 and _kind(self.path.stem.lower()):
             along = [("", (first, first + 1, first + 2))]
-            self.doubts.append(f"{self.path.name}: its columns are named after the file: check it")
+            self.doubts.append(f"{self._where}no header: the sensor is that of the file's name")
         elif self._form.names[0] == "column 1":
             for i in range(first, len(self._values) - 2, 3):
                 columns: tuple[int, ...] = (i, i + 1, i + 2)
@@ -254,8 +258,8 @@ class _Table:
                 sized = {kind for kind, units in _UNNAMED.items() if self._size(kind, columns) in units}
                 for kind in sized - out.keys():
                     out[kind] = columns
-                    where = f"{self.path.name}: columns {i + 1} to {i + 3}"
-                    self.doubts.append(f"{where} are {kind} by their size: check it")
+                    where = f"{self._where}columns {i + 1} to {i + 3}"
+                    self.doubts.append(f"{where} are {kind} by their size")
             return out
         for name, columns in along:
             name = name or self.path.stem.lower()  # x, y, z alone: the file is named after the sensor
@@ -263,12 +267,12 @@ class _Table:
             # ROS calls linear acceleration what has gravity in it.
             is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
             if is_linear or (kind == "accel" and self._lacks_gravity(columns)):
-                self.doubts.append(f"{self.path.name}: {self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
+                self.doubts.append(f"{self._where}{self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
             elif kind and kind not in out:
                 out[kind] = columns
             elif kind:
                 more = ", ".join(self._names(columns))
-                self.doubts.append(f"{self.path.name}: {more} are another {kind}, not used: name them instead if meant")
+                self.doubts.append(f"{self._where}{more} are another {kind}, not used: name them instead if meant")
         return out
 
     def _kind_of_units(self, columns: Sequence[int]) -> str:
@@ -302,10 +306,10 @@ class _Table:
         stated = {unit_of(kind, self._stated(i)) for i in columns}
         (unit,) = stated if len(stated) == 1 else ("",)
         if unit in UNITS:
-            self.reasons.append(f"{self.path.name}: {kind} is in {unit} by its header")
+            self.reasons.append(f"{self._where}{kind} is in {unit} by its header")
             return unit
         if kind != "gyro" and any("adc" in self._form.names[i].lower() for i in columns):
-            self.reasons.append(f"{self.path.name}: {kind} is in counts by its name")  # Betaflight's magADC
+            self.reasons.append(f"{self._where}{kind} is in counts by its name")  # Betaflight's magADC
             return ""
         if kind == "gyro":
             norms = self._norms(columns)
@@ -313,7 +317,7 @@ class _Table:
             found = "rad/s" if most < MAX_RATE_RAD_S else "deg/s" if most < _MOST_DEG_S else ""
         else:
             found = self._size(kind, columns)
-        self.doubts.append(f"{self.path.name}: {kind} is in {found or 'counts'} by its size: check it")
+        self.doubts.append(f"{self._where}{kind} is in {found or 'counts'} by its size")
         return found
 
     def _quaternion(self) -> list[str]:

@@ -67,9 +67,9 @@ class Validated:
     def sentence(self) -> str:
         """The verdict in words."""
         if self.same_recording:
-            return "Whether the calibration holds is not asked of the recording that it is from."
+            return "This is the recording of the calibration, which always agrees with it."
         if self.held is None or self.verdict == "unknown":
-            return "Whether the calibration holds is not known: the recording does not say."
+            return "The recording does not determine whether the calibration holds."
         steps = self.held.steps
         if self.verdict == "holds":
             return f"The calibration holds: {len(steps)} of {len(steps)} parameters unchanged, to {self._resolution}."
@@ -96,8 +96,6 @@ class Validated:
     def notes(self) -> list[str]:
         """Sentences that a reader needs beside the numbers."""
         out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note and not self.device)]
-        if self.same_recording:
-            out.append("this is the recording it was calibrated on; another one says more")
         if self.calibration.status != "calibrated":
             out.append(f"the calibration's own verdict is {self.calibration.status}")
         return out

@@ -19,7 +19,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from alidade.pipelines.errors import InputError, nearest_three
+from alidade.pipelines.errors import InputError
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -329,7 +329,7 @@ def method(name: str) -> Method:
         return found
     entry = _plugins().get(name)
     if entry is None:
-        raise InputError(f"no method {name!r}; {nearest_three(name, names())}")
+        raise InputError(f"no method {name!r}; there are {', '.join(names())}")
     try:
         made = entry.load()
     except Exception as error:

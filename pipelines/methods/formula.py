@@ -103,13 +103,16 @@ def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Ma
         Name -> result, for each formula whose inputs are given.
 
     Raises:
-        InputError: an input of no formula, or one that is useless without others that are not given.
+        InputError: an input of no formula or of another shape, or one that is useless without others not given.
     """
     known = dict.fromkeys(name for formula in formulas for name in formula.inputs)
     for name in measured:
         if name not in known:
             raise InputError(f"apply: nothing is computed from {name}; measurements are {', '.join(known)}")
-    for name in measured:
+    for name, given in measured.items():
+        length = {"vector": 3, "rotation": 4}.get(input_kind(name))
+        if length and np.shape(given)[-1:] != (length,):
+            raise InputError(f"apply: {name} has the shape {np.shape(given)}; (..., {length}) is needed")
         beside = [set(formula.inputs) for formula in formulas if name in formula.inputs]
         if all(needed - measured.keys() for needed in beside):
             fewest = min((needed - measured.keys() for needed in beside), key=len)

@@ -179,7 +179,7 @@ class McapFile(Container):
         if not start:
             raise InputError(f"{self.path}: the file is empty: nothing was recorded")
         if start != MAGIC:
-            raise NotARecordingError(f"{self.path}: not an MCAP file, nor any other recording that is known")
+            raise NotARecordingError.of(self.path)
 
     # -- the messages of a block
 

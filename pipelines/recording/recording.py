@@ -59,7 +59,7 @@ SENSOR_STAMPED_TYPES = {*messages.SENSORS} - {
 }
 # Topics, and pairs of frames, that an error message names.
 MAX_NAMED = 30
-_NO_COLUMNS = "`columns:` in the config say what a table holds, or --auto-columns concludes it"
+_NO_COLUMNS = "a table needs `columns:` in the config, or --auto-columns"
 # Sigma of the delay with which messages are logged, s: assumed where log times replace stamps.
 UNKNOWN_LOG_DELAY_S = 0.01
 # Quantities that may be counts of a sensor.

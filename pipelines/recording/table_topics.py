@@ -48,6 +48,8 @@ _KINDS: dict[str, type[series.Series]] = {
     "latitude_deg": series.FixSeries,
     "celsius": series.TemperatureSeries,
 }
+# Quantities that have units, and their SI units.
+_QUANTITIES = {"gyro": "rad/s", "accel": "m/s^2", "field": "T", "joints": "rad", "position": "m", "vector": "rad"}
 # Quantities along the axes of a device.
 _VECTORS = ("gyro", "accel", "field")
 # What may be as slow as it likes.
@@ -106,8 +108,11 @@ class TableTopic(BaseModel):
         if (self.time is None) == (self.rate is None):
             raise ValueError("either time, the column of the stamps, or rate, in Hz, is needed")
         for name, unit in self.units.items():
-            if name not in TableTopic.model_fields or unit not in UNITS:
-                raise ValueError(f"units.{name}: {unit} is not one of {', '.join(UNITS)}")
+            if name not in _QUANTITIES:
+                raise ValueError(f"units.{name}: only {', '.join(_QUANTITIES)} have units")
+            if not _measures(name, unit):
+                known = ", ".join(COMPATIBLE[_QUANTITIES[name]])
+                raise ValueError(f"units.{name}: {unit} is not one of {known}; counts have no entry in units")
         for name in {*kinds} & {*_VECTORS}:
             if len(set(getattr(self, name))) < len(getattr(self, name)):
                 raise ValueError(f"{name}: a column is named twice, {', '.join(getattr(self, name))}")
@@ -224,8 +229,7 @@ def _absent(names: set[str]) -> dict[str, Any]:
 
 def _measures(name: str, unit: str) -> bool:
     """Whether a unit is one of what the columns hold."""
-    quantity = {"gyro": "rad/s", "accel": "m/s^2", "field": "T", "joints": "rad", "position": "m", "vector": "rad"}
-    return name in quantity and unit in COMPATIBLE[quantity[name]]
+    return name in _QUANTITIES and unit in COMPATIBLE[_QUANTITIES[name]]
 
 
 def _is_value(text: str, value: str | float | int) -> bool:

@@ -96,7 +96,7 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
     form = table_form(path, data)
     if not form.width:
         # A file that grows may still have one.
-        raise InputError(str(_unknown(path, ": no line of numbers in it")))
+        raise InputError(str(NotARecordingError.of(path, ": no line of numbers in it")))
     if (poses := _trajectory(form)) is not None:
         return ArrayContainer(path, {"/trajectory": poses})
     return CsvFile(form)
@@ -110,11 +110,6 @@ class CsvFile(ArrayContainer):
         assumed = f"a table with the columns {columns}; `columns:` in the config says which is what"
         super().__init__(form.path, {}, [assumed], form.data)
         self.form = form
-
-
-def _unknown(path: Path, why: str = "") -> NotARecordingError:
-    named = "an MCAP file" if path.suffix == ".mcap" else "a table"
-    return NotARecordingError(f"{path}: not {named}, nor any other recording that is known{why}")
 
 
 def looks_like_text(start: bytes) -> bool:
@@ -134,17 +129,17 @@ def table_form(path: Path, data: Path) -> TableForm:
     # The last line may be cut.
     lines = lines[:-1] if len(start) == _HEAD else lines
     if "\0" in text or not lines or max(map(len, lines)) > _LONGEST_LINE:
-        raise _unknown(path)
+        raise NotARecordingError.of(path)
     delimiter, decimal = _separators(lines)
     cells = [_cells(line, delimiter) for line in lines]
     if max(map(len, cells)) > _MOST_COLUMNS:
-        raise _unknown(path)
+        raise NotARecordingError.of(path)
     usual = Counter(map(len, cells[-_SAMPLE:])).most_common(1)[0][0]
     first = next((i for i, row in enumerate(cells) if _is_row(row, usual) and not _is_comment(lines[i])), len(lines))
     width = len(cells[first]) if first < len(lines) else 0
     header, units = _header(lines[:first], delimiter, width)
     if not width and header is None:
-        raise _unknown(path, ": no line of numbers in it")
+        raise NotARecordingError.of(path, ": no line of numbers in it")
     if header is None and delimiter == ",":
         _check_decimal_commas(path, lines[:first], width)
     names = (

@@ -220,7 +220,7 @@ def _print_columns(columns: Columns | None) -> None:
         console.print("[yellow]tables, proposed (use `calibrate --auto-columns` or paste into the config):[/]")
         for line in columns.yaml.split("\n"):
             say(f"  {line}")
-    for sentence in (*columns.reasons, *(f"in doubt: {doubt}" for doubt in columns.doubts)):
+    for sentence in (*columns.reasons, *(f"check: {doubt}" for doubt in columns.doubts)):
         _paragraph(f"  {sentence}")
 
 

@@ -33,7 +33,7 @@ _ANSWERS: Mapping[str, tuple[str, Tone, tuple[str, ...]]] = {
         ),
     ),
     "unknown": ("cannot say", "warn", ("Record a motion as for a calibration, so that the parameters can be seen.",)),
-    "same": ("cannot say", "fixed", ("Validate on a recording that the calibration was not made from.",)),
+    "same": ("cannot say", "fixed", ("Validate on another recording of the device.",)),
 }
 
 

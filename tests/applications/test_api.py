@@ -440,6 +440,8 @@ def test_a_gyro_and_a_tracked_body_are_registered_in_one_line() -> None:
     mount = so3.matrix(so3.exp(np.array([truth[f"helmet_mount_{axis}"] for axis in "xyz"])))
     np.testing.assert_allclose(R, mount, atol=4e-3)
     assert delay == pytest.approx(truth["time_offset"], abs=4.0 * found.calibration.parameters["time_offset"].sigma)
+    with pytest.warns(UserWarning, match="inconsistent, do not use the values"):
+        alidade.hand_eye(data.head_gyro, data.head_t, data.vision_wxyz[:, [1, 2, 3, 0]], data.vision_t)
 
 
 def test_all_that_the_command_does_is_there(

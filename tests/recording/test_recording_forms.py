@@ -442,7 +442,11 @@ def test_a_config_can_be_given_again_and_changes_no_other_recording(tmp_path: Pa
         ("{file: imu.csv, time: t, gyro: [note, wy, wz]}", "row 1, column note: 'x' is no number"),
         ("{file: imu.csv, time: note, gyro: [wx, wy, wz]}", "imu.csv: a time that is no number in s"),
         ("{file: imu.csv, time: t}", "exactly one of gyro, .*latitude_deg, celsius, joints, video is needed"),
-        ("{file: imu.csv, time: t, gyro: [a, b, c], units: {gyro: rpm}}", "units.gyro: rpm is not one of rad/s"),
+        (
+            "{file: imu.csv, time: t, gyro: [a, b, c], units: {gyro: rpm}}",
+            "rpm is not one of rad/s, deg/s, mdeg/s; counts",
+        ),
+        ("{file: imu.csv, time: t, gyro: [a, b, c], units: {gyros: deg/s}}", "units.gyros: only gyro, accel, field,"),
         ("{file: imu.csv, time: t, gyro: [a, b]}", "columns./imu.gyro"),
         ("{file: imu.csv, time: t, video: a.mp4, gyro: [a, b, c]}", "joints, video is needed, not gyro and video"),
         ("{file: imu.csv, time: t, video: a.mp4}", r"a.mp4: cannot be opened \(No such file"),

@@ -86,7 +86,7 @@ def test_the_option_wins_over_the_config_over_the_topics(tmp_path: Path) -> None
     recording = open_recording(tmp_path / "s.mcap")
     assert resolve_method("cube", recording, load_config(b"method: los")) == "cube"
     assert resolve_method(None, recording, load_config(b"method: los")) == "los"
-    with pytest.raises(InputError, match="no method 'sextant'; the nearest are "):
+    with pytest.raises(InputError, match="no method 'sextant'; there are los, indexer, head"):
         resolve_method("sextant", recording, NONE)
 
 

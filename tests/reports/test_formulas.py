@@ -168,6 +168,8 @@ def test_a_calibration_applies_itself() -> None:
     np.testing.assert_array_equal(same["w_iv"], found["w_iv"])
     with pytest.raises(InputError, match="apply: gyro serves only together with accel"):
         apply(feels, {}, {"gyro": np.zeros(3)})
+    with pytest.raises(InputError, match=r"apply: gyro has the shape \(3, 5\); \(..., 3\) is needed"):
+        calibration.apply(gyro=np.zeros((3, 5)))
     with pytest.raises(InputError, match="nothing is computed from giro; measurements are gyro, cRh, stamp"):
         calibration.apply(giro=np.zeros(3))
 

@@ -57,29 +57,25 @@ def check_units(accel: Readings, gyro: Readings, mag: Readings | None = None) ->
         "mag": lambda: None if mag is None else _mag(mag.values),
     }
     found = {name: guess for name in sensors if name in wrong and (guess := guesses[name]()) is not None}
-    raise InputError("; ".join(wrong.values()) + _section(found))
+    raise InputError(" ".join([*wrong.values(), _section(found)]))
 
 
 def _wrong(name: str, readings: Readings) -> str:
     """Sentence about an implausible sensor; empty without fault."""
     values = nominal(readings.values, readings.conversion)
     if name == "gyro":
-        said = too_fast(readings.topic, readings.t, values)
-        return said and f"{said}, or its conversion under cube.raw"
+        fast = too_fast(readings.topic, readings.t, values)
+        return fast and f"{fast.partition('?')[0]}?"
     said = implausible(name, values)
     if GRAVITY_REMOVED in said:
         raise InputError(f"topic {readings.topic}: {said}")
-    unit = SI[name]
-    return said and (
-        f"topic {readings.topic}: {said}{'' if said.endswith('?') else ';'} It has to be in {unit}, or its conversion "
-        "in the config under cube.raw"
-    )
+    return said and f"topic {readings.topic}: {said}{'' if said.endswith('?') else '.'}"
 
 
 def _section(found: dict[str, tuple[float, float]]) -> str:
     """The conversions guessed as a section of the config in one line, and what they are."""
     if not found:
-        return ""
+        return "State the conversion to SI in the config under cube.raw"
     entries, words = [], []
     for name, (scale, offset) in found.items():
         usual = _usual(name, scale)
@@ -88,8 +84,8 @@ def _section(found: dict[str, tuple[float, float]]) -> str:
         entries.append(f"{name}: {{scale: {number}{f', offset: {offset:.1f}' if offset else ''}}}")
         words.append(f"{name} {usual or f'{1.0 / scale:.4g} counts a {SI[name]}'}")
     return (
-        f". By these data it is about cube: {{raw: {{{', '.join(entries)}}}}} ({'; '.join(words)}): check it against "
-        "the data sheet; what it is off by is calibrated"
+        f"Paste the conversion into the config: cube: {{raw: {{{', '.join(entries)}}}}} ({'; '.join(words)}, estimated "
+        "from these data). Check it against the data sheet; calibration corrects the rest"
     )
 
 

@@ -143,7 +143,7 @@ def test_study_goes_on_and_sums_up(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["gyro"], "no method 'gyro'; the nearest are "),
+        (["gyro"], "no method 'gyro'; there are los, "),
         (["head", "--scenario", "nothing"], "no scenario file nothing"),
         (["head", "--solvers", "magic"], "no solver 'magic'; the solvers are published, batch, incremental, or all"),
         (["head", "--runs", "0"], "at least one run"),

@@ -132,7 +132,7 @@ def test_validate_on_another_recording_writes_a_page(tmp_path: Path) -> None:
     page = (tmp_path / "v" / "validation.html").read_text()
     assert "Content-Security-Policy" in page
     assert page.count('class="plot"') == 2
-    assert "another one says more" in run.invoke(app, [*command, str(tmp_path / "a.mcap")]).output
+    assert "Validate on another recording" in run.invoke(app, [*command, str(tmp_path / "a.mcap")]).output
 
 
 def _line(text: str, part: str) -> str:
