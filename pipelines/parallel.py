@@ -13,6 +13,7 @@ import ctypes
 import gc
 import math
 import multiprocessing
+import operator
 import os
 import pickle
 import signal
@@ -79,11 +80,7 @@ def room() -> float:
 
 def done(works: Sequence[Callable[[], Answer]], what: str, most: int) -> list[Answer]:
     """Results of independent tasks, at most `most` at a time, with progress; see `WorkerPool.ask`."""
-    return WorkerPool(works, min(most, len(works))).ask(_done, [()] * len(works), what)
-
-
-def _done(work: Callable[[], Answer]) -> Answer:
-    return work()
+    return WorkerPool(works, min(most, len(works))).ask(operator.call, [()] * len(works), what)
 
 
 class LostError(InputError):

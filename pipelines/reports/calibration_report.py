@@ -155,21 +155,25 @@ def summary_of(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
         groups = [group_of(c, c.method.describe(name).removesuffix("."), "", [name]) for name in missed]
         rows = [(ResultCard("", (group,)), group, group.rows[0]) for group in groups]
     worst = max(rows, key=lambda found: found[2].ratio, default=None)
-    text, action = sentences.short_verdict(c.findings, c.quantities, c.verdicts, worst and _named(*worst))
+    text, action = sentences.short_verdict(
+        c.findings, c.quantities, c.verdicts, _nearest(*worst, bool(missed)) if worst else ""
+    )
     steps = (action,) if action else ()
     return Summary("", c.status, _TONES[c.status], text, c.notes, steps, _badges(c))
 
 
-def _named(card: ResultCard, group: ResultGroup, row: ResultRow) -> sentences.Worst:
-    """The number nearest to its requirement, in words."""
+def _nearest(card: ResultCard, group: ResultGroup, row: ResultRow, missed: bool) -> str:
+    """Phrase on the number nearest to its requirement, or farthest beyond."""
     what = f"{group.title[:1].lower()}{group.title[1:]}"
     label = f" {row.label}" if len(group.rows) > 1 else ""
     name = f"{what}{label}, {card.title.lower()}" if len(row.names) > 1 else f"{row.names[0]} ({what})"
+    if not missed:
+        return f"; the closest is {name}, at {100.0 * row.ratio:.2g} % of the requirement"
     for digits in range(2, 7):  # as many as distinguish the two
         sigma, require = rounded(row.sigma, digits), rounded(row.require or 0.0, digits)
         if sigma != require:
             break
-    return sentences.Worst(name, sigma, require, group.unit, row.ratio)
+    return f", worst {name}: ± {sigma} {group.unit} where {require} is required"
 
 
 def _badges(c: Calibration) -> tuple[Badge, ...]:

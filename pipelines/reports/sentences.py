@@ -91,19 +91,8 @@ def slow_error(findings: Sequence[Finding]) -> float:
     return max((float(f.evidence["ratio"]) for f in findings if f.kind == "slow_error"), default=1.0)
 
 
-@dataclass(frozen=True)
-class Worst:
-    """The number nearest to its requirement, or farthest beyond: sigma and requirement as text, and their ratio."""
-
-    name: str
-    sigma: str
-    require: str
-    unit: str
-    ratio: float
-
-
 def short_verdict(
-    findings: Sequence[Finding], quantities: Quantities, verdicts: Mapping[str, str], worst: Worst | None
+    findings: Sequence[Finding], quantities: Quantities, verdicts: Mapping[str, str], worst: str
 ) -> tuple[str, str]:
     """One sentence about the result, and one about what to do.
 
@@ -111,7 +100,7 @@ def short_verdict(
         findings: of a result, the most severe first.
         quantities: by name.
         verdicts: parameter -> verdict, of those with a required accuracy.
-        worst: of the required numbers; None: there is none.
+        worst: phrase on the number nearest to its requirement, or farthest beyond; empty: there is none.
     """
     advice = [what for _, what in by_advice(findings)]
     more = f"; {len(advice) - 1} more under Details" if len(advice) > 1 else ""
@@ -129,15 +118,11 @@ def short_verdict(
         action = f"Do not use the values before the cause is found.{probable} {sheets}"
         return sentence(first, quantities), action.rstrip()
     if state == "calibrated":
-        closest = f"; the closest is {worst.name}, at {100.0 * worst.ratio:.2g} % of the requirement" if worst else ""
-        text = (
-            f"All {len(required)} required parameters are within their required accuracy{closest}.{_warning(findings)}"
-        )
+        text = f"All {len(required)} required parameters are within their required accuracy{worst}.{_warning(findings)}"
         return text, _APPLY
     directions = sum(f.kind == "direction" and f.severity == Severity.UNOBSERVABLE for f in findings)
     if state == "weak" or not directions:
-        where = f", worst {worst.name}: ± {worst.sigma} {worst.unit} where {worst.require} is required" if worst else ""
-        accuracy = [f"{len(missed)} of {len(required)} parameters miss their required accuracy{where}."] * bool(missed)
+        accuracy = [f"{len(missed)} of {len(required)} parameters miss their required accuracy{worst}."] * bool(missed)
         beside = [f for f in findings if f.severity > Severity.NOTE and not (missed and f.kind in _ON_ACCURACY)][:1]
         moved = [_MOVED for f in beside if f.kind in MOVES]
         return " ".join([*(sentence(f, quantities) for f in beside), *accuracy]), " ".join(

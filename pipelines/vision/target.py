@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,16 +63,6 @@ class _Match:
     quality: float
 
 
-class _Target(Protocol):
-    """What is looked at: a tag or a texture."""
-
-    middle: Array
-
-    def find(self, picture: Picture, ckRc0: Array) -> _Match | str:
-        """Its points in a picture that is turned about as much as `ckRc0` against the first; else why not."""
-        ...
-
-
 def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors:
     """LOS errors of the target that the first picture shows; pictures are streamed.
 
@@ -87,7 +76,7 @@ def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors
     Raises:
         InputError: no picture decodes, or the first one shows neither a tag nor enough texture.
     """
-    target: _Target | None = None
+    target: _Tag | _Texture | None = None
     R = so3.identity()
     rows: list[tuple[int, Array, Array, float]] = []
     dropped: Counter[str] = Counter()
@@ -116,7 +105,7 @@ def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors
     )
 
 
-def _target(picture: Picture, camera: Camera) -> _Target:
+def _target(picture: Picture, camera: Camera) -> _Tag | _Texture:
     found = detect(picture, camera=camera)
     good = np.flatnonzero(np.isfinite(found.covariance).all(axis=(1, 2, 3)))
     if len(good):
@@ -133,8 +122,7 @@ class _Tag:
         middle = np.cross(np.cross(corners[0], corners[2]), np.cross(corners[1], corners[3]))
         self.middle = middle * np.sign(middle @ corners.mean(axis=0)) / np.linalg.norm(middle)
 
-    def find(self, picture: Picture, ckRc0: Array) -> _Match | str:
-        del ckRc0  # the tag is found wherever it is
+    def find(self, picture: Picture, _: Array) -> _Match | str:
         found = detect(picture, camera=self._camera)
         mine = np.flatnonzero(found.ids == self._id)
         if len(mine) != 1 or not np.isfinite(found.covariance[mine[0]]).all():

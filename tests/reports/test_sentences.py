@@ -313,10 +313,10 @@ JUMP = Finding("jump", WEAK, {"since_s": 117.5, "time_s": 117.6, "size": 0.0105,
 
 def test_the_short_verdict_gives_the_finding_that_makes_the_status() -> None:
     """A jump with all accuracies met read "weak. 0 of 7 parameters miss their required accuracy"."""
-    text, action = short_verdict([JUMP], QUANTITIES, {MOUNT.name: "observable"}, None)
+    text, action = short_verdict([JUMP], QUANTITIES, {MOUNT.name: "observable"}, "")
     assert text == sentence(JUMP, QUANTITIES)
     assert action.startswith("What to do: ")
-    both, _ = short_verdict([JUMP], QUANTITIES, {MOUNT.name: "weak"}, None)
+    both, _ = short_verdict([JUMP], QUANTITIES, {MOUNT.name: "weak"}, "")
     assert both == f"{text} 1 of 1 parameters miss their required accuracy."
 
 
@@ -363,5 +363,5 @@ def test_a_recording_that_determines_next_to_nothing_is_said_to_be_too_short() -
 
 def test_a_cause_that_is_but_noted_adds_no_stray_full_stop() -> None:
     note = Finding("prior_conflict", NOTE, {**CONFLICT, "inseparable": (), "effect": {}})
-    _, action = short_verdict([REJECTED, note], QUANTITIES, {MOUNT.name: "observable"}, None)
+    _, action = short_verdict([REJECTED, note], QUANTITIES, {MOUNT.name: "observable"}, "")
     assert action == "Do not use the values before the cause is found."

@@ -49,6 +49,6 @@ def test_slow_errors_that_double_sigmas_are_a_warning() -> None:
     for ratio, warned in ((1.5, False), (2.5, True)):
         found = [Finding("slow_error", Severity.NOTE, {"parameter": "helmet_mount_z", "ratio": ratio})]
         assert ("Warning: sigmas × 2.5" in headline(found, {}, {})) == warned
-        assert ("Warning: sigmas × 2.5" in short_verdict(found, {}, {}, None)[0]) == warned
+        assert ("Warning: sigmas × 2.5" in short_verdict(found, {}, {}, "")[0]) == warned
         page = report_html(replace(make_calibration(), findings=tuple(found)))
         assert ("sigmas × 2.5 for slow errors" in page) == warned

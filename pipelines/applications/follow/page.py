@@ -22,7 +22,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import suppress
-from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -54,6 +54,7 @@ _MAX_NOTE = 2000
 # Machines beyond every network (RFC 5737, RFC 3849): what would be sent there goes out by the address that others see.
 # Nothing is sent.
 _ELSEWHERE = {socket.AF_INET: ("192.0.2.1", 9), socket.AF_INET6: ("2001:db8::1", 9)}
+_PAGE = Path(__file__).parent / "templates" / "live.html"
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'",
@@ -92,7 +93,7 @@ class LivePage:
         self._say, self._host = say, host
         self._socket, self._families = _listening(host, port)
         self._port = self._socket.getsockname()[1]
-        self.is_open = not _is_loopback(self._socket.getsockname()[0])
+        self.is_open = not ipaddress.ip_address(self._socket.getsockname()[0]).is_loopback
         self._token, self._key = _token(), secrets.token_urlsafe(32)
         self._gate, self._attempts = Gate(), Attempts()
         self._histories: dict[str, list[tuple[float, float]]] = {}
@@ -258,7 +259,7 @@ class LivePage:
         from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
 
         if self._may(request):
-            return HTMLResponse(_html(), headers=_HEADERS)
+            return HTMLResponse(_PAGE.read_text(encoding="utf-8"), headers=_HEADERS)
         token, client = request.query_params.get("token"), request.client.host if request.client else "?"
         if not self.is_open or token is None or not self._asks_for_this_machine(request):
             return PlainTextResponse(_REFUSED, 403, _HEADERS)
@@ -304,10 +305,6 @@ _REFUSED = (
 _TOO_MANY = "Too many wrong addresses from this device: wait a minute.\n"
 
 
-def _html() -> str:
-    return files("alidade.pipelines.applications.follow").joinpath("templates/live.html").read_text(encoding="utf-8")
-
-
 def _listening(host: str, port: int) -> tuple[socket.socket, Sequence[socket.AddressFamily]]:
     """A listening socket and the address families that reach it: `::` is reached by IPv4 as well where that can be."""
     try:
@@ -317,10 +314,6 @@ def _listening(host: str, port: int) -> tuple[socket.socket, Sequence[socket.Add
         return listening, (socket.AF_INET, socket.AF_INET6) if both else (family,)
     except (OSError, OverflowError, UnicodeError) as error:
         raise InputError(f"--page: no server can be started at {host} port {port} ({error}); give another") from error
-
-
-def _is_loopback(address: str) -> bool:
-    return ipaddress.ip_address(address).is_loopback
 
 
 def _is_address(host: str) -> bool:

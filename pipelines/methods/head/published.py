@@ -22,6 +22,10 @@ from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # The Euler rates divide by cos(pitch). Nearer than this to pitch +-90 deg (rad) they divide by the cosine held here.
 _NEAREST_TO_VERTICAL = np.deg2rad(5.0)
+# Sigma of the bias before any measurement, rad/s.
+_BIAS_SIGMA = 0.05
+# Bias estimates of which the mean is reported, on an axis where they scatter by more than this, rad/s.
+_SMOOTHED, _SMOOTHING_SIGMA = 25, 2e-3
 
 
 @dataclass(frozen=True)
@@ -50,9 +54,6 @@ def euler_kalman_filter(
     gyro_density: float,
     bias_walk: float,
     vision_sigma: float,
-    bias_sigma: float = 0.05,
-    smoothing_window: int = 25,
-    smoothing_threshold: float = 2e-3,
 ) -> HeadFilterResult:
     """Run the filter over a session, from the first vision frame to the last within the gyro's time span.
 
@@ -65,11 +66,6 @@ def euler_kalman_filter(
         gyro_density: white noise of the helmet gyro, rad/s/sqrt(Hz).
         bias_walk: random walk of its bias, rad/s/sqrt(s).
         vision_sigma: noise of the vision angles, rad per angle.
-        bias_sigma: standard deviation of the bias before any measurement, rad/s.
-        smoothing_window: number of recent bias estimates looked at.
-        smoothing_threshold: on an axis where their standard deviation is above this (rad/s), their mean is reported
-            as the bias. The filter itself goes on with its own estimate: fed back, the mean is the delay that sets an
-            integral loop swinging (tried: attitude error up to six times as large).
 
     Raises:
         InputError: no vision frame lies within the gyro's time span.
@@ -79,7 +75,7 @@ def euler_kalman_filter(
         raise InputError("vision and helmet gyro do not overlap in time: the published filter has nothing to do")
     t, measured = data.vision_t[inside], euler_angles(data.vision_wxyz[inside])
     x = np.concatenate([measured[0], np.zeros(3)])
-    P = np.diag(np.repeat([vision_sigma**2, bias_sigma**2], 3))
+    P = np.diag(np.repeat([vision_sigma**2, _BIAS_SIGMA**2], 3))
     R = vision_sigma**2 * np.eye(3)
     states, sigmas, innovations, expected = [x], [np.sqrt(np.diag(P))], [np.zeros(3)], [R]
     for k, steps in enumerate(_steps(data, t), start=1):
@@ -99,7 +95,7 @@ def euler_kalman_filter(
     return HeadFilterResult(
         t=t,
         wxyz=attitude(history[:, :3]),
-        bias=_smooth(history[:, 3:], smoothing_window, smoothing_threshold),
+        bias=_smooth(history[:, 3:], _SMOOTHED, _SMOOTHING_SIGMA),
         bias_sigma=np.array(sigmas)[:, 3:],
         innovation=np.array(innovations),
         innovation_covariance=np.array(expected),
@@ -137,7 +133,11 @@ def published_estimate(data: HeadData, config: Config, problem: Problem) -> Esti
 
 
 def _smooth(bias: Array, window: int, threshold: float) -> Array:
-    """Moving average of the last `window` rows, (K, 3), wherever their standard deviation exceeds the threshold."""
+    """Moving average of the last `window` rows, (K, 3), wherever their standard deviation exceeds the threshold.
+
+    It is reported alone: fed back into the filter, the mean is the delay that sets an integral loop swinging (attitude
+    error up to six times as large).
+    """
     padded = np.concatenate([np.repeat(bias[:1], window - 1, axis=0), bias])
     recent = np.lib.stride_tricks.sliding_window_view(padded, window, axis=0)
     return np.asarray(np.where(recent.std(axis=-1) > threshold, recent.mean(axis=-1), bias))

@@ -41,7 +41,7 @@ class LosLeastSquares:
 
 
 def recursive_least_squares(
-    data: LosData, los_sigma: float = 2e-5, initial_sigma: float = 0.1, forgetting: float = 1.0, exact: bool = False
+    data: LosData, los_sigma: float = 2e-5, initial_sigma: float = 0.1, exact: bool = False
 ) -> LosLeastSquares:
     """Run the filter over a session.
 
@@ -49,7 +49,6 @@ def recursive_least_squares(
         data: the session.
         los_sigma: noise of one LOS error, rad; it scales the covariance alone.
         initial_sigma: of each angle before any measurement, rad.
-        forgetting: 1 forgets nothing, as published.
         exact: H2,1 with the term that the publication leaves out.
 
     Raises:
@@ -61,11 +60,11 @@ def recursive_least_squares(
     values, covariances, residuals, sigmas = [], [], [], []
     for y, h, r in zip(measured, H, variance, strict=True):
         innovation = y - h @ x
-        S = h @ P @ h.T + forgetting * r * np.eye(2)
+        S = h @ P @ h.T + r * np.eye(2)
         gain = P @ h.T @ np.linalg.inv(S)
         sigmas.append(np.sqrt(0.5 * np.trace(S)))
         x = x + gain @ innovation
-        P = (P - gain @ h @ P) / forgetting
+        P = P - gain @ h @ P
         P = 0.5 * (P + P.T)
         values.append(x)
         covariances.append(P)
