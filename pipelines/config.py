@@ -51,45 +51,37 @@ def configured(recording: Recording, override: Settings = None) -> tuple[Recordi
 
 def load_config(attachment: bytes | None, override: Settings = None) -> Config:
     """The config in a recording's attachment, overridden key by key by a file or another config. Raises InputError."""
-    override = _file_or_config(override)
-    base = _read(attachment, f"attachment {ATTACHMENT}") if attachment is not None else {}
-    more: dict[Any, Any] = {}
-    gaussian_prior = None
-    if isinstance(override, Config):
-        gaussian_prior, more, override = (
-            override.gaussian_prior,
-            override.model_dump(exclude_unset=True),
-            Path("config"),
-        )
-    elif override is not None:
-        more = _read(read_bytes(override, MAX_YAML_BYTES), str(override))
-        if str(more.get("schema", "")).startswith("alidade."):
-            raise InputError(f"{override}: that is a result, not a config; `--prior` takes it")
+    attached = f"attachment {ATTACHMENT}"
+    base = _read(attachment, attached) if attachment is not None else {}
+    source, more = _override(override)
     try:
         config = model().model_validate(_merge(base, more))
     except ValidationError as error:
-        said, text = first_error(error, model())
-        where = str(override) if _has(more, said) else f"attachment {ATTACHMENT}"
-        raise InputError(f"{where}: {text}") from error
+        path, text = first_error(error, model())
+        raise InputError(f"{source if source and _has(more, path) else attached}: {text}") from error
     known = {topic.key for name in methods.names() for topic in methods.method(name).topics}
     for key in config.topics.keys() - known:
-        where = str(override) if _has(more, ("topics", key)) else f"attachment {ATTACHMENT}"
+        where = source if _has(more, ("topics", key)) else attached
         raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
-    config = config.of(str(override) if override is not None else f"attachment {ATTACHMENT}")
-    return config if gaussian_prior is None else config.with_prior(gaussian_prior)
+    config = config.of(source or attached)
+    prior = override.gaussian_prior if isinstance(override, Config) else None
+    return config if prior is None else config.with_prior(prior)
 
 
-def _file_or_config(given: object) -> Path | Config | None:
-    if given is None or isinstance(given, Config | Path):
-        return given
-    if isinstance(given, str):
-        return Path(given)
-    if not isinstance(given, Mapping):
+def _override(given: object) -> tuple[str, Mapping[Any, Any]]:
+    """Source and content of what overrides a recording's config; empty where there is nothing."""
+    if given is None:
+        return "", {}
+    if isinstance(given, Config):
+        return "config", given.model_dump(exclude_unset=True)
+    if isinstance(given, Mapping):
+        return "config", given
+    if not isinstance(given, str | Path):
         raise InputError(f"config: a file, an alidade.Config or its keys are needed, not {type(given).__name__}")
-    try:
-        return model().model_validate(dict(given))
-    except ValidationError as error:
-        raise InputError(f"config: {first_error(error, model())[1]}") from error
+    content = _read(read_bytes(Path(given), MAX_YAML_BYTES), str(given))
+    if str(content.get("schema", "")).startswith("alidade."):
+        raise InputError(f"{given}: that is a result, not a config; `--prior` takes it")
+    return str(given), content
 
 
 @cache

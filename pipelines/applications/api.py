@@ -126,12 +126,6 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     return Session(chosen, data, settings)
 
 
-def load_settings(config: Settings, more: Mapping[str, Any]) -> _BaseConfig:
-    """A config with these keys where it does not have them itself. Raises InputError."""
-    given = load_config(None, config).model_dump(exclude_unset=True)
-    return Config({**more, **given})
-
-
 def calibrate(
     source: Source,
     solver: str = "batch",

@@ -4,7 +4,8 @@
     K, bias, K_gyro, bias_gyro = alidade.imu_static(acc, gyro, t, latitude_deg=48.1)
     R, delay = alidade.hand_eye(gyro, t, wxyz, t_wxyz)
 
-Each is a tuple that has the whole `Calibration` behind it: `alidade.magcal(m).calibration`. An inconsistent one warns.
+Each is a tuple that has the whole `Calibration` behind it: `alidade.magcal(m).calibration`. One that is inconsistent or
+unobservable warns.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from alidade.factors import so3
-from alidade.pipelines.applications.api import calibrate, load_settings
-from alidade.pipelines.config import Settings
+from alidade.pipelines.applications.api import calibrate
+from alidade.pipelines.config import Settings, load_config
 from alidade.pipelines.estimation.problem import Array
 
 if TYPE_CHECKING:
@@ -33,8 +34,8 @@ class _Result:
     calibration: Calibration
 
     def _with(self, calibration: Calibration) -> Self:
-        if calibration.status == "inconsistent":
-            warnings.warn(f"inconsistent, do not use the values: {calibration.headline}", stacklevel=3)
+        if calibration.status in ("inconsistent", "unobservable"):
+            warnings.warn(f"{calibration.status}: {calibration.headline}", stacklevel=3)
         self.calibration = calibration
         return self
 
@@ -91,8 +92,8 @@ def imu_static(
     Raises:
         InputError: arrays or config cannot be used.
     """
-    settings = load_settings(config, {"latitude_deg": latitude_deg})
-    found = calibrate({"imu_t": t, "gyro": gyro, "accel": acc}, method="cube", config=settings)
+    keys = {"latitude_deg": latitude_deg, **load_config(None, config).model_dump(exclude_unset=True)}
+    found = calibrate({"imu_t": t, "gyro": gyro, "accel": acc}, method="cube", config=keys)
     numbers = (found.matrix("accel"), found.bias("accel"), found.matrix("gyro"), found.bias("gyro"))
     return StaticResult(numbers)._with(found)
 

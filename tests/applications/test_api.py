@@ -440,8 +440,17 @@ def test_a_gyro_and_a_tracked_body_are_registered_in_one_line() -> None:
     mount = so3.matrix(so3.exp(np.array([truth[f"helmet_mount_{axis}"] for axis in "xyz"])))
     np.testing.assert_allclose(R, mount, atol=4e-3)
     assert delay == pytest.approx(truth["time_offset"], abs=4.0 * found.calibration.parameters["time_offset"].sigma)
-    with pytest.warns(UserWarning, match="inconsistent, do not use the values"):
-        alidade.hand_eye(data.head_gyro, data.head_t, data.vision_wxyz[:, [1, 2, 3, 0]], data.vision_t)
+
+
+def test_a_hand_eye_calibration_that_one_axis_does_not_determine_warns() -> None:
+    from alidade.factors import so3
+
+    t, noise = np.arange(0.0, 10.0, 0.01), np.random.default_rng(0)
+    axis = np.array([1.0, 0.0, 0.0])
+    gyro = np.cos(2.0 * t)[:, None] * axis + 1e-3 * noise.standard_normal((len(t), 3))
+    attitudes = so3.exp((0.5 * np.sin(2.0 * t[::5]))[:, None] * axis + 5e-3 * noise.standard_normal((len(t[::5]), 3)))
+    with pytest.warns(UserWarning, match="unobservable: .*helmet_mount"):
+        alidade.hand_eye(gyro, t, attitudes, t[::5])
 
 
 def test_all_that_the_command_does_is_there(
