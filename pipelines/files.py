@@ -8,6 +8,7 @@ All raise InputError.
 
 from __future__ import annotations
 
+import datetime
 import os
 import re
 import stat
@@ -92,6 +93,15 @@ def flow_yaml(value: object) -> str:
         return f"{value:g}" if isinstance(value, float) else str(value).lower()
     plain = re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_/. ^-]*", value) and value.lower() not in _YAML_WORDS
     return value if plain else '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def as_date(text: str) -> datetime.datetime:
+    """A date of ISO 8601, with or without time; UTC unless it says otherwise. Raises InputError when it is none."""
+    try:
+        date = datetime.datetime.fromisoformat(text)
+    except ValueError as error:
+        raise InputError(f"date {text!r}: must be like 2026-11-20 or 2026-11-20T12:00") from error
+    return date if date.tzinfo else date.replace(tzinfo=datetime.UTC)
 
 
 def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:

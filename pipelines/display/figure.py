@@ -8,7 +8,6 @@ Colours are names from PALETTE, which has a light and a dark form of each, so th
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.files import as_date
 
 # The first three are Paul Tol's high-contrast scheme: distinguishable for the colour-blind, and in grey. On dark ground
 # their lighter forms. "rejected" is kept for what was rejected, the last ones for what stands behind.
@@ -277,9 +277,4 @@ def thin(count: int) -> slice:
 
 def milliseconds(dates: Iterable[str | None]) -> Array:
     """ISO dates (n,) as the datetime scale has them, ms since 1970 UTC; nan where there is none."""
-    return np.array([1e3 * _timestamp(each) if each else np.nan for each in dates])
-
-
-def _timestamp(date: str) -> float:
-    found = datetime.datetime.fromisoformat(date)
-    return (found if found.tzinfo else found.replace(tzinfo=datetime.UTC)).timestamp()
+    return np.array([1e3 * as_date(each).timestamp() if each else np.nan for each in dates])

@@ -6,7 +6,6 @@ saved.value("gyro_bias_x"), saved.rotations["helmet_mount"]
 
 from __future__ import annotations
 
-import datetime
 import re
 from collections.abc import Mapping, Sequence
 from io import StringIO
@@ -21,7 +20,7 @@ from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, load_yaml, read_bytes, yaml_float
+from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, as_date, load_yaml, read_bytes, yaml_float
 from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.reports.result import Calibration
@@ -134,10 +133,9 @@ class SavedCalibration(_Record, SensorValues):
     def start_ns(self) -> int:
         """Start of its recording, Unix ns, to the second; UTC where no zone is stated. Raises InputError."""
         try:
-            date = datetime.datetime.fromisoformat(self.recording.start)
-        except ValueError as error:
-            raise InputError(f"{self._source}: start of the recording: {self.recording.start!r} is no date") from error
-        return round((date if date.tzinfo else date.replace(tzinfo=datetime.UTC)).timestamp()) * 1_000_000_000
+            return round(as_date(self.recording.start).timestamp()) * 1_000_000_000
+        except InputError as error:
+            raise InputError(f"{self._source}: start of the recording: {error}") from error
 
     def of_method(self, name: str) -> SavedCalibration:
         """Itself. Raises InputError when it is another method's calibration."""

@@ -19,7 +19,7 @@ from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.fleet import require_extra
 from alidade.pipelines.applications.fleet.engine import Killed, source_version, work_off
 from alidade.pipelines.applications.fleet.histories import packed
-from alidade.pipelines.applications.fleet.recordings import Recording, as_date, from_metadata, from_name, local
+from alidade.pipelines.applications.fleet.recordings import Recording, from_metadata, from_name, local
 from alidade.pipelines.applications.fleet.store import (
     RecordingResult,
     Store,
@@ -32,6 +32,7 @@ from alidade.pipelines.applications.fleet.store import (
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import as_date
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.reports.calibration import load_known

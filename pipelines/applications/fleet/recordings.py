@@ -7,7 +7,6 @@ file system is copied for that time.
 
 from __future__ import annotations
 
-import datetime
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -172,15 +171,6 @@ def _recorded(path: Path) -> dict[str, str]:
             # A damaged file fails in any way here. Its error is reported when its messages are read.
             return {}
     return found
-
-
-def as_date(text: str) -> datetime.datetime:
-    """A date of ISO 8601, with or without time; UTC unless it says otherwise. Raises InputError when it is none."""
-    try:
-        date = datetime.datetime.fromisoformat(text)
-    except ValueError as error:
-        raise InputError(f"date {text!r}: must be like 2026-11-20 or 2026-11-20T12:00") from error
-    return date if date.tzinfo else date.replace(tzinfo=datetime.UTC)
 
 
 def _custom(text: bytes | str) -> dict[str, str]:
