@@ -105,8 +105,20 @@ class GtsamSystem:
         root = np.triu(np.linalg.qr(whole, mode="r"))
         conditionals = [_Conditional.of(each, layout) for each in conditionals_of(tree, ordering)]
         found = GtsamFactorization(layout, c, root, conditionals)
-        root[-1, -1] = np.sqrt(max(self.squares - found.explained, 0.0))  # gtsam drops what no variable can change
+        root[-1, -1] = np.sqrt(self._minimum(graph, found))  # gtsam drops what no variable can change
         return found
+
+    def _minimum(self, graph: gtsam.GaussianFactorGraph, found: GtsamFactorization) -> float:
+        """Sum of squares at the solution; where there is none, what the rows of R leave of it."""
+        try:
+            last = np.asarray(np.linalg.solve(found.root[:-1, :-1], found.root[:-1, -1:]), dtype=float)
+            moves = found.moves(last, 1.0, None)
+        except np.linalg.LinAlgError:
+            return max(self.squares - found.explained, 0.0)
+        solution = gtsam.VectorValues()
+        for at, move in moves.items():
+            solution.insert(int(self.layout.key[at]), move[:, 0])
+        return 2.0 * float(graph.error(solution))
 
     def _damped(self, damping: float) -> gtsam.GaussianFactorGraph:
         graph, layout = gtsam.GaussianFactorGraph(), self.layout
