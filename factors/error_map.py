@@ -41,7 +41,7 @@ class ErrorMapFactor(Model):
 
     @property
     def sqrt_information(self) -> Array:
-        """Of the model."""
+        """Square-root information of the wrapped model, (n, m, m)."""
         return np.asarray(self.model.sqrt_information)
 
     @property

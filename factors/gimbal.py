@@ -17,8 +17,8 @@ from alidade.factors.model import Array, Stacked
 WINDOWS = (0.2, 0.1, 0.05, 0.025)
 # Samples left out to choose it, and the part by which prediction errors differ by chance.
 _TRIED, _AS_GOOD = 500, 1.05
-# Between angles by which commands and what follows them are compared, s.
-_FOLLOWED = 0.1
+# Interval of the angles whose third differences are compared, s.
+_FOLLOWING_INTERVAL = 0.1
 # Of the polynomials.
 _DEGREE = 3
 # Moments whose samples are held at a time: few enough for the processor's cache.
@@ -194,12 +194,13 @@ def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
 
 
 def _following(gimbal: GimbalPath, commanded: GimbalPath) -> float:
-    """Share of commanded angles that a gimbal follows, 0 to 1, by what moves it within tenths of a second.
+    """Share of commanded angles that a gimbal follows, 0 to 1, by its motion within tenths of a second.
 
-    Slower motion says nothing of the gyro's noise, faster one is lost in that of pictures. Least absolute deviations
-    of third differences, on which slews to another target have no influence.
+    The sway in slower motion hides the gyro's noise, and faster motion is lost in the noise of pictures. Least absolute
+    deviations of third differences, on which slews to another target have next to no influence.
     """
-    t = np.arange(gimbal.t[0], gimbal.t[-1], _FOLLOWED)
+    ends = max(gimbal.t[0], commanded.t[0]), min(gimbal.t[-1], commanded.t[-1])
+    t = np.arange(*ends, _FOLLOWING_INTERVAL)
     read, asked = (np.diff(path.at(t), 3, axis=0).ravel() for path in (gimbal, commanded))
     moving = asked != 0.0
     ratio, weight = read[moving] / asked[moving], np.abs(asked[moving])

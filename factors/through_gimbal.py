@@ -1,18 +1,20 @@
-"""Noise that reaches attitudes and pictures through the angles of a gimbal.
+"""Whitening of gyro and encoder noise that errors of a gimbal couple into attitudes and pictures.
 
 The angles from which a camera's attitude is computed contain noise: the gimbal turns with what the gyro that drives it
-reads, that gyro's noise included, and encoders have noise of their own. Both are accounted for as long as the gimbal is
-as assumed. An error that turns the camera by e f about an axis a, f a function of the gimbal angles, adds
+reads, that gyro's noise n included, and encoders have noise of their own. With a perfect gimbal neither matters: the
+camera turns with the gimbal, and encoder noise is part of the stated noise v of pictures. Let an error of size e turn
+the camera by e f about an axis a, f a function of the gimbal angles. A step dg of the angles then turns the attitudes
+that follow from angles and pictures by a further
 
     e Y dg,    Y dg = a (grad f) dg + f sum_k (a_k x a) dg_k,
 
-to how a step dg of the angles turns the attitudes that follow from them, a_k the axes of the gimbal's turns between the
-gyro and a. With errors e_i an increment of the gyro has the noise (1 + K) n, K n = sum e_i Y_i dg, dg the commands by
-which n drives the gimbal. A picture with the noise v has v + sum e_i Y_i dg, dg what of v is the encoders': E(dg | v).
+a_k the axes of those of the gimbal's turns that stand between gyro and a. So errors e_i change the noise of the gyro's
+increments to (1 + K) n, K n = sum e_i Y_i dg, with the steps dg by which n drives the gimbal; and that of pictures to
+(1 + K) v, K v = sum e_i Y_i dg, with the steps E(dg | v) that are the encoders' part of v.
 
 Errors that are unknowns would be chosen to make that noise smaller, and be biased by a number of sigmas that grows with
 the square root of the recording's length. Multiplied with the inverse of 1 + K, residuals have the same noise whatever
-the errors are. K is linear in them, so they are counted from a first guess.
+the errors are. K is of first order in them, so they are counted from a first guess, where K is 0.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ class GimbalErrors(Stacked):
     """Errors of a gimbal's mounting and encoders.
 
     Attributes:
-        names: of the mounting angles.
+        names: mounting angles that are variables.
         mount: their first guess, rad.
     """
 
@@ -114,7 +116,7 @@ class ThroughGimbalFactor(Model):
         errors: of the gimbal.
         encoder: (n,) sigma of the encoders' noise within the pictures', rad.
         following: the share of the gyro's commands that the gimbal follows.
-        held: which of the model's blocks are those of the errors; empty: none.
+        error_blocks: which of the model's blocks hold the errors; empty: they are appended after the model's.
     """
 
     model: Any
@@ -122,7 +124,7 @@ class ThroughGimbalFactor(Model):
     errors: GimbalErrors | GimbalMap
     encoder: Array | None = None
     following: float = 1.0
-    held: tuple[int, ...] = ()
+    error_blocks: tuple[int, ...] = ()
     shapes: ClassVar = {"gimbal": (2,), "encoder": ()}
     stacked: ClassVar = ("model", "gimbal", "errors", "encoder")
 
@@ -144,15 +146,15 @@ class ThroughGimbalFactor(Model):
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Blocks of the model and of the errors."""
-        return (*self.model.blocks, *(() if self.held else self.errors.blocks))
+        return (*self.model.blocks, *(() if self.error_blocks else self.errors.blocks))
 
     def __call__(self, *blocks: Array) -> Residuals:
         """Residual (1 + K)^-1 r of the model's r, (n, m)."""
         count = len(self.model.blocks)
-        held = self.held or tuple(range(count, len(blocks)))
+        error_blocks = self.error_blocks or tuple(range(count, len(blocks)))
         residuals, jacobians = self.model(*blocks[:count])
         errors = list(self.errors.each(self.gimbal))
-        e = np.stack([blocks[held[block]][:, column] - guess for block, column, guess, *_ in errors])
+        e = np.stack([blocks[error_blocks[block]][:, column] - guess for block, column, guess, *_ in errors])
         to_steps, to_residuals = self._units()
         Y = self._by_steps([error[3:] for error in errors])
         K = to_residuals @ np.einsum("en,ekjn->nkj", e, Y) @ to_steps
@@ -167,7 +169,7 @@ class ThroughGimbalFactor(Model):
             ends = np.cumsum([dimension(block) for block in self.blocks])[:-1]
             out = np.split(np.concatenate([own, added], axis=2), ends, axis=2)
             for i, (block, column, *_) in enumerate(errors):
-                out[held[block]][:, :, column] -= by_errors[:, :, i]
+                out[error_blocks[block]][:, :, column] -= by_errors[:, :, i]
             return tuple(out)
 
         return residuals, all_jacobians

@@ -26,7 +26,7 @@ class InputError(Exception):
 
 
 class NotARecordingError(InputError):
-    """A file that is no recording, and will not become one."""
+    """A file that cannot be used however long it grows: of no known format, or a table without `columns`."""
 
     @classmethod
     def of(cls, path: Path, why: str = "") -> Self:

@@ -4,8 +4,8 @@
     K, bias, K_gyro, bias_gyro = alidade.imu_static(acc, gyro, t, latitude_deg=48.1)
     R, delay = alidade.hand_eye(gyro, t, wxyz, t_wxyz)
 
-Each is a tuple that has the whole `Calibration` behind it: `alidade.magcal(m).calibration`. One that is inconsistent or
-unobservable warns.
+Each is a tuple that has the whole `Calibration` behind it: `alidade.magcal(m).calibration`. An inconsistent or
+unobservable result raises a UserWarning.
 """
 
 from __future__ import annotations

@@ -526,7 +526,7 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     facts = session_facts(recording, config)
     by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
     asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
-    to_ask = {name: (f"`--method {name}`, as topics alone do not choose it",) for name in asked}
+    to_ask = {name: (f"`--method {name}`: topics alone do not select it",) for name in asked}
     facts = replace(facts, missing={**facts.missing, **to_ask})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
     facts = replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
@@ -604,7 +604,7 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     ]
     if by_name:
         options = " or ".join(f"--method {name}" for name in by_name)
-        raise InputError(f"{recording.path}: these topics serve a method only when it is named: {options}")
+        raise InputError(f"{recording.path}: these topics alone do not select a method; use {options}")
     columns = propose_columns(recording)
     if columns is not None and columns.columns:
         raise NotARecordingError(

@@ -119,7 +119,7 @@ class ErrorMap:
         errors = GimbalMap(self.functions[at], self.slopes[at])
         if mapped is None:
             return ThroughGimbalFactor(model, gimbal, errors, following=model.following)
-        return ThroughGimbalFactor(mapped, gimbal, errors, model.encoder, held=(len(model.blocks),))
+        return ThroughGimbalFactor(mapped, gimbal, errors, model.encoder, error_blocks=(len(model.blocks),))
 
     def error(self, c: Array) -> Array:
         """Errors (n, axes) of the measurements."""

@@ -100,7 +100,8 @@ def short_verdict(
         findings: of a result, the most severe first.
         quantities: by name.
         verdicts: parameter -> verdict, of those with a required accuracy.
-        worst: phrase on the number nearest to its requirement, or farthest beyond; empty: there is none.
+        worst: phrase on the number nearest to its requirement, or farthest beyond, with the comma or semicolon before
+            it; empty: there is none.
     """
     advice = [what for _, what in by_advice(findings)]
     more = f"; {len(advice) - 1} more under Details" if len(advice) > 1 else ""
@@ -231,7 +232,10 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
     prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
     numbers = f"{format_estimate(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
     if not (q.assumed or q.tight):
-        return f"{q.name} is far from its prior", f"{numbers}; {_FAR.get(q.unit, 'if the device is so, widen it')}"
+        return (
+            f"{q.name} is far from its prior",
+            f"{numbers}; {_FAR.get(q.unit, 'if the device really has this value, widen the prior')}",
+        )
     inseparable = f" (or {', '.join(e['inseparable'])}, inseparable from it)" if e["inseparable"] else ""
     what = f"{q.name} contradicts its {'data sheet' if q.sheet else 'prior'}{inseparable}"
     return what, numbers + _shift(e["effect"], q.name, quantities, "its departure")

@@ -20,9 +20,9 @@ correlated by exp(-k / T), has the restricted likelihood (Harville, J. Am. Stat.
     -2 log L = (n - m) log q + log det V + log det Q'V^-1 Q,    q = min_x (y - Q x)'V^-1 (y - Q x)
 
 V = (1 - f) I + f exp(-|i - j| / T), Q an orthonormal basis of what the m numbers move the n residuals y by. But for
-both ends the cosine transform makes V diagonal. v = q / r, r the redundancy of the residuals: states have absorbed some
-of them as well, and what is rejected is none of them. The weights have v = 1, as found, stated or sampled; a v below it
-is of correlated noise that states have absorbed.
+both ends the cosine transform makes V diagonal. v = q / r, r the redundancy of the measurements that are used: what
+states and numbers leave of their count. Weights correspond to v = 1; a smaller estimate means that states absorbed
+correlated noise, so v is at least 1.
 """
 
 from __future__ import annotations
@@ -392,7 +392,7 @@ def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) 
     for family, noise in noises.items():
         L, right = _influences(influence, family)
         groups = influence.at.engine.measured[family]
-        time = np.concatenate([group.model.time for group in groups])[_in_time(groups, influence.at.values)]
+        time = np.concatenate([group.model.time for group in groups])[_used_in_time(groups, influence.at.values)]
         nominal = np.einsum("nri,nrj->ij", L, L)
         whole = noise.variance * (nominal + _correlated(L, noise.correlation[: len(L) - 1]))
         ratio = ratio_by_blocks(time, np.einsum("nrm,nr->nm", L, right), np.diag(whole))
@@ -405,13 +405,13 @@ def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) 
 
 def _residuals(groups: Sequence[Group], values: Values) -> Array:
     """Weighted residuals (n, r) of the measurements of several groups that count, in time order."""
-    return np.concatenate([g.weighted(g.evaluate(values)[0]) for g in groups])[_in_time(groups, values)]
+    return np.concatenate([g.weighted(g.evaluate(values)[0]) for g in groups])[_used_in_time(groups, values)]
 
 
 def _influences(influence: Influence, family: str) -> tuple[Array, Array]:
     """L (n, r, m) of a family's measurements that count, in time order, and minus their weighted residuals (n, r)."""
     groups = influence.at.engine.measured[family]
-    found, order = [influence.rows(group) for group in groups], _in_time(groups, influence.at.values)
+    found, order = [influence.rows(group) for group in groups], _used_in_time(groups, influence.at.values)
     return np.concatenate([each[0] for each in found])[order], np.concatenate([each[1] for each in found])[order]
 
 
@@ -486,7 +486,7 @@ def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
     return np.maximum(ratio, 1.0) if certain else np.ones(len(ratio))
 
 
-def _in_time(groups: Sequence[Group], values: Values) -> NDArray[np.intp]:
+def _used_in_time(groups: Sequence[Group], values: Values) -> NDArray[np.intp]:
     """The measurements of several groups that count, in order of time."""
     order = np.argsort(np.concatenate([group.model.time for group in groups]), kind="stable")
     return order[np.concatenate([group.inliers(values) for group in groups])[order]]

@@ -69,7 +69,7 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
 def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float) -> Estimate:
     """The solution with the map free, its prior as wide as the map.
 
-    What the recording does not determine `without` the map it does not with it.
+    Directions that are weak `without` the map keep their values.
     """
     compiled, solution, information = _solved(problem, error_map, estimate)
     chi_square, dof, rms = _tested(_rows(information, error_map)[1], error_map, ratio)
@@ -86,25 +86,26 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
     # Given the map the numbers move by -R_xx^-1 R_xc c; with its prior the information on c is R_cc' R_cc + 1 / p^2.
     gain = np.asarray(-np.linalg.lstsq(rows[:p, :p], rows[:p, p:-1], rcond=None)[0], dtype=float)
     others = [name for name, is_own in zip(information.names, own, strict=True) if not is_own]
-    gain = _along_strong(gain, others, posterior)
+    gain = _along_strong(_along_strong(gain, others, posterior), others, without)
     R = np.concatenate([root[:-1, :-1], np.eye(len(error_map.names)) / error_map.prior])
     spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
     at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
     shift = np.array([at[name] for name in estimate.names]) - estimate.values
     columns, rows_of = np.zeros((len(estimate.names), spread.shape[1])), [estimate.names.index(n) for n in others]
     columns[rows_of] = gain @ spread
-    shift[rows_of] = _along_strong(shift[rows_of, None], others, without)[:, 0]
+    weak = np.zeros_like(shift)
+    weak[rows_of] = shift[rows_of] - _along_strong(shift[rows_of, None], others, without)[:, 0]
     found = FoundMap(
         error_map,
         error_map.error(information.at[own]),
         chi_square,
         dof,
         estimate.names,
-        shift,
+        shift - weak,
         columns,
     )
     out = replace(found.applied(estimate), error_map=found)
-    return _with_history(out, compiled, posterior) if error_map.moves else out
+    return _with_history(out, compiled, posterior, weak) if error_map.moves else out
 
 
 def _along_strong(gain: Array, names: Sequence[str], posterior: Posterior) -> Array:
@@ -142,16 +143,21 @@ def _rows(information: SqrtInformation, error_map: ErrorMap) -> tuple[Array, Arr
     return rows, rows[-own.sum() - 1 :, -own.sum() - 1 :]
 
 
-def _with_history(estimate: Estimate, compiled: Compiled, posterior: Posterior) -> Estimate:
-    """Replace an estimate's history by that of the solution with the map: without it the map would show there."""
+def _with_history(estimate: Estimate, compiled: Compiled, posterior: Posterior, weak: Array) -> Estimate:
+    """Replace an estimate's history by that of the solution with the map: without it the map would show there.
+
+    The solution is off by `weak` (n,) along directions that are weak without the map.
+    """
     n = len(estimate.names)
     bias = smoothed(compiled, posterior, posterior.covariance)
     if bias is not None:
-        bias = History(bias.time, bias.values[:, :n], bias.sigmas[:, :n])
+        bias = History(bias.time, bias.values[:, :n] - weak, bias.sigmas[:, :n])
     history = estimate.posterior_history and posterior_history(compiled, posterior)
     if history is None:
         return replace(estimate, smoothed=bias)
-    own = PosteriorHistory(history.time, history.values[:, :n], history.covariance[:, :n, :n], history.steady[:n])
+    own = PosteriorHistory(
+        history.time, history.values[:, :n] - weak, history.covariance[:, :n, :n], history.steady[:n]
+    )
     wide = sigma_ratio(np.diag(own.covariance[-1]), np.diag(estimate.covariance))
     return replace(estimate, smoothed=bias, posterior_history=own, history=own.history.inflated(wide))
 

@@ -99,6 +99,9 @@ def test_a_map_moves_nothing_that_the_recording_does_not_determine() -> None:
     found = _session("los", 2e-4, 2, 12.0, carrier=carrier | {"pitch": [], "roll": []}).calibrate("batch", report=False)
     assert found.estimate.error_map is not None
     assert abs(found.parameters["delta_px"].value) < 0.01
+    history = found.estimate.posterior_history
+    assert history is not None
+    np.testing.assert_allclose(history.values[-1], found.estimate.values, atol=1e-6)
     assert np.abs(_errors(found)).max() < 3.0
 
 

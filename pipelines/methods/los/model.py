@@ -2,7 +2,8 @@
 
 The graph's states are tRm, the gyro's attitude in the frame of the target, at the pictures: gtsam's native AHRSFactor
 joins them, or with errors of the gyro GyroIncrementFactor; LosDirectionFactor ties them to the picture and the gimbal.
-Where a target stands is part of its first attitude, so a target found anew starts a new chain. Methods page, section 1.
+ThroughGimbalFactor wraps both where errors are variables. Where a target stands is part of its first attitude, so a
+target found anew starts a new chain. Methods page, section 1.
 """
 
 from __future__ import annotations
@@ -362,7 +363,7 @@ def _step(model: _Model, keyframes: range) -> Step:
         step.factors.extend(vector_prior(each, np.zeros(len(each.quantities))) for each in p.all)
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step, keyframes)
-    step.factors[:] = [_driving(model, factor) for factor in step.factors]
+    step.factors[:] = [_whitened(model, factor) for factor in step.factors]
     step.factors.extend(_picture_factors(model, keyframes))
     if chain.bias.nodes > 1 and model.parameters.sight is not None:
         # All pictures take it.
@@ -384,15 +385,15 @@ def _start_factor(model: _Model, k: int) -> Factor:
     return rotation_about(model.chain.state(k), initial, so3.matrix(initial) / sigmas[:, None])
 
 
-def _driving(model: _Model, factor: Factor) -> Factor:
-    """The factor; increments of the gyro, that drives the gimbal, with noise that its errors do not change."""
+def _whitened(model: _Model, factor: Factor) -> Factor:
+    """Wrap increments of the gyro so that errors of the gimbal leave their noise as it is; no other factor."""
     increments, sight, around = factor.process, model.parameters.sight, model.around
     if increments is None or sight is None or around is None or factor.family != "gyro":
         return factor
     at = np.searchsorted(model.chain.time, increments.model.time)
     errors, following = model.gimbal_errors, around.motion.following
-    driving = ThroughGimbalFactor(increments.model, model.angles[at], errors, following=following)
-    return replace(factor, process=driving.on(*increments.tied, model.parameters.angles.key, sight.key))
+    increment = ThroughGimbalFactor(increments.model, model.angles[at], errors, following=following)
+    return replace(factor, process=increment.on(*increments.tied, model.parameters.angles.key, sight.key))
 
 
 def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
@@ -421,7 +422,7 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str)
     bound: Model = rows_model
     if p.sight is not None:
         bound = ThroughGimbalFactor(
-            rows_model, model.angles[some], model.gimbal_errors, model.encoder[some], held=(1, 3)
+            rows_model, model.angles[some], model.gimbal_errors, model.encoder[some], error_blocks=(1, 3)
         )
         # From stamp to picture the bias has no time to matter but as a whole. Each keyframe's own, where it may walk
         # far, would follow the picture's noise, the better the larger the time offset, which would grow without bounds.
