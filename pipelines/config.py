@@ -72,10 +72,13 @@ def _override(given: object) -> tuple[str, Mapping[Any, Any]]:
     """Source and content of what overrides a recording's config; empty where there is nothing."""
     if given is None:
         return "", {}
+    if isinstance(given, Mapping):
+        try:
+            given = model().model_validate(dict(given))
+        except ValidationError as error:
+            raise InputError(f"config: {first_error(error, model())[1]}") from error
     if isinstance(given, Config):
         return "config", given.model_dump(exclude_unset=True)
-    if isinstance(given, Mapping):
-        return "config", given
     if not isinstance(given, str | Path):
         raise InputError(f"config: a file, an alidade.Config or its keys are needed, not {type(given).__name__}")
     content = _read(read_bytes(Path(given), MAX_YAML_BYTES), str(given))

@@ -47,7 +47,8 @@ def _at_random(graph: Problem, key: int, steps: Sequence[Step]) -> tuple[gtsam.V
 
 def _models(steps: Sequence[Step], kind: type[Any]) -> list[Any]:
     bound = [factor.measurement for step in steps for factor in step.factors if factor.measurement is not None]
-    return [each.model for each in bound if isinstance(each.model, kind)]
+    models = [getattr(each.model, "model", each.model) for each in bound]
+    return [each for each in models if isinstance(each, kind)]
 
 
 @pytest.mark.parametrize("skew", [0.0, 0.05])
