@@ -548,7 +548,7 @@ def test_the_command_finds_it_by_itself_and_says_what_there_is(tmp_path: Path, a
 def test_an_accelerometer_alone_if_asked_for(tmp_path: Path) -> None:
     simulated = _simulated(RESTING, 5)
     _write(tmp_path / "s.mcap", simulated.data, mag=False)
-    with pytest.raises(InputError, match="serves only a method that is asked for: --method cube or --method tumble"):
+    with pytest.raises(InputError, match="topics alone do not select a method; use --method cube or --method tumble"):
         Session.read(open_recording(tmp_path / "s.mcap"), None, None)
     calibration = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None).calibrate()
     for name, parameter in calibration.parameters.items():
