@@ -53,6 +53,7 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
+from alidade.pipelines.recording.decoding import ENCODING
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.plausibility import HELD
@@ -612,8 +613,9 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
             "`--auto-columns` uses the proposal"
         )
     raise InputError(
-        f"{recording.path}: no usable topics for any method; {recording.there()}; `alidade info` lists what "
-        "each method needs, `topics:` in the config renames" + (f"; nearest is {nearest}" if nearest else "")
+        f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
+        f"({ENCODING}): `alidade info` lists them for each method, `topics:` in the config can rename"
+        + (f"; nearest is {nearest}" if nearest else "")
     )
 
 

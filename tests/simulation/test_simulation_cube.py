@@ -158,7 +158,7 @@ def test_given_attitudes_come_after_the_random_ones() -> None:
         ("{poses: 0}", "poses or attitudes are needed"),
         ("{camera_rate_hz: 5.0}", "unknown key camera_rate_hz"),
         ("{camera: {rate_hz: 5.0, ocluded: 0.1}}", r"unknown key camera\.ocluded; the nearest known key is occluded"),
-        ("{reference: false}", r"reference: .*ReferenceAttitude"),
+        ("{reference: false}", r"reference: must be a section of keys, not False"),
     ],
 )
 def test_attitudes_that_are_none(tmp_path: Path, text: str, message: str) -> None:
