@@ -25,6 +25,7 @@ from alidade.factors.model import (
     Keys,
     Model,
     Residuals,
+    WrappedModel,
     check,
     dimension,
     select_rows,
@@ -238,7 +239,7 @@ def jacobian_factor(keys: list[int], widths: list[int], augmented: Array) -> gts
 
 
 @dataclass(frozen=True)
-class _Whitened(Model):
+class _Whitened(WrappedModel):
     """A model whose residuals are whitened here.
 
     Attributes:
@@ -246,7 +247,6 @@ class _Whitened(Model):
         R: (m, m) square root of the information of one measurement.
     """
 
-    model: Model
     R: Array
 
     @classmethod
@@ -258,18 +258,6 @@ class _Whitened(Model):
         if noise.dim() != model.rows:
             raise ValueError(f"{name}: one measurement has {model.rows} rows, the noise model {noise.dim()}")
         return cls(model, noise.R())
-
-    @property
-    def time(self) -> Array:
-        return self.model.time
-
-    @property
-    def rows(self) -> int:
-        return self.model.rows
-
-    @property
-    def blocks(self) -> tuple[Block, ...]:
-        return self.model.blocks
 
     def __call__(self, *blocks: Array) -> Residuals:
         residuals, linearize = self.model(*blocks)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from alidade.factors.model import Array, Block, Model, Residuals
+from alidade.factors.model import Array, Block, Residuals, WrappedModel
 
 
 @dataclass(frozen=True)
-class ErrorMapFactor(Model):
+class ErrorMapFactor(WrappedModel):
     """A model of measurements with an error that is linear in known functions of where each was made.
 
     The first `axes` numbers of measurement i are larger by e_i = sum_j f_ij c_j, so that its residual is that of the
@@ -24,25 +24,9 @@ class ErrorMapFactor(Model):
         axes: how many numbers of a measurement have such errors.
     """
 
-    model: Any
     functions: Array
     axes: int
     stacked: ClassVar = ("model", "functions")
-
-    @property
-    def time(self) -> Array:
-        """(n,) s."""
-        return np.asarray(self.model.time)
-
-    @property
-    def rows(self) -> int:
-        """Rows of the model."""
-        return int(self.model.rows)
-
-    @property
-    def sqrt_information(self) -> Array:
-        """Square-root information of the wrapped model, (n, m, m)."""
-        return np.asarray(self.model.sqrt_information)
 
     @property
     def blocks(self) -> tuple[Block, ...]:

@@ -6,7 +6,7 @@ A model knows nothing of gtsam; `on` ties it to the variables of a graph.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
 from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
@@ -124,6 +124,37 @@ class Model:
         from alidade.factors.bridge import BoundModel
 
         return BoundModel(self, keys, loss, noise)
+
+
+@dataclass(frozen=True)
+class WrappedModel(Model):
+    """A model made of another one, with its measurements, rows and blocks unless it says otherwise.
+
+    Attributes:
+        model: the other one.
+    """
+
+    model: Any
+
+    @property
+    def time(self) -> Array:
+        """(n,) s."""
+        return np.asarray(self.model.time)
+
+    @property
+    def rows(self) -> int:
+        """Rows of a measurement."""
+        return int(self.model.rows)
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """What the variables are."""
+        return tuple(self.model.blocks)
+
+    @property
+    def sqrt_information(self) -> Array:
+        """Square-root information (n, m, m) of the measurements, where the other one has it."""
+        return np.asarray(self.model.sqrt_information)
 
 
 def width(block: Block) -> int:

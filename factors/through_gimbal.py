@@ -21,12 +21,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from alidade.factors.los import SIGHT_ERRORS
-from alidade.factors.model import Array, Block, Model, Residuals, Stacked, dimension
+from alidade.factors.model import Array, Block, Residuals, Stacked, WrappedModel, dimension
 
 # The turns of gimbal and camera, from the gyro on.
 _AZIMUTH, _ELEVATION, _NONPERPENDICULARITY, _COLLIMATION, _ROLL = range(5)
@@ -104,8 +104,8 @@ class GimbalMap(Stacked):
 
 
 @dataclass(frozen=True)
-class ThroughGimbalFactor(Model):
-    """A model of increments or pictures whose noise is the same whatever the errors of the gimbal are.
+class ThroughGimbalFactor(WrappedModel):
+    """Increments of a gyro, or pictures from its gimbal, whitened so that the gimbal's errors do not change their noise.
 
     Blocks: those of the model and, unless these are among them, those of the errors.
 
@@ -119,7 +119,6 @@ class ThroughGimbalFactor(Model):
         error_blocks: which of the model's blocks hold the errors; empty: they are appended after the model's.
     """
 
-    model: Any
     gimbal: Array
     errors: GimbalErrors | GimbalMap
     encoder: Array | None = None
@@ -127,21 +126,6 @@ class ThroughGimbalFactor(Model):
     error_blocks: tuple[int, ...] = ()
     shapes: ClassVar = {"gimbal": (2,), "encoder": ()}
     stacked: ClassVar = ("model", "gimbal", "errors", "encoder")
-
-    @property
-    def time(self) -> Array:
-        """(n,) s."""
-        return np.asarray(self.model.time)
-
-    @property
-    def rows(self) -> int:
-        """Rows of the model."""
-        return int(self.model.rows)
-
-    @property
-    def sqrt_information(self) -> Array:
-        """Of a model of pictures."""
-        return np.asarray(self.model.sqrt_information)
 
     @property
     def blocks(self) -> tuple[Block, ...]:
