@@ -152,10 +152,7 @@ class ErrorMap:
         model = None if bound is None else self.of_model(factor.family, bound.model)
         if bound is None or model is None:
             return factor
-        mapped = model.on(*bound.tied, key, loss=bound.loss)
-        if factor.measurement is None:
-            return replace(factor, process=mapped)
-        return replace(factor, measurement=mapped)
+        return factor.rebound(model.on(*bound.tied, key, loss=bound.loss))
 
 
 @dataclass(frozen=True, eq=False)

@@ -246,6 +246,10 @@ class Factor:
         """The vectorised model behind the factor, measurement or process."""
         return self.measurement or self.process
 
+    def rebound(self, bound: BoundModel) -> Factor:
+        """The factor with another vectorised model behind it."""
+        return replace(self, process=bound) if self.measurement is None else replace(self, measurement=bound)
+
     def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
         """The factor linearised about the values."""
         return self.factor.linearize(values) if self.bound is None else self.bound.linearized(values)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import cast
 
 import gtsam
@@ -261,9 +260,7 @@ def _weighed(factor: Factor, levels: Sequence[Level]) -> Factor:
     bound = factor.bound
     if bound is not None:
         stated = np.ones((len(bound.model.time), bound.model.rows)) if bound.weights is None else bound.weights
-        weighed = bound.weighed(level_weights(stated, own, factor.beside, factor.fixed))
-        is_process = factor.measurement is None
-        return replace(factor, process=weighed) if is_process else replace(factor, measurement=weighed)
+        return factor.rebound(bound.weighed(level_weights(stated, own, factor.beside, factor.fixed)))
     native = cast(gtsam.NoiseModelFactor, factor.factor)
     for level in own:
         noise = cast(gtsam.noiseModel.Gaussian, native.noiseModel())

@@ -393,7 +393,7 @@ def _whitened(model: _Model, factor: Factor) -> Factor:
     at = np.searchsorted(model.chain.time, increments.model.time)
     errors, following = model.gimbal_errors, around.motion.following
     increment = ThroughGimbalFactor(increments.model, model.angles[at], errors, following=following)
-    return replace(factor, process=increment.on(*increments.tied, model.parameters.angles.key, sight.key))
+    return factor.rebound(increment.on(*increments.tied, model.parameters.angles.key, sight.key))
 
 
 def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
