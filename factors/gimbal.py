@@ -203,12 +203,10 @@ def _following(gimbal: GimbalPath, commanded: GimbalPath) -> float:
     t = np.arange(*ends, _FOLLOWING_INTERVAL)
     read, asked = (np.diff(path.at(t), 3, axis=0).ravel() for path in (gimbal, commanded))
     moving = asked != 0.0
-    ratio, weight = read[moving] / asked[moving], np.abs(asked[moving])
-    order = np.argsort(ratio)
-    total = np.cumsum(weight[order])
-    if not len(total):
+    if not moving.any():
         return 0.0
-    return float(np.clip(ratio[order][np.searchsorted(total, 0.5 * total[-1])], 0.0, 1.0))
+    ratio, weights = read[moving] / asked[moving], np.abs(asked[moving])
+    return float(np.clip(np.quantile(ratio, 0.5, weights=weights, method="inverted_cdf"), 0.0, 1.0))
 
 
 def _smoothing(at: Array, t: Array, values: Array) -> float:

@@ -337,7 +337,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _trajectory(form: TableForm) -> series.PoseSeries | None:
-    """Read a table as a TUM trajectory: eight columns apart by blanks, the last four a unit quaternion; else None."""
+    """Read a TUM trajectory, eight columns separated by blanks, the last four a unit quaternion; else None."""
     if form.delimiter != " " or len(form.names) != len(_TUM):
         return None
     _, first = next(_rows(form), (0, []))

@@ -487,7 +487,7 @@ def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
 
 
 def _used_in_time(groups: Sequence[Group], values: Values) -> NDArray[np.intp]:
-    """The measurements of several groups that count, in order of time."""
+    """Indices (n,) of the measurements of several groups that are used, in order of time."""
     order = np.argsort(np.concatenate([group.model.time for group in groups]), kind="stable")
     return order[np.concatenate([group.inliers(values) for group in groups])[order]]
 

@@ -152,7 +152,7 @@ def _graduated(
 
 
 def _undecided(engine: Linearization, residuals: Sequence[Array]) -> float:
-    """Share of measurements whose weight under a surrogate is neither 0 nor 1, by the residuals of each group."""
+    """Share of measurements whose robust weight is neither 0 nor 1, by the whitened residuals of each group."""
     each = zip(engine.groups, residuals, strict=True)
     whole = np.concatenate([group.used(own) for group, own in each if group.loss is not None])
     return float(((whole > 0.0) & (whole < 1.0)).mean())
