@@ -105,7 +105,7 @@ class GimbalMap(Stacked):
 
 @dataclass(frozen=True)
 class ThroughGimbalFactor(WrappedModel):
-    """Increments of a gyro, or pictures from its gimbal, whitened so that the gimbal's errors do not change their noise.
+    """Gyro increments, or pictures from a gimbal, whitened so that errors of the gimbal do not change their noise.
 
     Blocks: those of the model and, unless these are among them, those of the errors.
 
