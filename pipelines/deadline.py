@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -27,7 +27,9 @@ LEAST_S, SHARE = 60.0, 0.1
 @dataclass
 class _Deadline:
     limit: float  # s
-    until: float  # time.monotonic()
+    until: float  # by the clock
+    clock: Callable[[], float]
+    usual: bool = False
     stopped: list[str] = field(default_factory=list)
 
 
@@ -35,30 +37,43 @@ _deadline: ContextVar[_Deadline | None] = ContextVar("deadline", default=None)
 
 
 @contextmanager
-def within(limit: float | None) -> Iterator[None]:
-    """The block has so many seconds from now; None sets no deadline, and leaves one that is set."""
-    if limit is None:
-        yield
-        return
-    token = _deadline.set(_Deadline(limit, time.monotonic() + limit))
+def _set(deadline: _Deadline | None) -> Iterator[None]:
+    """None leaves the deadline that is set."""
+    token = _deadline.set(deadline or _deadline.get())
     try:
         yield
     finally:
         _deadline.reset(token)
 
 
-@contextmanager
-def usual(duration: float, online: bool = False) -> Iterator[None]:
+def within(limit: float | None) -> AbstractContextManager[None]:
+    """The block has so many seconds from now; None sets no deadline, and leaves one that is set."""
+    return _set(None if limit is None else _Deadline(limit, time.monotonic() + limit, time.monotonic))
+
+
+def usual(duration: float, online: bool = False) -> AbstractContextManager[None]:
     """The usual time for a recording of so many seconds, where no deadline is set."""
-    unset = _deadline.get() is None
-    with within(max(LEAST_S, duration if online else SHARE * duration) if unset else None):
-        yield
+    if _deadline.get() is not None:
+        return _set(None)
+    limit = max(LEAST_S, duration if online else SHARE * duration)
+    return _set(_Deadline(limit, time.monotonic() + limit, time.monotonic, usual=True))
+
+
+def of_processor() -> AbstractContextManager[None]:
+    """The usual limit, in the block, is on what this thread computes: that a machine is busy ends no solution.
+
+    A limit that was set is one by the clock on the wall.
+    """
+    deadline = _deadline.get()
+    if deadline is None or not deadline.usual:
+        return _set(None)
+    return _set(replace(deadline, until=time.thread_time() + deadline.limit, clock=time.thread_time))
 
 
 def passed(what: str = "") -> bool:
     """Whether there is no time left; `what` names what ends for that."""
     deadline = _deadline.get()
-    if deadline is None or time.monotonic() < deadline.until:
+    if deadline is None or deadline.clock() < deadline.until:
         return False
     if what and what not in deadline.stopped:
         deadline.stopped.append(what)

@@ -461,11 +461,12 @@ class Session:
             from alidade.pipelines.solvers.incremental import solve_incremental
 
             shown = replace(problem, steps=partial(_shown, problem, self.facts.duration_s))
-            return solve_incremental(shown, window), problem
+            with deadline.of_processor():
+                return solve_incremental(shown, window), problem
         from alidade.pipelines.solvers.batch import solve_batch
 
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
-        with progress.doing("solving"):
+        with progress.doing("solving"), deadline.of_processor():
             changed = self._changed() if report else ()
             estimate = solve_batch(
                 problem,

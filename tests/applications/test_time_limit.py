@@ -64,6 +64,25 @@ def test_what_the_command_says_goes_before_the_usual(clock: list[float]) -> None
         assert not deadline.passed()
 
 
+def test_a_busy_machine_ends_no_solution_and_a_stated_limit_is_by_the_clock(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used = [3.0]
+    monkeypatch.setattr(time, "thread_time", lambda: used[0])
+    with deadline.usual(30.0):
+        with deadline.of_processor():
+            clock[0] += 1000.0
+            used[0] += 59.0
+            assert not deadline.passed()
+            used[0] += 1.0
+            assert deadline.passed("the solution")
+        assert deadline.passed()
+        assert "60 s stopped the solution" in deadline.stopped()
+    with deadline.within(60.0), deadline.of_processor():
+        clock[0] += 60.0
+        assert deadline.passed()
+
+
 def test_items_end_with_the_time_and_it_is_said_where(clock: list[float]) -> None:
     with deadline.within(2.5):
         taken = []
