@@ -12,8 +12,8 @@ residuals are as white as the samples; the bias of second order, noise along a c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -122,6 +122,16 @@ class StrengthFactor(Model):
             return by_numbers, -scale[..., None], *by_slope(by_numbers, self.drivers)
 
         return ((distance - self.excess) * weight)[:, None], jacobians
+
+    def without_noise(self, triads: Array, strength: Array, *drift: Any) -> StrengthFactor:
+        """Return the factor of the nearest readings on the ellipsoid, to first order in their distance from it.
+
+        Where noise is, the slope is another one: the Jacobian at a reading and its residual are correlated.
+        """
+        K, length, direction = _polar(self.raw, drifted(triads, self.drivers, drift), self.symmetric)
+        gradient = np.einsum("nij,ni->nj", K, direction)
+        excess = (length - strength[:, 0]) / np.maximum((gradient**2).sum(axis=1), _LEAST)
+        return replace(self, raw=self.raw - excess[:, None] * gradient)
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,10 @@ class Model:
         def __call__(self, *blocks: Any, **_: Any) -> Residuals:
             """Residuals and Jacobians."""
 
+    def without_noise(self, *_: Any) -> Model:
+        """Return the model of the nearest measurements whose residuals are zero, if noise enters the Jacobians."""
+        return self
+
     def on(
         self,
         *keys: Keys,

@@ -19,8 +19,9 @@ correlated by exp(-k / T), has the restricted likelihood (Harville, J. Am. Stat.
 
     -2 log L = (n - m) log q + log det V + log det Q'V^-1 Q,    q = min_x (y - Q x)'V^-1 (y - Q x)
 
-V = (1 - f) I + f exp(-|i - j| / T), Q an orthonormal basis of what the m numbers move the n residuals y by. But for
-both ends the cosine transform makes V diagonal. v = q / r, r the redundancy of the measurements that are used: what
+V = (1 - f) I + f exp(-|i - j| / T), Q an orthonormal basis of what the m numbers move the n residuals y by, at
+measurements without their noise: with it Q reproduces y, beside a constant so large that only a long T allows it. But
+for both ends the cosine transform makes V diagonal. v = q / r, r the redundancy of the measurements that are used: what
 states and numbers leave of their count. Weights correspond to v = 1; a smaller estimate means that states absorbed
 correlated noise, so v is at least 1.
 """
@@ -408,16 +409,23 @@ def _residuals(groups: Sequence[Group], values: Values) -> Array:
     return np.concatenate([g.weighted(g.evaluate(values)[0]) for g in groups])[_used_in_time(groups, values)]
 
 
-def _influences(influence: Influence, family: str) -> tuple[Array, Array]:
-    """L (n, r, m) of a family's measurements that count, in time order, and minus their weighted residuals (n, r)."""
-    groups = influence.at.engine.measured[family]
-    found, order = [influence.rows(group) for group in groups], _used_in_time(groups, influence.at.values)
+def _influences(influence: Influence, family: str, noise: bool = True) -> tuple[Array, Array]:
+    """L (n, r, m) of a family's measurements that count, in time order, and minus their weighted residuals (n, r).
+
+    Args:
+        influence: of the residuals.
+        family: of measurements.
+        noise: at the measurements; False: at those without their noise.
+    """
+    groups, values = influence.at.engine.measured[family], influence.at.values
+    found = [influence.rows(group if noise else group.without_noise(values)) for group in groups]
+    order = _used_in_time(groups, values)
     return np.concatenate([each[0] for each in found])[order], np.concatenate([each[1] for each in found])[order]
 
 
 def _basis(influence: Influence, family: str) -> Array:
-    """Orthonormal basis (n, r, k) of what the numbers move the residuals of a family by."""
-    L, _ = _influences(influence, family)
+    """Orthonormal basis (n, r, k) of what the numbers move the residuals of a family by, if measured without noise."""
+    L, _ = _influences(influence, family, noise=False)
     flat = (L / influence.reported.scale).reshape(-1, L.shape[2])
     squares, axes = np.linalg.eigh(flat.T @ flat)
     some = squares > _LEAST_SQUARE * squares.max(initial=0.0)

@@ -117,12 +117,17 @@ class Group:
 
     def evaluate(self, values: Values) -> Residuals:
         """Whitened residuals (n, m), unweighted, and their Jacobians on demand."""
-        n = len(self.model.time)
-        blocks = []
+        return self.model(*self._gathered(values))
+
+    def without_noise(self, values: Values) -> Group:
+        """Return the group at measurements whose residuals are zero, where its Jacobians have noise of these."""
+        return replace(self, model=self.model.without_noise(*self._gathered(values)))
+
+    def _gathered(self, values: Values) -> Iterator[Array]:
+        """Yield the blocks of variables (n, width) that the model is called with."""
         for block, rows in self.gather:
             array = values.arrays[block][rows]
-            blocks.append(np.broadcast_to(array, (n, array.shape[1])))
-        return self.model(*blocks)
+            yield np.broadcast_to(array, (len(self.model.time), array.shape[1]))
 
     @property
     def all_weights(self) -> Array:
