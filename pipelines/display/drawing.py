@@ -42,7 +42,7 @@ class Drawing:
         self._parts: list[str] = []
 
     def line(self, points: Iterable[Array], lit: bool = False, width: float = 1.5, arrows: str = "") -> None:
-        """Through points (3,); `arrows` at its "start", its "end" or both."""
+        """Draw a line through points (3,); `arrows` at its "start", its "end" or both."""
         flat = self._flat(np.array(list(points)))
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in flat)
         self._parts.append(
@@ -65,7 +65,7 @@ class Drawing:
         )
 
     def arc(self, axis: Array, middle: Array, radius: float, degrees: tuple[float, float], arrows: str) -> None:
-        """An arrow about an axis (3,) around `middle` (3,); 0 deg is where the arc is nearest to the eye."""
+        """Draw an arc about an axis (3,) with the centre `middle` (3,); 0 deg is where it is nearest to the eye."""
         towards = self.eye - (self.eye @ axis) * axis
         towards = towards / np.linalg.norm(towards)
         across = np.cross(axis, towards)
@@ -81,7 +81,7 @@ class Drawing:
         )
 
     def word_on(self, middle: Array, along: Array, up: Array, text: str, lit: bool = False) -> None:
-        """A word that lies in a plane: it runs along one direction (3,), its top towards another."""
+        """Write a word in a plane: it runs along one direction (3,), its top towards another (3,)."""
         ((x, y),), right, down = self._flat(middle[None]), self.projection @ along, -self.projection @ up
         matrix = " ".join(f"{v:.3f}" for v in (*right, *down, x, y))
         self._parts.append(
@@ -90,7 +90,7 @@ class Drawing:
         )
 
     def svg(self, label: str) -> str:
-        """The picture; the label is read out to whoever does not see it."""
+        """Return the picture as SVG; screen readers read the label."""
         half = 0.5 * _SIZE
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{-half:g} {-half:g} {_SIZE:g} {_SIZE:g}" role="img" '
@@ -98,7 +98,7 @@ class Drawing:
         )
 
     def _flat(self, points: Array) -> Array:
-        """(n, 2) on the picture of points (n, 3)."""
+        """Project points (n, 3) onto the picture (n, 2)."""
         return _UNIT * np.asarray(points) @ self.projection.T
 
     def _head(self, tip: Array, along: Array, lit: bool, width: float) -> None:
@@ -116,7 +116,7 @@ class Drawing:
 
 @cache
 def swaying(axes: str, who: str, size: tuple[float, float, float] = (0.8, 1.1, 0.45)) -> str:
-    """A body swaying about some of its axes.
+    """Return an SVG picture of a body that sways about some of its axes.
 
     Args:
         axes: of "xyz".
@@ -129,7 +129,7 @@ def swaying(axes: str, who: str, size: tuple[float, float, float] = (0.8, 1.1, 0
 
 
 def resting(nRb: Array, compass: bool = False, lit: Array | None = None) -> str:
-    """A cube resting in an attitude nRb (4,), its sides named; an arrow goes up, and with a compass one to the north.
+    """Return an SVG picture of a cube at rest in the attitude nRb (4,), with an arrow up and maybe one north.
 
     `lit` (3,) is a direction in the body to be drawn out of the cube.
     """
@@ -154,7 +154,7 @@ def resting(nRb: Array, compass: bool = False, lit: Array | None = None) -> str:
 
 
 def along(direction: Array, name: str) -> str:
-    """The device in its own axes, and an arrow along a direction (3,) in them, with its name."""
+    """Return an SVG picture of the device in its own axes, with a named arrow along a direction (3,)."""
     unit = direction / np.linalg.norm(direction)
     out = Drawing(_BEFORE)
     hidden = bool(unit @ out.eye < 0.0)
@@ -173,7 +173,7 @@ def along(direction: Array, name: str) -> str:
 
 
 def covered(directions: Array, what: str) -> str:
-    """Which directions (n, 3) of a body there were: the upper and the lower half of all of them, each seen from above.
+    """Return an SVG map of covered directions (n, 3) of a body: upper and lower half of the sphere, seen from above.
 
     Lambert's equal-area map; painted is what is within 30 deg of a direction that was there, an ellipse in good
     approximation.
@@ -218,7 +218,7 @@ def covered(directions: Array, what: str) -> str:
 
 
 def _side(out: Drawing, nRb: Array, normal: Array, name: str, lit: bool) -> None:
-    """A side of a cube in the attitude nRb with its name, as upright as it can stand."""
+    """Draw a side of a cube in the attitude nRb (4,), with its name as upright as possible."""
     edges = so3.rotate(nRb, np.delete(_AXES, _NAMES.index(name[1]), axis=0))
     out.face(np.array([normal + a * edges[0] + b * edges[1] for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]), lit)
     tops = np.vstack([edges, -edges])
@@ -227,7 +227,7 @@ def _side(out: Drawing, nRb: Array, normal: Array, name: str, lit: bool) -> None
 
 
 def _block_with_axes(out: Drawing, half: Array, lit: str = "") -> None:
-    """A block along the axes, which come out of its sides towards the eye; about the lit ones go arrows both ways."""
+    """Draw a block with its three axes as arrows towards the eye; lit axes have arrows of rotation both ways."""
 
     def draw(k: int) -> None:
         axis, is_lit = _AXES[k], _NAMES[k] in lit

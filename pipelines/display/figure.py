@@ -142,7 +142,7 @@ class Figure:
         alpha: float = 1.0,
         texts: Sequence[str] = (),
     ) -> None:
-        """Points (n,), thinned where they are very many and have no texts."""
+        """Draw points (n,), thinned where they are very many and have no texts."""
         some = slice(None) if texts else thin(np.size(x))
         self._add("points", {"x": x, "y": y}, some, color, name, size=size, shape=shape, alpha=alpha, texts=texts)
 
@@ -157,11 +157,11 @@ class Figure:
         width: float = 1.5,
         shown: bool = True,
     ) -> None:
-        """A line through points (n,), thinned; it is broken where y is not a number."""
+        """Draw a line through points (n,), thinned; the line is broken where y is not a number."""
         self._add("line", {"x": x, "y": y}, thin(np.size(x)), color, name, shown, size=width, dash=dash)
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str, name: str = "") -> None:
-        """A band between two lines (n,), thinned; it belongs to the line of that name."""
+        """Draw a band between two lines (n,), thinned; the band belongs to the line called `name`."""
         columns = {"x": x, "low": low, "high": high}
         self._add("band", columns, thin(2 * np.size(x)), color, name, False, alpha=0.2)
 
@@ -181,7 +181,7 @@ class Figure:
         self._add("boxes", columns, slice(None), color, name, alpha=alpha, texts=texts)
 
     def bars(self, heights: ArrayLike, name: str, color: str, place: tuple[int, int] = (0, 1)) -> None:
-        """A bar (n,) at each of the x_labels: the i-th of so many that stand side by side there."""
+        """Draw bars (n,) at the x_labels; `place` (i, count) is that of the i-th of `count` bars side by side."""
         heights = np.asarray(heights, dtype=float)
         i, count = place
         left = np.arange(len(heights)) - 0.4 + 0.8 * i / count
@@ -189,7 +189,7 @@ class Figure:
         self.boxes(left, left + 0.8 / count, zero, heights, name, color, self.x_labels)
 
     def segments(self, x: ArrayLike, y: ArrayLike, x1: ArrayLike, y1: ArrayLike, color: str, name: str = "") -> None:
-        """Lines (n,) from x, y to x1, y1; they belong to the points of that name."""
+        """Draw lines (n,) from (x, y) to (x1, y1), which belong to the points called `name`."""
         self._add("segments", {"x": x, "y": y, "x1": x1, "y1": y1}, slice(None), color, name, False)
 
     def levels(self, y: ArrayLike, color: str = "soft", dash: Dash = "dotted", name: str = "") -> None:
@@ -205,14 +205,14 @@ class Figure:
         self._add("text", {"x": x, "y": y}, slice(None), "ink", "", False, texts=texts)
 
     def heat(self, values: Array, numbers: bool) -> None:
-        """A map of values (rows, columns) from -1 to 1 at the y_labels and x_labels, maybe with numbers in it."""
+        """Draw a map of values (rows, columns) from -1 to 1 at the y_labels and x_labels; `numbers` writes them in."""
         rows, columns = np.indices(values.shape)
         texts = [f"{v:.1f}" for v in values.ravel()] if numbers else ()
         places = {"x": columns.ravel(), "y": rows.ravel(), "value": values.ravel()}
         self._add("heat", places, slice(None), "ink", "", False, texts=texts)
 
     def patches(self, outlines: Array, values: Array, color: str, texts: Sequence[str]) -> None:
-        """Polygons (n, corners, 2), the darker the larger their values (n,)."""
+        """Draw polygons (n, corners, 2), darker for larger values (n,)."""
         gap = np.full((len(outlines), 1, 2), np.nan)
         at = np.concatenate([outlines, gap], axis=1).reshape(-1, 2)
         self._add(
@@ -258,7 +258,7 @@ class Plot:
 
     @property
     def legend(self) -> tuple[Mark, ...]:
-        """The first mark of each name that the legend has."""
+        """First mark of each name that the legend shows."""
         marks: dict[str, Mark] = {}
         for mark in (mark for figure in self.figures for mark in figure.marks if mark.shown):
             marks.setdefault(mark.name, mark)
@@ -266,15 +266,15 @@ class Plot:
 
     @property
     def broad(self) -> bool:
-        """Whether it takes the whole width of a page."""
+        """Whether the plot takes the whole width of a page."""
         return bool(self.beside) or self.figure.height > _BROAD_PX
 
 
 def thin(count: int) -> slice:
-    """Every n-th of so many points, so that no mark has more than a few thousand."""
+    """Return the slice that thins so many points to a few thousand at most."""
     return slice(None, None, max(1, -(-count // _MOST_POINTS)))
 
 
 def milliseconds(dates: Iterable[str | None]) -> Array:
-    """ISO dates (n,) as the datetime scale has them, ms since 1970 UTC; nan where there is none."""
+    """Convert ISO dates (n,) to ms since 1970 UTC, as the datetime scale needs; NaN for None."""
     return np.array([1e3 * as_date(each).timestamp() if each else np.nan for each in dates])

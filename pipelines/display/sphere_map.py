@@ -14,7 +14,7 @@ _DIRECTIONS = 1500
 
 
 def described(direction: object) -> str:
-    """A direction (3,) in words: the axis that it is nearest to, and where it leans."""
+    """Return a direction (3,) in words: the nearest axis, and towards which axis the direction leans."""
     unit = np.asarray(direction, dtype=float) / np.linalg.norm(np.asarray(direction, dtype=float))
     first, second = np.argsort(-np.abs(unit))[:2]
     lean = np.rad2deg(np.arccos(np.clip(abs(unit[first]), 0.0, 1.0)))
@@ -23,19 +23,19 @@ def described(direction: object) -> str:
 
 
 def widest_gap(directions: Array) -> tuple[float, Array]:
-    """Angle, rad, from the direction (3,) that is farthest from all unit vectors (n, 3) to the nearest of them."""
+    """Return the radius, rad, of the widest gap between unit vectors (n, 3), and the direction (3,) at its centre."""
     away = _distances(directions)
     widest = int(np.argmax(away))
     return float(away[widest]), _SPHERE[widest]
 
 
 def share_near(directions: Array) -> float:
-    """Share of the sphere's area near some directions."""
+    """Share of the sphere's area that lies within 30 deg of some of the directions (n, 3)."""
     return float(np.mean(_distances(directions) <= _GAPS[0]))
 
 
 def sphere_map(directions: Array, names: list[str], what: str) -> Figure:
-    """A map with unit vectors (n, 3) of the body.
+    """Return a map of unit vectors (n, 3) of the body, with the gaps between them.
 
     Args:
         directions: as above.
@@ -76,7 +76,7 @@ def _distances(directions: Array) -> Array:
 
 
 def _map(directions: Array) -> Array:
-    """Places (n, 2) of directions (n, 3) on Hammer's equal-area map, +x in the middle, +z on top."""
+    """Project directions (n, 3) to places (n, 2) on Hammer's equal-area map, +x in the middle, +z on top."""
     longitude = np.arctan2(directions[:, 1], directions[:, 0])
     sine = np.clip(directions[:, 2], -1.0, 1.0)
     cosine = np.sqrt(1.0 - sine**2)

@@ -16,7 +16,7 @@ _ANGLES = (15.0, 30.0, 45.0, 90.0)
 
 
 def svg(figure: Figure) -> str:
-    """A figure with axes; the y axis begins at 0 where nothing is below."""
+    """Return a figure with axes as SVG; the y axis begins at 0 unless values are below."""
     return _Drawing(figure).markup()
 
 
@@ -95,7 +95,7 @@ class _Drawing:
 
 
 def ticks(low: float, high: float, count: int, angles: bool = False) -> list[tuple[float, str]]:
-    """Round places between two ends with their texts, at most about so many; of angles multiples of 15 deg."""
+    """Return at most `count` round values between two limits, with their texts; of angles multiples of 15 deg."""
     steps = _ANGLES if angles and high - low > _ANGLES[0] * 2 else ()
     base = 10.0 ** np.floor(np.log10((high - low) / count))
     step = float(next(s for s in (*steps, *(m * base for m in _STEPS)) if (high - low) / s <= count))
@@ -107,7 +107,7 @@ def ticks(low: float, high: float, count: int, angles: bool = False) -> list[tup
 
 
 def interval_bar(interval: Interval) -> str:
-    """A dark bar of +-2 sigma over a light one of +-2 required, 84 x 14 px; a triangle points at the truth."""
+    """Return an SVG bar of +-2 sigma over one of +-2 required, 84 x 14 px; a triangle marks the truth."""
     if not interval.sigma > 0.0:
         return ""
     width, half = 84.0, 36.0

@@ -31,7 +31,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Interval:
-    """A sigma against the one required, drawn as bars of +-2 about the value; one unit for all numbers.
+    """Sigma beside the required one, drawn as bars of +-2 about the value; all numbers in one unit.
 
     Attributes:
         sigma: standard deviation.
@@ -95,15 +95,15 @@ class Table:
 
     @property
     def heads(self) -> tuple[Column, ...]:
-        """The columns, texts made columns."""
+        """Columns of the table; plain texts become Column."""
         return tuple(Column(each) if isinstance(each, str) else each for each in self.columns)
 
     @property
     def cells(self) -> tuple[tuple[Cell, ...], ...]:
-        """The rows, texts made cells."""
+        """Rows of the table; plain texts become Cell."""
         return tuple(tuple(Cell(each) if isinstance(each, str) else each for each in row) for row in self.rows)
 
     @property
     def is_folded(self) -> bool:
-        """Whether a page collapses it."""
+        """Whether a page collapses the table."""
         return self.most_rows is not None and len(self.rows) > self.most_rows

@@ -35,13 +35,13 @@ _FINE_UNITS = {**_UNITS, "rad": ("arcsec", _DEG * 3600.0), "rad/s": ("deg/h", _D
 
 
 def human_unit(quantity: Quantity) -> tuple[str, float]:
-    """The unit to show a quantity in, empty for a plain number, and what to multiply its SI number by."""
+    """Return the unit to show a quantity in, empty for a plain number, and the factor from its SI value."""
     small = quantity.unit == "" and quantity.prior_scale < _SMALL
     return _PPM if small else shown_unit(quantity.unit, quantity.require)
 
 
 def shown_unit(unit: str, require: float | None) -> tuple[str, float]:
-    """The same of a number in an SI unit of which a standard deviation of `require` is wanted; None: none is."""
+    """Return the unit to show numbers of an SI unit in, finer for a small required sigma, and the factor from SI."""
     units = _FINE_UNITS if require is not None and require < _FINE else _UNITS
     return units.get(unit, (unit, 1.0))
 
@@ -71,7 +71,7 @@ _NOISE: dict[str, tuple[str, float]] = {
 
 
 def noise_unit(name: str, si: str) -> tuple[str, float]:
-    """The unit to show a noise of the config in, and what to multiply its SI number by."""
+    """Return the unit to show a noise of the config in, and the factor from its SI value."""
     return _NOISE.get(name, (si, 1.0))
 
 
@@ -82,7 +82,7 @@ def signed(value: float, decimals: int = 1) -> str:
 
 
 def rounded(value: float, digits: int = 2) -> str:
-    """A number to so many digits, without an exponent where people can do without."""
+    """Format a number to so many digits, without an exponent from 1e-5 to 1e7."""
     if value == 0.0 or not math.isfinite(value) or not 1e-5 < abs(value) < 1e7:
         return f"{value:.{digits}g}"
     decimals = digits - 1 - math.floor(math.log10(abs(value)))
@@ -90,17 +90,17 @@ def rounded(value: float, digits: int = 2) -> str:
 
 
 def significant(value: float, digits: int) -> str:
-    """A number to so many digits, never with an exponent or trailing zeros."""
+    """Format a number to so many digits, never with an exponent or trailing zeros."""
     return np.format_float_positional(value, precision=digits, fractional=False, trim="-")
 
 
 def minute(date: str) -> str:
-    """A date of ISO 8601 to the minute."""
+    """Format an ISO 8601 date to the minute."""
     return date[:16].replace("T", " ")
 
 
 def format_estimate(quantity: Quantity, value: float, sigma: float) -> str:
-    """Value and sigma, SI, in the unit people read: "1.234 ± 0.056 deg"."""
+    """Format a value with its sigma, both SI, in the unit people read: "1.234 ± 0.056 deg"."""
     unit, factor = human_unit(quantity)
     number, spread = (to_digits_of(factor * each, factor * sigma) for each in (value, sigma))
     return f"{number} ± {spread} {unit}".strip()
@@ -111,7 +111,7 @@ _NOTHING = 1e-9
 
 
 def to_digits_of(value: float, sigma: float) -> str:
-    """A number with the digits down to the second one of its sigma; six digits where the sigma is zero."""
+    """Format a number down to the second digit of its sigma; to six digits where the sigma is zero."""
     if not (sigma > 0.0 and math.isfinite(sigma)):
         return f"{value:.6g}" if abs(value) > _NOTHING else "0"
     decimals = 1 - math.floor(math.log10(sigma))

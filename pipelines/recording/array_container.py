@@ -28,7 +28,7 @@ _SEC_NS = 1_000_000_000
 
 
 class SeriesEncoder:
-    """A series as CDR messages, taken in order.
+    """Encodes a series as CDR messages, in the order of its stamps.
 
     Attributes:
         definition: message type.
@@ -46,7 +46,7 @@ class SeriesEncoder:
         self._encode, self._taken = encode, 0
 
     def take(self, count: int) -> Any:
-        """The next messages: rows of bytes (count, size), or a list of bytes if their sizes vary."""
+        """Return the next `count` messages: rows of bytes (count, size), or a list of bytes if their sizes vary."""
         which = slice(self._taken, self._taken + count)
         self._taken = which.stop
         return self._encode(which)
@@ -62,7 +62,7 @@ class SeriesEncoder:
 def _uniform(
     definition: Definition, t_ns: NDArray[np.int64], first: object, columns: Mapping[str, Array]
 ) -> SeriesEncoder:
-    """Of messages that differ in nothing but numbers."""
+    """Return the encoder of messages that differ in numbers alone, from the first one and columns (N, k) by field."""
     data = definition.encode(first)
     layout = definition.layout(data)
     assert layout is not None
@@ -80,14 +80,14 @@ def _uniform(
 
 
 def _varying(definition: Definition, t_ns: NDArray[np.int64], encoded: Iterator[bytes], size: int) -> SeriesEncoder:
-    """Of messages of any size, encoded one by one by rosbags."""
+    """Return the encoder of messages of any size, each of which rosbags has encoded by itself."""
     return SeriesEncoder(
         definition, t_ns, size, lambda which: list(islice(encoded, which.stop - which.start)), varies=True
     )
 
 
 def encode_series(topic: series.Topic) -> SeriesEncoder:
-    """CDR messages of a series, as a topic."""
+    """Return the encoder of a series as the CDR messages of a topic."""
     if isinstance(topic, series.Series):
         definition = known(topic.TYPE)
         columns = {}
@@ -115,7 +115,7 @@ def encode_series(topic: series.Topic) -> SeriesEncoder:
 
 
 class ArrayContainer(Container):
-    """Topics, name -> series, as messages.
+    """Container of topics that are series in memory, encoded as CDR messages on reading.
 
     Args:
         path: of the file or folder they were read from, as the user named it.
@@ -143,7 +143,7 @@ class ArrayContainer(Container):
             self.counts[number] = 1 if isinstance(topic, series.CameraInfo) else len(topic)
 
     def sha256(self) -> str:
-        """SHA-256 of the file, hexadecimal; of several that of their own digests, in order."""
+        """Return the SHA-256 of the file, hexadecimal; of several files that of their own digests, in order."""
         return combined_sha256(map(file_sha256, self._files)) if self._files else super().sha256()
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
@@ -156,7 +156,7 @@ class ArrayContainer(Container):
 
 
 def ros2_schema(name: str) -> Schema:
-    """Schema of a ROS 2 type, its number 0. Raises MessageError for one that is not known."""
+    """Return the schema of a ROS 2 message type, with the id 0. Raises MessageError for an unknown type."""
     return Schema(0, name, "ros2msg", definition_text(name).encode())
 
 

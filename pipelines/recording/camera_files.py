@@ -27,7 +27,7 @@ _MRCAL = ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMO
 
 
 class CameraFile(ArrayContainer):
-    """Calibrations of cameras by topic, stamped t_ns, Unix ns: when the recording beside them begins."""
+    """Container of camera calibrations by topic, stamped `t_ns`, Unix ns: the start of the recording beside them."""
 
     def __init__(self, path: Path, cameras: Mapping[str, series.CameraInfo], data: Path, t_ns: int = 0) -> None:
         self.cameras = {topic: replace(each, t_ns=t_ns) for topic, each in cameras.items()}
@@ -35,7 +35,7 @@ class CameraFile(ArrayContainer):
 
 
 def read_cameras(path: Path, data: Path) -> CameraFile:
-    """The cameras in a file `data`, which is named `path`. Raises InputError where there is none."""
+    """Read the camera calibrations in file `data`, called `path` in messages. Raises InputError where there is none."""
     text = read_bytes(data, MAX_YAML_BYTES).decode(errors="replace")
     content = load_yaml(re.sub(r"^%YAML[ :]1\.\d\s*(---)?|!!opencv-matrix", "", text), str(path))
     try:
@@ -48,7 +48,7 @@ def read_cameras(path: Path, data: Path) -> CameraFile:
 
 
 def _own(content: object) -> str:
-    """What a file of alidade's own is, which is no recording; empty for others."""
+    """Return why a result or a config of alidade is no camera calibration, as a phrase; empty for other content."""
     keys = set(content) if isinstance(content, dict) else set()
     if isinstance(content, dict) and str(content.get("schema", "")).startswith("alidade."):
         return "that is a result, no recording; `--prior` and `--calibration` take it"
@@ -58,7 +58,7 @@ def _own(content: object) -> str:
 
 
 def camera(content: Mapping[str, Any], frame_id: str, t_ns: int = 0) -> series.CameraInfo:
-    """Camera of a file of several, or of a sensor.yaml in EuRoC's form.
+    """Return the camera that an entry of a calibration file describes, or a sensor.yaml in EuRoC's form.
 
     Raises AttributeError, KeyError, TypeError or ValueError where something is missing or of another kind.
     """
@@ -90,5 +90,5 @@ def camera(content: Mapping[str, Any], frame_id: str, t_ns: int = 0) -> series.C
 
 
 def _numbers(matrix: Any) -> NDArray[np.float64]:
-    """A matrix as OpenCV and ROS write it, or as nested lists."""
+    """Return the numbers of a matrix, flattened, from nested lists or from the mapping that OpenCV and ROS write."""
     return np.array(matrix["data"] if isinstance(matrix, dict) else matrix, dtype=float).ravel()

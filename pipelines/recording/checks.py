@@ -45,7 +45,7 @@ def clean(
     least: int = 2,
     slowest_s: float = SLOWEST_S,
 ) -> tuple[Array, NDArray[np.int64]]:
-    """Times in s from epoch_ns, strictly increasing, and which samples they belong to (indexes into the series).
+    """Return strictly increasing times, s from epoch_ns, of the usable samples, and the samples' indexes in the series.
 
     Samples with a NaN or infinite value (rows of `values`) are dropped, and so are all but the first of several with
     the same stamp; stamps out of order are sorted. What was done is counted in `dropped`.
@@ -99,7 +99,7 @@ def clean(
 
 
 def check_time_unit(name: str, t_ns: NDArray[np.int64], slowest_s: float) -> None:
-    """Raise InputError where the usual step between stamps, ns, is no sensor's, but would be in another unit."""
+    """Raise InputError where the median step between stamps, ns, is plausible for a sensor only in another unit."""
     factor = likely_time_unit(t_ns, slowest_s)
     if factor is not None:
         step = float(np.median(np.diff(t_ns))) * 1e-9
@@ -110,7 +110,7 @@ def check_time_unit(name: str, t_ns: NDArray[np.int64], slowest_s: float) -> Non
 
 
 def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
-    """Factor (1e-3, 1e3, ...) that makes the usual step of stamps, ns, plausible for a sensor; None: 1.
+    """Return the factor (1e-3, 1e3, ...) that makes the median step of stamps, ns, plausible; None if none is needed.
 
     Args:
         t_ns: (N,), in order or not.
@@ -127,7 +127,7 @@ def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
 
 
 def take_rows(values: Array, rows: NDArray[np.int64]) -> Array:
-    """Rows of an array; of the array itself where they are all, or where it never changes and takes no memory."""
+    """Select rows of an array, without a copy where all rows are selected or all rows are one in memory."""
     if values.strides[0] == 0:
         return np.broadcast_to(values[0], (len(rows), *values.shape[1:]))
     everything = len(rows) == len(values) and bool((rows[1:] > rows[:-1]).all())
@@ -163,7 +163,7 @@ def too_fast(topic: str, t: Array, gyro: Array) -> str:
 
 
 def tracked(topic: str, wxyz: Array, dropped: dict[str, int]) -> Array:
-    """Quaternions (N, 4), NaN in place of those that are all zero: a tracker that lost the body; counted."""
+    """Return quaternions (N, 4), NaN where all components are zero (the tracker lost the body); count these rows."""
     lost = np.asarray(~wxyz.any(axis=1))
     if lost.all() or not lost.any():
         return wxyz
@@ -196,13 +196,13 @@ def check_overlap(spans: Mapping[str, Array]) -> None:
 
 
 def count(dropped: dict[str, int], reason: str, number: int) -> None:
-    """Add a count to a tally; nothing for zero."""
+    """Add a number of samples to the entry of a reason in the tally `dropped`; zero adds no entry."""
     if number:
         dropped[reason] = dropped.get(reason, 0) + number
 
 
 def _copies(stamps: NDArray[np.int64], values: Array) -> NDArray[np.bool_]:
-    """Mask of samples, sorted by stamp, that repeat the one before, stamp and numbers."""
+    """Mask (N,) of samples, sorted by stamp, whose stamp and numbers equal those of the preceding sample."""
     out = np.zeros(len(stamps), dtype=bool)
     again = np.flatnonzero(np.diff(stamps) == 0) + 1
     rows = values.reshape(len(stamps), -1)
@@ -211,7 +211,7 @@ def _copies(stamps: NDArray[np.int64], values: Array) -> NDArray[np.bool_]:
 
 
 def _is_overtaking(in_file: NDArray[np.int64], stamps: NDArray[np.int64]) -> bool:
-    """Whether stamps out of order are of messages that overtook each other: late by little, and even once sorted."""
+    """Whether stamps are out of order because messages overtook each other: slightly late, and even once sorted."""
     steps = np.diff(stamps)
     if not len(steps):
         return False

@@ -60,7 +60,7 @@ class MessageBlock(NamedTuple):
 
     @classmethod
     def pack(cls, channel: int, messages: Sequence[bytes], log_ns: ArrayLike) -> MessageBlock:
-        """Messages side by side in one buffer."""
+        """Return a block of messages of one channel, copied side by side into one buffer."""
         size = np.array([len(message) for message in messages], dtype=np.int64)
         buffer = np.frombuffer(b"".join(messages), np.uint8)
         return cls(channel, buffer, np.cumsum(size) - size, size, np.asarray(log_ns, dtype=np.int64))
@@ -151,7 +151,7 @@ class Container(ABC):
         return min((int(block.log_ns.min()) for block in self.first_blocks(self.channels).values()), default=0)
 
     def is_defined(self, channel: int) -> bool:
-        """Whether a channel has a topic and a definition of its messages, or needs none."""
+        """Whether the file defines a channel, and its schema if the channel refers to one."""
         return channel in self.channels and self.channels[channel].schema_id in {0, *self.schemas}
 
     def set_counts(self, counts: Mapping[int, int]) -> None:
@@ -168,7 +168,7 @@ class Container(ABC):
         return total({self.channels[number].topic: n} for number, n in lost)
 
     def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
-        """Sentences about what is lost, one a kind, and when in a session that starts at start_ns, Unix ns.
+        """Return a sentence about each kind of loss, with its time in a session that starts at start_ns, Unix ns.
 
         Args:
             start_ns: None leaves out when the losses are.
@@ -223,12 +223,12 @@ class Container(ABC):
         return file_sha256(self.path)
 
     def require_readable(self) -> None:
-        """Raise InputError if something is lost and nothing is left."""
+        """Raise InputError if parts of the file are lost and no readable message is left."""
         if not self.counts and (self.losses or self.missing):
             raise InputError(f"{self.path}: {'; '.join(self.notes(None))}; nothing in it can be read: record again")
 
     def require_complete(self) -> None:
-        """Read everything once. Raises InputError if anything is lost."""
+        """Read the whole file once; raise InputError if any part or message of the file is lost."""
         for _ in self.blocks(set(self.channels)):
             pass
         for name in self.attachments:
@@ -294,7 +294,7 @@ class MultiPartContainer(Container):
         return tuple(dict.fromkeys(name for part in self.parts for name in part.attachments))
 
     def attachment(self, name: str, needed: bool = True) -> bytes | None:
-        """The attachment of that name in the first part that has one."""
+        """Return the content of the attachment of that name, from the first part that has one."""
         for part in self.parts:
             if name in part.attachments:
                 return part.attachment(name, needed)
@@ -307,7 +307,7 @@ class MultiPartContainer(Container):
                 yield block._replace(channel=i * _ID_RANGE + block.channel)
 
     def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
-        """Sentences about what is lost, of each part under its name."""
+        """Return the sentences about losses of all parts, each after the name of its part."""
         notes = (f"{part.path.name}: {note}" for part in self.parts for note in part.notes(start_ns, duration_s))
         return tuple(notes)
 
@@ -320,7 +320,7 @@ class MultiPartContainer(Container):
 
 
 def total(counts: Iterable[Mapping[_Key, int]]) -> dict[_Key, int]:
-    """Sum of several counts by the same keys."""
+    """Return the sum, key by key, of several mappings of counts."""
     found = Counter[_Key]()
     for each in counts:
         found.update(each)
@@ -339,7 +339,7 @@ def combined_sha256(digests: Iterable[str]) -> str:
 
 
 def _when(losses: Sequence[DataLoss], start_ns: int | None, duration_s: float) -> str:
-    """Session time of losses; nothing where that is unknown or implausible."""
+    """Return a phrase with the time span of losses, s from the session's start; empty if unknown or implausible."""
     if start_ns is None:
         return ""
     spans = [loss.span for loss in losses if loss.span is not None]

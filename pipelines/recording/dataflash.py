@@ -49,13 +49,13 @@ def read_dataflash(path: Path, data: Path) -> ArrayContainer:
         raise InputError(f"{path}: an ArduPilot log; to read it: pip install 'alidade[ardupilot]'") from error
 
     class Index(DFReader_binary):  # type: ignore[misc]
-        """Formats, and where messages lie; without a clock, for which pymavlink reads all messages one by one."""
+        """Index of a log's formats and messages; has no clock, for which pymavlink would read every message."""
 
         def init_clock(self) -> None:
             return
 
         def init_arrays_fast(self, progress_callback: Any = None) -> None:
-            """By pymavlink's Python: its C prints what is damaged."""
+            """Index the messages with pymavlink's Python code; its C code prints what is damaged."""
             self.init_arrays(progress_callback)
 
     content = np.fromfile(data, np.uint8)
@@ -76,14 +76,14 @@ def read_dataflash(path: Path, data: Path) -> ArrayContainer:
 
 
 def _is_damaged(log: Any, size: int) -> bool:
-    """Whether there is something else between the messages, or behind them."""
+    """Whether bytes that are no messages lie between the messages of a log, or more than _TAIL of them at its end."""
     there = [(log.offsets[number], form.len) for number, form in log.formats.items() if log.offsets[number]]
     end = max((at[-1] + length for at, length in there), default=0)
     return end > sum(len(at) * length for at, length in there) or size - end > _TAIL
 
 
 def _messages(log: Any, codes: Mapping[str, Any], content: NDArray[np.uint8]) -> Iterator[tuple[Kind, Columns]]:
-    """Columns of the messages of each kind and instance, scaled as their format says.
+    """Yield the columns of the messages of each kind and instance, scaled to units as their format states.
 
     Logs before 2020 number instances in the name of the kind, `IMU2`. Raises ValueError and KeyError for formats that
     do not fit their messages.
@@ -106,12 +106,12 @@ def _messages(log: Any, codes: Mapping[str, Any], content: NDArray[np.uint8]) ->
 
 
 def _scaled(values: NDArray[Any], per_unit: float) -> NDArray[Any]:
-    """Values in units, exact to the last bit: divided by a whole number."""
+    """Convert logged integers to units, exact to the last bit: division by the whole number of counts per unit."""
     return values if per_unit == 1.0 else values / round(per_unit)
 
 
 def _topics(found: Mapping[Kind, Columns], offset: int) -> Iterator[tuple[str, series.Topic]]:
-    """Topics from the messages, with an IMU's temperature where it has one."""
+    """Yield topics by name from the log's messages, with an IMU's temperature where its messages have one."""
     for (kind, instance), data in found.items():
         name = f"/{kind}" + (f"/{instance}" if instance else "")
         yield name, _READERS[kind](data, offset)
@@ -120,7 +120,7 @@ def _topics(found: Mapping[Kind, Columns], offset: int) -> Iterator[tuple[str, s
 
 
 def _unix_offset(found: Mapping[Kind, Columns]) -> int:
-    """Offset from log time to Unix time, us, the median over all fixes; 0 without one that knows the time."""
+    """Return the offset from log time to Unix time, us, median over all GNSS fixes; 0 if none states the time."""
     offsets = [np.zeros(0, np.int64)]
     for data in (data for (kind, _), data in found.items() if kind == "GPS"):
         week, ms, logged = (data[name].astype(np.int64) for name in ("GWk", "GMS", "TimeUS"))
@@ -130,7 +130,7 @@ def _unix_offset(found: Mapping[Kind, Columns]) -> int:
 
 
 def _stamps(data: Columns, offset: int) -> NDArray[np.int64]:
-    """When it was measured, Unix ns; a compass says so in the lower 32 bits of the clock."""
+    """Return times of measurement, Unix ns; a compass logs the lower 32 bits of that time (column S)."""
     logged = data["TimeUS"].astype(np.int64)
     if np.any(data.get("S", 0)):
         logged = logged - (logged - data["S"].astype(np.int64)) % (1 << 32)
@@ -147,21 +147,21 @@ def _vector(kind: str, data: Columns, offset: int) -> series.VectorSeries:
 
 
 def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
-    """Readings, each once: the log repeats one until there is the next."""
+    """Return the magnetometer's readings, T, each once: the log repeats a reading until the next one."""
     t_ns = _stamps(data, offset)
     new = np.diff(t_ns, prepend=t_ns[0] - 1) != 0
     return series.MagneticSeries(t_ns[new], _MILLIGAUSS * columns(data, "MagX", "MagY", "MagZ")[new])
 
 
 def _attitude(data: Columns, offset: int) -> series.QuaternionSeries:
-    """Turned about down by the yaw, then about right by the pitch, then about forward by the roll."""
+    """Return attitudes in ENU: yaw about down, then pitch about right, then roll about forward."""
     turns = np.radians(columns(data, "Yaw", "Pitch", "Roll"))
     about = [so3.exp(turns[:, i, None] * np.eye(3)[2 - i]) for i in range(3)]
     return series.QuaternionSeries(_stamps(data, offset), so3.compose(ENU_FROM_NED, *about))
 
 
 def _fix(data: Columns, offset: int) -> series.FixSeries:
-    """Fixes, with the height above mean sea level."""
+    """Return GNSS fixes with the height above mean sea level, m."""
     status = np.where(data["Status"] >= 3, 0.0, -1.0)
     return series.FixSeries(_stamps(data, offset), data["Lat"], data["Lng"], data["Alt"], status=status)
 

@@ -78,7 +78,7 @@ class DecodedMessage(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """Runs of numbers of the fields in messages of a layout, with their order. No layout: decoded one by one."""
+    """Positions of a table's numbers in messages of one layout, in column order; no layout: decode one by one."""
 
     layout: Layout | None
     fields: dict[str, tuple[Leaf, Any]]
@@ -119,7 +119,7 @@ class ColumnTable:
         self._varying: dict[str, Array] = {}
 
     def orders(self, message: Any) -> Mapping[str, Any] | None:
-        """Column -> indexes of the numbers of its field that are meant; None for a message that lacks a joint."""
+        """Map each column to the indexes of its numbers in the field; None for a message that lacks a joint."""
         if self._joints is None:
             return self._orders
         self.joint_names.update(dict.fromkeys(map(str, message.name)))
@@ -135,7 +135,7 @@ class ColumnTable:
         return np.arange(new.start, new.stop)
 
     def fill(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]], frame: str = "") -> None:
-        """Fill increasing rows: column -> (rows, numbers), all of one frame. Raises KeyError at another width."""
+        """Write messages of one frame into increasing rows, column -> (rows, width). KeyError at another width."""
         # Rows that follow each other are written in half the time.
         first, last = int(rows[0]), int(rows[-1])
         where = slice(first, last + 1) if last - first == len(rows) - 1 else rows
@@ -145,7 +145,7 @@ class ColumnTable:
         self._frame[where] = self._frames.setdefault(frame, len(self._frames))
 
     def frames(self) -> dict[str, NDArray[np.bool_]]:
-        """Frame -> the filled rows that have it."""
+        """Map each frame name to the mask of the filled rows whose messages have that frame."""
         found = {name: self.filled & (self._frame == i) for name, i in self._frames.items()}
         return {name: rows for name, rows in found.items() if rows.any()}
 
@@ -156,12 +156,12 @@ class ColumnTable:
         return int(np.count_nonzero(few))
 
     def times(self, filled: bool = True) -> Times:
-        """Stamps, log times where there are none, and log times of the filled rows, or of all that were added."""
+        """Return stamps (log times where missing) and log times of the filled rows, or of all rows added, Unix ns."""
         rows: Any = self.filled if filled and not self.filled.all() else slice(self.count)
         return with_log_times(self._t_ns[rows], self._log_ns[rows])
 
     def sorted(self) -> tuple[Stamps, int, dict[str, Any]]:
-        """Stamps, the number of them that are log times, and the columns; the filled rows by log time."""
+        """Return the stamps, the number of them that are log times, and the columns of the filled rows, by log time."""
         from_log = is_unstamped(self._t_ns, self._log_ns) & self.filled
         t_ns = np.where(from_log, self._log_ns, self._t_ns)
         rows: Any = slice(None)
@@ -222,11 +222,11 @@ class MessageFormat:
 
     @cached_property
     def definition(self) -> Definition:
-        """Definition of the type. Raises MessageError where it cannot be used."""
+        """Definition of the channel's ROS 2 message type. Raises MessageError where it cannot be used."""
         return messages.known(self.type) if self._is_translated else self._recorded
 
     def stamps(self, block: MessageBlock) -> Stamps:
-        """Header stamps, Unix ns: 0 where there is none; the log times of messages that are not read."""
+        """Return a block's header stamps, Unix ns, 0 where there is none; log times where messages cannot be read."""
         if not self.is_readable:
             return block.log_ns
         try:
@@ -236,7 +236,7 @@ class MessageFormat:
             return block.log_ns
 
     def append(self, block: MessageBlock, table: ColumnTable) -> None:
-        """Append messages to the table; those that lack one of its joints stay unfilled.
+        """Append a block's messages to a table; the rows of messages that lack one of its joints stay unfilled.
 
         Raises KeyError or AttributeError at a field that the messages do not have, and MessageError.
         """
@@ -266,7 +266,7 @@ class MessageFormat:
             table.fill(rows[i : i + 1], {name: found[name][None, orders[name]] for name in found}, _frame(message))
 
     def decode(self, block: MessageBlock) -> Iterator[DecodedMessage]:
-        """Messages one by one. Raises MessageError."""
+        """Decode the messages of a block one by one. Raises MessageError."""
         definition, block = self.definition, self._translated(block)
         stamps = header_stamps(definition.has_header, block, definition.wire)
         absent = is_unstamped(stamps, block.log_ns)
@@ -278,7 +278,7 @@ class MessageFormat:
 
     @cached_property
     def _recorded(self) -> Definition:
-        """The recorded definition, in ROS."""
+        """Definition that the recording has of a ROS type; the standard one where the recording has none."""
         assert self._schema is not None
         assert self._wire is not None
         text = self._schema.data.decode(errors="replace") or messages.definition_text(self._recorded_type)
@@ -289,7 +289,7 @@ class MessageFormat:
 
     @cached_property
     def _has_header(self) -> bool:
-        """Whether messages begin with a header: by the text alone where there is one, which may be no definition."""
+        """Whether messages begin with a header, by the recorded text, which need not be a valid definition, if any."""
         if not self._is_translated and self._language == "msg" and self._schema is not None and self._schema.data:
             return messages.has_header(self._schema.data.decode(errors="replace"))
         return self.definition.has_header
@@ -300,7 +300,7 @@ class MessageFormat:
         return Translation(self._schema if self._wire is None else self._recorded, self.definition)
 
     def _translated(self, block: MessageBlock) -> MessageBlock:
-        """The messages as `definition` defines them. Raises MessageError at one that cannot be translated."""
+        """Return the messages translated to `definition`. Raises MessageError at one that cannot be translated."""
         if not self._is_translated:
             return block
         translated = []
@@ -310,7 +310,7 @@ class MessageFormat:
         return MessageBlock.pack(block.channel, translated, block.log_ns)
 
     def _plan(self, data: bytes, table: ColumnTable) -> _Plan:
-        """Layout of a message and the places of the table's fields in it."""
+        """Return the layout of a message and the positions of the table's numbers in that layout."""
         layout = self.definition.layout(data)
         if layout is None:
             return _Plan(None, {})
@@ -324,7 +324,7 @@ class MessageFormat:
 
 @contextmanager
 def at_log_time(log_ns: int) -> Iterator[None]:
-    """Note the log time of the message in a MessageError about it."""
+    """Context manager that adds a message's log time, Unix ns, to a MessageError about that message."""
     try:
         yield
     except MessageError as error:
@@ -333,18 +333,18 @@ def at_log_time(log_ns: int) -> Iterator[None]:
 
 
 def is_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
-    """Messages without a stamp: it is zero, and they were not logged at zero, as rows of a table may be."""
+    """Mask (N,) of messages without a stamp: stamp zero, log time not (a table's rows may begin at zero)."""
     return np.asarray((stamps == 0) & (log_ns != 0))
 
 
 def few_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
-    """Messages without a stamp where they are at most MAX_UNSTAMPED_SHARE of all; otherwise none."""
+    """Mask (N,) of messages without a stamp if these are at most MAX_UNSTAMPED_SHARE of all; otherwise all False."""
     without = is_unstamped(stamps, log_ns)
     return without & (np.count_nonzero(without) <= MAX_UNSTAMPED_SHARE * len(without))
 
 
 def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
-    """Stamps and log times. Messages without a stamp are left out where they are few; else log times replace stamps."""
+    """Return stamps and log times; few messages without a stamp are left out, many get their log times as stamps."""
     kept: Any = ~few if (few := few_unstamped(stamps, log_ns)).any() else slice(None)
     stamps, log_ns = stamps[kept], log_ns[kept]
     return (stamps if stamps.all() else np.where(stamps == 0, log_ns, stamps)), log_ns
@@ -368,7 +368,7 @@ def header_stamps(has_header: bool, block: MessageBlock, wire: Wire) -> Stamps:
 def _append_alike(
     plan: _Plan, block: MessageBlock, left: NDArray[np.int64], table: ColumnTable, rows: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Append those of the messages `left` that have a layout, all at once. Returns which of them these are."""
+    """Append at once those of the messages `left` that have the plan's layout; return the mask of the appended ones."""
     if plan.layout is None:
         return np.zeros(len(left), dtype=bool)
     size = len(plan.layout.first)
@@ -386,7 +386,7 @@ def _append_alike(
 
 
 def _frame(message: Any) -> str:
-    """Frame in a message's header, empty where it has none."""
+    """Return the frame_id in a message's header, empty where there is none."""
     return str(getattr(getattr(message, "header", None), "frame_id", "")).lstrip("/")
 
 

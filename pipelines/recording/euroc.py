@@ -23,12 +23,12 @@ from alidade.pipelines.recording.tables import numbers, read_columns, table_form
 
 
 def find_euroc(path: Path) -> Path | None:
-    """The folder that has the sensors' folders, at the path or at `mav0` in it; None if it is no such data set."""
+    """Return the folder that contains the sensors' folders, `path` or its `mav0`; None if there is no such data set."""
     return next((root for root in (path, path / "mav0") if any(root.glob("*/data.csv"))), None)
 
 
 def read_euroc(path: Path, root: Path) -> ArrayContainer:
-    """Container of all sensors of a data set."""
+    """Read all sensors of a EuRoC data set into a container."""
     topics: dict[str, series.Topic] = {}
     assumptions = []
     tables = sorted(root.glob("*/data.csv"))
@@ -42,14 +42,14 @@ def read_euroc(path: Path, root: Path) -> ArrayContainer:
 
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
-    """Topics of a sensor's table, by name."""
+    """Return the topics made of one sensor's table, by topic name."""
     layout = table_form(table, table)
     names = layout.names
     columns, _ = read_columns(layout, names)
     t_ns = nanoseconds(table, columns[names[0]], "ns")
 
     def chosen(letter: str) -> list[str]:
-        """Names of the columns of a quantity, in the order of the axes."""
+        """Return the names of the columns of a quantity (w, a, q or p), in the order of the axes."""
         return [one for one in names[1:] if one.split(" ")[0].startswith(f"{letter}_")]
 
     def of(letter: str) -> NDArray[np.float64]:
@@ -78,7 +78,7 @@ def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, seri
 
 
 class _Pictures:
-    """The files of pictures, read one by one and anew each time."""
+    """Iterable of the contents of picture files, each read in its turn, anew on each iteration."""
 
     def __init__(self, files: list[Path]) -> None:
         self._files = files

@@ -44,7 +44,7 @@ _MOST_LOST = 0.2
 def drop_faults(
     topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str, may_stand: bool = False
 ) -> NDArray[np.intp]:
-    """Rows of values (N, k) at t (N,), s, that are sound; what is not is counted in `dropped`.
+    """Return the rows of values (N, k) at times t (N,), s, that have no fault; count the others in `dropped`.
 
     Raises:
         InputError: an axis never moves while the others do, none does (unless it `may_stand`), or more than a fifth of
@@ -61,9 +61,9 @@ def drop_faults(
 
 
 def drop_frozen(topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str, axes: str) -> NDArray[np.intp]:
-    """Drop faults as `drop_faults`, of what may reach the end of its range and has outliers that the estimate weighs.
+    """Return the rows that are not frozen, of readings whose saturation and outliers the estimate weighs by itself.
 
-    It is nowhere at rest: what is frozen for most of the time is so nonetheless.
+    Such a sensor is nowhere at rest: readings frozen for most of the time are faults as well.
     """
     frozen = np.stack([_frozen(t, column, most=1.0) for column in values.T], axis=1)
     return _without(topic, t, values, {_STUCK: frozen}, dropped, unit, axes)
@@ -72,7 +72,7 @@ def drop_frozen(topic: str, t: Array, values: Array, dropped: dict[str, int], un
 def _without(
     topic: str, t: Array, values: Array, reasons: dict[str, Mask], dropped: dict[str, int], unit: str, axes: str = "xyz"
 ) -> NDArray[np.intp]:
-    """Rows that no reason, its mask (N, k), speaks against; the others are counted, and refused if too many."""
+    """Return the rows that no mask (N, k) of a fault marks; count the others by fault, raise InputError if too many."""
     for reason, mask in reasons.items():
         lost = mask.any(axis=1)
         if lost.mean() > _MOST_LOST:
@@ -88,7 +88,7 @@ def _without(
 
 
 def _check_alive(topic: str, values: Array, unit: str, may_stand: bool) -> None:
-    """Refuse axes that never change, one beside others that always do, or all of them."""
+    """Raise InputError for an axis that never changes while the others do, or if no axis ever changes."""
     if len(values) <= _FROZEN_SAMPLES:
         return
     repeated = (np.diff(values, axis=0) == 0.0).mean(axis=0)
@@ -105,7 +105,7 @@ def _check_alive(topic: str, values: Array, unit: str, may_stand: bool) -> None:
 
 
 def _check_one_device(topic: str, values: Array, unit: str) -> None:
-    """Refuse readings that alternate between two levels, which are those of two devices."""
+    """Raise InputError for readings that alternate between two levels, as those of two devices on one topic do."""
     if len(values) < _ALTERNATE_SAMPLES:
         return
     next_one, next_but_one = (np.median(np.abs(values[lag:] - values[:-lag]), axis=0) for lag in (1, 2))
@@ -118,7 +118,7 @@ def _check_one_device(topic: str, values: Array, unit: str) -> None:
 
 
 def _spikes(x: Array) -> Mask:
-    """Single readings far from both neighbours, which agree."""
+    """Mask (N,) of single readings far from both neighbours, which agree with each other."""
     out = np.zeros(len(x), dtype=bool)
     if len(x) < 5:
         return out
@@ -137,7 +137,7 @@ def _runs(x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def _mask(size: int, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Mask:
-    """True from each start to its stop."""
+    """Mask (size,), True from each start to its stop, both included."""
     edges = np.zeros(size + 1, dtype=int)
     np.add.at(edges, starts, 1)
     np.add.at(edges, stops + 1, -1)
@@ -145,12 +145,12 @@ def _mask(size: int, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Mask:
 
 
 def _edge(step: Array, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Array:
-    """The larger of the steps into and out of each run."""
+    """Return the larger of the absolute steps into and out of each run of equal readings."""
     return np.fmax(np.concatenate([[0.0], step])[starts], np.concatenate([step, [0.0]])[stops])
 
 
 def _frozen(t: Array, x: Array, most: float = _MOST_REPEATED) -> Mask:
-    """Long runs of one value that end in a jump; none where they are so much of the stream that this is its nature."""
+    """Mask (N,) of long runs of one value that end in a jump; all False where they make up `most` of the stream."""
     starts, stops = _runs(x)
     long = (stops - starts + 1 >= _FROZEN_SAMPLES) & (t[stops] - t[starts] >= _FROZEN)
     step = np.abs(np.diff(x))
@@ -162,13 +162,13 @@ def _frozen(t: Array, x: Array, most: float = _MOST_REPEATED) -> Mask:
 
 
 def _clipped(t: Array, x: Array, smallest: float) -> Mask:
-    """Samples at the end of the range, none below the smallest: runs of its very reading, and plateaus that wander."""
+    """Mask (N,) of samples at the end of the range: runs of one reading, and wandering plateaus above `smallest`."""
     out = _at_end(x)
     return out | ((_on_plateau(t, x, out) | _on_plateau(t, -x, out)) & (np.abs(x) >= smallest))
 
 
 def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
-    """Plateaus near the largest reading, entered and left steeply for how flat they are; none where one is known."""
+    """Mask (N,) of plateaus near the largest reading, with edges steep for their height, apart from known ones."""
     out, longest = np.zeros(len(x), dtype=bool), 0
     above = x - np.nanmedian(x)
     edges = np.diff(np.concatenate([[False], above > (1.0 - _NEAR_END) * np.nanmax(above), [False]]).astype(int))
@@ -193,7 +193,7 @@ def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
 
 
 def _at_end(x: Array) -> Mask:
-    """Runs at the largest or the smallest reading of the stream."""
+    """Mask (N,) of runs of equal readings at the largest or the smallest reading of the stream."""
     starts, stops = _runs(x)
     step = np.abs(np.diff(x))
     if not np.any(step > 0.0):

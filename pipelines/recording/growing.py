@@ -20,7 +20,7 @@ MAX_KEPT_BYTES = 1 << 14
 
 
 class GrowingMcap(McapFile):
-    """An MCAP file as far as it has been written; `refresh` restricts what is read to its end.
+    """MCAP file that is still being written; `refresh` selects the blocks at its end that are read.
 
     Raises InputError when it is no MCAP, or hostile.
     """
@@ -33,10 +33,10 @@ class GrowingMcap(McapFile):
         super().__init__(path)
 
     def _read_index(self, stream: BinaryIO) -> None:
-        """Nothing; see `refresh`."""
+        """Read no index on opening; `refresh` walks the file."""
 
     def refresh(self, since_ns: int | None) -> None:
-        """Walk what is new; read from now on what was logged since a time, Unix ns, a little before included."""
+        """Walk the new records; select the blocks logged since a time, Unix ns, or a little before (None: all)."""
         with open_binary(self.data, self.path) as stream:
             self._walk_new(stream)
             # The last block's message index may not have been written yet.
@@ -53,7 +53,7 @@ class GrowingMcap(McapFile):
         }
 
     def last_log_ns(self) -> int | None:
-        """Log time of the last message written by now, as its block states it, Unix ns; None without one."""
+        """Return the log time of the last message written so far, Unix ns, as its block states it; None without one."""
         with open_binary(self.data, self.path) as stream:
             self._walk_new(stream)
         return next((block.log_span_ns[1] for block in reversed(self._blocks) if block.log_span_ns is not None), None)
@@ -68,7 +68,7 @@ class GrowingMcap(McapFile):
         self._walk(stream, self.size, is_growing=True)
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
-        """Messages of each channel in one block, however small the recorder's chunks are.
+        """Yield the messages of each channel in one block, however small the recorder's chunks are.
 
         From its first large message on those of a channel come chunk by chunk, in their order.
         """
@@ -98,7 +98,7 @@ class GrowingMcap(McapFile):
 
 
 def _joined(parts: Sequence[MessageBlock]) -> Iterator[MessageBlock]:
-    """Compact blocks of one channel as one; none of none."""
+    """Yield compact blocks of one channel joined into one block; no block for none."""
     if parts:
         size, log_ns = (np.concatenate(each) for each in zip(*((p.size, p.log_ns) for p in parts), strict=True))
         buffer = np.concatenate([part.buffer for part in parts])
@@ -106,23 +106,23 @@ def _joined(parts: Sequence[MessageBlock]) -> Iterator[MessageBlock]:
 
 
 class GrowingFiles:
-    """The files of a growing recording. Those that are not MCAP are read anew every time."""
+    """Files of a recording that is still being written; those that are not MCAP are read anew on each refresh."""
 
     def __init__(self) -> None:
         self._files: dict[Path, GrowingMcap] = {}
 
     @property
     def attachments(self) -> list[str]:
-        """Names of all attachments met."""
+        """Names of the attachments of all files read so far."""
         return [name for file in self._files.values() for name in file.attachments]
 
     def last_log_ns(self, paths: Sequence[Path]) -> int | None:
-        """Log time of the last message written by now, without reading it; None where that is unknown."""
+        """Return the log time of the last message written so far, Unix ns, from record heads alone; None if unknown."""
         last = self._files.get(paths[-1]) if paths else None
         return None if last is None else last.last_log_ns()
 
     def refresh(self, paths: Sequence[Path], since_ns: int | None) -> Container:
-        """The recording by now: all of it, or what was logged since a time, Unix ns. Raises InputError."""
+        """Return the recording so far: all of it, or what was logged since a time, Unix ns. Raises InputError."""
         files: list[Container] = []
         for path in paths:
             if not _is_mcap(path):
@@ -144,7 +144,7 @@ def _ends_before(block: Block, since_ns: int | None) -> bool:
 
 
 def _compact(block: MessageBlock) -> MessageBlock:
-    """The messages side by side, without the bytes between them."""
+    """Return a block with its messages side by side, without the bytes between them."""
     size = int(block.size[0]) if len(block.size) else 0
     if size and (block.size == size).all():
         data = byte_windows(block.buffer, size)[block.start].view(np.uint8)

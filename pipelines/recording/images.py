@@ -76,14 +76,14 @@ def netpbm(image: Any) -> bytes:
 
 
 def _used_bytes(data: NDArray[np.uint8], height: int, used: int, step: int) -> NDArray[np.uint8]:
-    """The bytes that are used of each row."""
+    """Return the used bytes (height, used) of each row of a picture, without the padding."""
     if not 0 < used <= step or height <= 0 or height * step != len(data) or len(data) > MAX_PICTURE_BYTES:
         raise ValueError(f"{height} rows of {step} bytes with {used} used, in {len(data)} bytes of data")
     return np.ascontiguousarray(data.reshape(height, step)[:, :used])
 
 
 def _eight_bits(rows: NDArray[np.uint8], width: int, image: Any) -> NDArray[np.uint8]:
-    """Pixels of 8 bits as they are; of 16 bits the upper 8 that are used: 10 or 12 bits leave the highest ones zero."""
+    """Return 8-bit pixels unchanged, and the upper 8 of the bits in use of 16-bit pixels (often only 10 or 12 are)."""
     if rows.shape[1] == width:
         return rows
     pixels = rows.view(">u2" if image.is_bigendian else "<u2")
@@ -92,7 +92,7 @@ def _eight_bits(rows: NDArray[np.uint8], width: int, image: Any) -> NDArray[np.u
 
 
 def _file(pixels: Pixels) -> bytes:
-    """A picture (height, width) or (height, width, 3) of 8 bits as a file."""
+    """Return a picture (height, width) or (height, width, 3) of 8 bits as a file in the Netpbm form."""
     kind = "P5" if pixels.ndim == 2 else "P6"
     return f"{kind} {pixels.shape[1]} {pixels.shape[0]} 255\n".encode() + pixels.tobytes()
 
@@ -118,7 +118,7 @@ def decode_video(packets: Iterable[tuple[int, bytes]], form: str) -> Iterator[tu
 
 
 def _decoded_by_pyav(packets: Iterable[tuple[int, bytes]], form: str) -> Iterator[tuple[int, bytes]]:
-    """Decode with one thread, which has no delay: each message is a picture at once."""
+    """Decode a video with PyAV in one thread, which has no delay: each message is a picture at once."""
     try:
         import av
     except ImportError as error:
@@ -138,12 +138,12 @@ def _decoded_by_pyav(packets: Iterable[tuple[int, bytes]], form: str) -> Iterato
 
 
 def is_video(start: bytes) -> bool:
-    """Whether a file that begins so, 12 bytes, is one of the video files that are read: MP4 or AVI."""
+    """Whether the first 12 bytes of a file are those of a video file that is read: MP4 or AVI."""
     return start[4:8] == b"ftyp" or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")
 
 
 class VideoFile:
-    """The pictures of an MP4 or AVI file as files in the Netpbm form, one by one and anew each time.
+    """Iterable of the pictures of an MP4 or AVI file as files in the Netpbm form, decoded anew on each iteration.
 
     Args:
         path: of the file.
@@ -168,7 +168,7 @@ class VideoFile:
 
 
 def _decoded_pictures(name: str, count: int, of: str, needed: str) -> Iterator[bytes]:
-    """The pictures of a video, which there are `count` of. Raises ValueError otherwise, with what is needed."""
+    """Yield the `count` pictures of a video as files in the Netpbm form. Raises ValueError if there are not so many."""
     # Remarks on what is damaged would go to the terminal; what matters of them is the number of pictures.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     import cv2

@@ -34,7 +34,7 @@ class TopicFacts:
 
 @dataclass(frozen=True)
 class SessionFacts:
-    """A recording: its start (Unix ns), its length, its topics, and for every method what it lacks for it.
+    """Facts about a recording: start, Unix ns, length, s, topics, and method -> what the recording lacks for it.
 
     lost: topic -> messages that are known to be lost; notes: sentences about what of the file cannot be used;
     proposed: method -> keys of the config that the recording suggests, each with the reason.
@@ -51,12 +51,12 @@ class SessionFacts:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The methods the recording can serve."""
+        """Names of the methods for which the recording lacks nothing."""
         return tuple(method for method, lacking in self.missing.items() if not lacking)
 
 
 def facts_of(recording: Recording, config: Config, needs: Mapping[str, Sequence[Need]]) -> SessionFacts:
-    """Facts about all topics of a recording, and what it lacks of the needs of methods."""
+    """Return facts about all topics of a recording, and for each method its needs that the recording does not meet."""
     epoch, times = recording.epoch_ns, recording.times
     topics = tuple(_facts(recording.topics[name], epoch, *times[name]) for name in recording.topics)
     missing = {method: lacking(wanted, recording, config) for method, wanted in needs.items()}

@@ -81,7 +81,7 @@ class Block:
 
 
 class _AttachmentName:
-    """The beginning of an attachment record, up to its name."""
+    """Fields of an attachment record up to its name."""
 
     @staticmethod
     def read(stream: ReadDataStream) -> str:
@@ -184,7 +184,7 @@ class McapFile(Container):
     # -- the messages of a block
 
     def _load(self, stream: BinaryIO, block: Block) -> NDArray[np.uint8]:
-        """Records of a block, of a chunk decompressed and verified. Raises DamagedError."""
+        """Return the bytes of a block's records; a chunk is decompressed and verified. Raises DamagedError."""
         stream.seek(block.start + HEAD.size if block.is_chunk else block.start)
         data = stream.read(block.end - stream.tell())
         return records.decompress_chunk(data) if block.is_chunk else np.frombuffer(data, np.uint8)
@@ -192,7 +192,7 @@ class McapFile(Container):
     def _locate(
         self, stream: BinaryIO, block: Block, buffer: NDArray[np.uint8]
     ) -> tuple[dict[int, NDArray[np.int64]], list[tuple[int, bytes]]]:
-        """Channel -> offsets of its messages in the buffer; and the other records, where they had to be searched."""
+        """Return channel -> offsets of its messages in the buffer, and other records if the index is not complete."""
         index = {}
         for number, at in block.index_offsets.items():
             stream.seek(at)
@@ -208,7 +208,7 @@ class McapFile(Container):
                 self._verify(stream, block)
 
     def _verify(self, stream: BinaryIO, block: Block) -> None:
-        """Read a block: count its messages, read the definitions in it if need be."""
+        """Read a block to verify the counts of its messages, and any definitions that are not known yet."""
         try:
             buffer = self._load(stream, block)
             offsets, others = self._locate(stream, block, buffer)
@@ -248,7 +248,7 @@ class McapFile(Container):
     # -- the walk
 
     def _walk(self, stream: BinaryIO, stop: int, is_growing: bool = False) -> None:
-        """Read record heads up to a byte; of a growing file up to its last whole record."""
+        """Read record heads up to byte `stop`; of a growing file up to its last whole record."""
         position = self._walked
         while position < stop and self._data_end is None:
             stream.seek(position)
@@ -267,7 +267,7 @@ class McapFile(Container):
         self._walked = position
 
     def _skip_damage(self, stream: BinaryIO, position: int, end: int, stop: int, reason: str) -> int:
-        """Note the loss at a position; returns the byte at which to continue."""
+        """Record a data loss at a byte position; return the byte at which reading continues."""
         span = None
         if not _may_be_record(stream, end, stop):
             end = records.find_next_chunk(stream, position + 1, stop)
@@ -282,7 +282,7 @@ class McapFile(Container):
         return end
 
     def _read_record(self, stream: BinaryIO, opcode: int, head: bytes, position: int, end: int) -> None:
-        """Note what the record at [position, end) states. Raises DamagedError."""
+        """Read the record at bytes [position, end) into the file's index. Raises DamagedError."""
         body = position + HEAD.size
         stream.seek(body)
         if opcode == Opcode.MESSAGE:
@@ -364,7 +364,7 @@ class McapFile(Container):
     # -- the end of the file
 
     def _read_summary(self, stream: BinaryIO) -> int | None:
-        """Byte of the footer, None without one; reads the summary if its checksum holds."""
+        """Read the summary if its checksum is right; return the byte of the footer, None without a footer."""
         at = self.size - len(MAGIC) - _FOOTER.size
         if at < len(MAGIC):
             return None
@@ -401,7 +401,7 @@ class McapFile(Container):
             self._define(opcode, record)
 
     def _check_end(self, stream: BinaryIO, is_closed: bool) -> None:
-        """Note how the file ends, and verify messages that have no checksum but the one over all data."""
+        """Record a loss if the file has no proper end; verify messages outside chunks by the checksum of all data."""
         if is_closed:
             pass
         elif self._data_end is None and not any(loss.kind == "cut" for loss in self.losses):
@@ -442,7 +442,7 @@ def _may_be_record(stream: BinaryIO, position: int, stop: int) -> bool:
 
 
 def _crc(stream: BinaryIO, stop: int) -> int:
-    """CRC-32 of the file up to a byte."""
+    """Return the CRC-32 of the first `stop` bytes of the file."""
     crc, left = 0, stop
     stream.seek(0)
     while left and (piece := stream.read(min(left, 1 << 20))):

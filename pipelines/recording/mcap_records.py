@@ -51,7 +51,7 @@ _SEARCHED = 1 << 20
 
 
 class DamagedError(Exception):
-    """Bytes that are not what they should be; the message says why, as a part of a sentence."""
+    """Raised at damaged bytes, with the reason as a part of a sentence."""
 
 
 class ChunkHead(NamedTuple):
@@ -74,7 +74,7 @@ class _RecordType(Protocol[_Record_co]):
 
 
 class _WholeFields(ReadDataStream):
-    """A record's bytes; a field that is not whole is damage."""
+    """Reader of a record's fields that raises DamagedError at a field that is cut short."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length)
@@ -84,7 +84,7 @@ class _WholeFields(ReadDataStream):
 
 
 def parse(kind: type[_RecordType[_Record_co]], record: bytes) -> _Record_co:
-    """A record of one of the kinds in mcap.records. Raises DamagedError."""
+    """Parse the bytes of a record as one of the kinds in mcap.records. Raises DamagedError."""
     try:
         return kind.read(_WholeFields(BytesIO(record)))
     except EndOfFile as error:
@@ -114,7 +114,7 @@ def chunk_head(start: bytes, length: int) -> ChunkHead:
 
 
 def decompress_chunk(chunk: bytes) -> NDArray[np.uint8]:
-    """The records in a chunk, checksum verified. Raises DamagedError."""
+    """Return the records in a chunk, decompressed, with their checksum verified. Raises DamagedError."""
     head = chunk_head(chunk[:64], len(chunk))
     packed = memoryview(chunk)[head.packed]
     try:
@@ -129,7 +129,7 @@ def decompress_chunk(chunk: bytes) -> NDArray[np.uint8]:
 
 
 def iter_records(data: memoryview, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, int, int]]:
-    """Records in [start, stop) as (opcode, start, end). Raises DamagedError if they do not fill it."""
+    """Yield records in [start, stop) as (opcode, start, end). Raises DamagedError if records do not fill that range."""
     stop = len(data) if stop is None else stop
     while start < stop:
         opcode, length = HEAD.unpack_from(data, start) if start + HEAD.size <= stop else (0, stop)
@@ -188,7 +188,7 @@ def index_is_complete(buffer: NDArray[np.uint8], index: Mapping[int, NDArray[np.
 
 
 def find_next_chunk(stream: BinaryIO, start: int, stop: int) -> int:
-    """Byte from `start` on at which the next chunk begins that ends by `stop`; `stop` if there is none."""
+    """Return the byte from `start` on at which the next chunk begins that ends by `stop`; `stop` if there is none."""
     while start + HEAD.size <= stop:
         stream.seek(start)
         piece = np.frombuffer(stream.read(min(_SEARCHED, stop - start)), np.uint8)
@@ -208,7 +208,7 @@ def find_next_chunk(stream: BinaryIO, start: int, stop: int) -> int:
 
 
 def _decompress(head: ChunkHead, packed: memoryview) -> bytes | memoryview:
-    """Decompressed data, at most one byte more than the chunk states."""
+    """Decompress the data of a chunk, at most one byte more than the chunk states."""
     if head.compression == "lz4":
         return lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=head.size + 1)
     if head.compression == "zstd":

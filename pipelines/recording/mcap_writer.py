@@ -39,7 +39,7 @@ _MEDIA = {".yaml": "application/yaml", ".json": "application/json"}
 
 
 def attached(truth: Mapping[str, float] | None, config_yaml: str | None) -> dict[str, bytes]:
-    """A session's attachments: its config and the true values of its parameters, as far as there are any."""
+    """Return a recording's attachments, name -> content: its config and the true parameter values, where given."""
     attachments = {}
     if config_yaml is not None:
         attachments[ATTACHMENT] = config_yaml.encode()
@@ -79,7 +79,7 @@ def write_session(
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file that takes its place when the block ends without an error; InputError when it cannot be written."""
+    """Yield a temporary file that replaces `path` when the block ends without an error; InputError if it cannot."""
     if not path.name or (path.exists() and not path.is_file()):
         raise InputError(f"{path}: there is no file to be written, it is something else")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -95,7 +95,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 class McapOutput:
-    """An MCAP file being written: header, attachments, definitions, chunks with their message indexes, summary.
+    """Writer of an MCAP file: header, attachments, definitions, chunks with their message indexes, summary.
 
     Args:
         stream: of the file.
@@ -117,7 +117,7 @@ class McapOutput:
             self._attach(name, data, max(time_ns, 0))
 
     def channel(self, topic: str, encoding: str, schema: Schema | None) -> int:
-        """Number of a topic with messages of an encoding and a schema, whatever the schema's own number."""
+        """Return the channel id of a topic with this encoding and schema; write both definitions on their first use."""
         number = 0
         if schema is not None:
             schema = schema._replace(id=0)
@@ -135,14 +135,14 @@ class McapOutput:
         return self._channels[key].id
 
     def put(self, block: MessageBlock) -> None:
-        """Write messages of a channel; they wait until a chunk is full."""
+        """Add messages of a channel to the pending chunk, which is written once it is full."""
         if len(block.start):
             self._waiting.append(block)
         if sum(int(each.size.sum()) for each in self._waiting) >= CHUNK_BYTES:
             self.flush()
 
     def flush(self) -> None:
-        """Write the messages that wait as a chunk, in the order of their log times."""
+        """Write the pending messages as a chunk, in the order of their log times."""
         if not self._waiting:
             return
         blocks, self._waiting = self._waiting, []
@@ -172,7 +172,7 @@ class McapOutput:
         self._put_chunk(out.tobytes(), int(log_ns.min()), int(log_ns.max()), index)
 
     def finish(self) -> None:
-        """Write what waits, and the summary."""
+        """Write the pending messages and the summary."""
         self.flush()
         self._put(DataEnd(0))
         statistics = Statistics(
@@ -220,7 +220,7 @@ class McapOutput:
 
 
 def _copy(block: MessageBlock, out: NDArray[np.uint8], at: NDArray[np.int64]) -> None:
-    """Copy messages to the places `at`, those of one size at once."""
+    """Copy a block's messages to the offsets `at` of a buffer, all messages of one size at once."""
     for size in np.unique(block.size).tolist():
         rows = np.flatnonzero(block.size == size)
         byte_windows(out, size)[at[rows]] = byte_windows(block.buffer, size)[block.start[rows]]

@@ -84,7 +84,7 @@ _LONGEST_TEXT, _LONGEST_IDL, _MOST_FIELDS, _DEEPEST = 1 << 18, 1 << 15, 10_000, 
 
 @dataclass(frozen=True)
 class Leaf:
-    """A run of numbers in a message: where it starts, of which numpy type, how many."""
+    """Run of numbers of one type in a message: field path, byte offset, numpy type, count."""
 
     path: str
     offset: int
@@ -92,7 +92,7 @@ class Leaf:
     count: int
 
     def of(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
-        """The numbers in messages, rows of bytes (n, size), as a view (n, count)."""
+        """Return the run's numbers in messages, rows of bytes (n, size), as a view (n, count)."""
         strides = (rows.shape[1], self.dtype.itemsize)
         return np.ndarray((len(rows), self.count), self.dtype, rows, self.offset, strides)
 
@@ -106,7 +106,7 @@ class Layout:
     fixed: tuple[tuple[int, int], ...]  # [start, end) of what has to be equal
 
     def run(self, path: str) -> Leaf:
-        """Run of all numbers at or below a field.
+        """Return the run of all numbers at or below the field at a path.
 
         Raises KeyError if the message has no such field, or does not hold its numbers side by side.
         """
@@ -133,7 +133,7 @@ class Layout:
 
     @cached_property
     def _fixed(self) -> list[Leaf]:
-        """Runs of bytes that must be equal, as the widest integers: three times as fast to compare as bytes."""
+        """Runs of bytes in which messages have to agree, as the widest integers, which compare three times as fast."""
         found = []
         for start, end in self.fixed:
             for width in (8, 4, 2, 1):
@@ -144,7 +144,7 @@ class Layout:
 
 
 class MessageError(Exception):
-    """A message or a definition that cannot be read; who reads knows the topic and the file.
+    """Raised for a message or definition that cannot be read; the caller adds the topic and the file.
 
     log_ns is the log time of the message, Unix ns, where it is one.
     """
@@ -191,7 +191,7 @@ class Definition:
             ) from error
 
     def numbers(self, value: Any) -> Array:
-        """Numbers in a field of a decoded message, in order."""
+        """Return the numbers in a field of a decoded message as a flat array, in the order of the definition."""
         if isinstance(value, list):
             return np.concatenate([self.numbers(item) for item in value]) if value else np.empty(0)
         if hasattr(value, "__msgtype__"):
@@ -200,7 +200,7 @@ class Definition:
         return np.atleast_1d(np.asarray(value, dtype=float))
 
     def encode(self, message: object) -> bytes:
-        """The CDR bytes of one message, little endian."""
+        """Encode one message as CDR, little endian."""
         return bytes(self._store.serialize_cdr(message, self.name, little_endian=True))
 
     def fields(self, kind: str) -> Any:
@@ -208,14 +208,14 @@ class Definition:
         return self._store.fielddefs[kind][1]
 
     def new(self, kind: str, /, **given: Any) -> Any:
-        """A message of this type or of one it holds: fields not given are zero, empty, or themselves new."""
+        """Create a message of this type or of a nested one; fields not given are zero, empty, or new messages."""
         values = {
             name: given[name] if name in given else self._zero(what) for name, what in self._store.fielddefs[kind][1]
         }
         return self._store.types[kind](**values)
 
     def layout(self, data: bytes) -> Layout | None:
-        """The layout of a message, None if it is not one plain little- or big-endian CDR message, or one of ROS 1."""
+        """Return the layout of a message; None if it is neither plain CDR, little or big endian, nor ROS 1."""
         if self.wire == "cdr" and data[:2] not in (b"\x00\x00", b"\x00\x01"):
             return None
         walk = _Walk(self._store.fielddefs, data, self.wire)
@@ -263,7 +263,7 @@ definition = lru_cache(maxsize=64)(Definition)
 
 
 def _types_of_idl(text: str) -> Any:
-    """The types in the IDL of one type, or of several under a line with the name of each."""
+    """Parse the IDL of one type, or of several types each under a line with its name, into definitions by name."""
     types: dict[str, Any] = {}
     for part in text.split(f"{'=' * 80}\n"):
         types |= (
@@ -273,7 +273,7 @@ def _types_of_idl(text: str) -> Any:
 
 
 def has_header(text: str) -> bool:
-    """Whether the messages that a text defines begin with a std_msgs/Header."""
+    """Whether messages with this definition text begin with a std_msgs/Header."""
     lines = (line.partition("#")[0].split() for line in text.split("\n"))
     first = next((words for words in lines if words and not any("=" in word for word in words)), [""])
     return first[0] in ("Header", "std_msgs/Header", "std_msgs/msg/Header")
@@ -281,7 +281,7 @@ def has_header(text: str) -> bool:
 
 @lru_cache(maxsize=64)
 def definition_text(name: str) -> str:
-    """The text that a recording carries for a type, with all the types it is made of.
+    """Return the definition text that a recording carries for a type, including all nested types.
 
     Raises MessageError for a type that is neither one of ROS 2 Humble's nor in _DEFINITIONS.
     """
@@ -294,17 +294,17 @@ def definition_text(name: str) -> str:
 
 
 def known(name: str) -> Definition:
-    """Definition of a type by the text of `definition_text`. Raises MessageError."""
+    """Return the definition of a known type, parsed from its `definition_text`. Raises MessageError."""
     return definition(name, definition_text(name))
 
 
 def at(message: Any, path: str) -> Any:
-    """The field of a decoded message, by its path. Raises AttributeError."""
+    """Return the field of a decoded message at a dotted path. Raises AttributeError."""
     return reduce(getattr, path.split("."), message)
 
 
 def _fields(types: Any, name: str, known: dict[str, int], depth: int = 0) -> int:
-    """Numbers and strings in a message of a type, those of arrays of fixed size included. Raises MessageError."""
+    """Count the numbers and strings in a message of a type, fixed-size arrays included. Raises MessageError."""
     if depth > _DEEPEST or name not in types:
         what = "is nested too deep" if name in types else f"lacks the type {name}"
         raise MessageError(f"the definition of a message type {what}")
@@ -321,7 +321,7 @@ def _fields(types: Any, name: str, known: dict[str, int], depth: int = 0) -> int
 
 
 class _Walk:
-    """Walks one message along its definition, noting the numbers and everything they depend on.
+    """Walks one message along its definition; records the runs of numbers and the bytes that fix the layout.
 
     Raises IndexError when the message is too short and KeyError at something CDR has no numbers for.
     """

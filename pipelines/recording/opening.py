@@ -45,7 +45,7 @@ Where = Path | str | Sequence[Path | str]
 
 
 def open_container(where: Where, strict: bool = False) -> Container:
-    """The container that a path, a pattern or a list of paths names.
+    """Open the recording that a path, a pattern or a list of paths names, as a container of messages.
 
     Raises InputError when something is missing, is no recording, or cannot be read; with `strict` also when anything
     is lost, for which everything is read once.
@@ -73,7 +73,7 @@ def _open(where: Where) -> Container:
 
 
 def group_recordings(paths: Sequence[Path]) -> list[Where]:
-    """The recordings that several paths name: each is one, but for parts of one bag, by the metadata.yaml beside them.
+    """Group paths by recording: each path is one, except that parts of a bag (metadata.yaml beside them) go together.
 
     Folders and patterns stand for all of their parts.
     """
@@ -93,14 +93,14 @@ def group_recordings(paths: Sequence[Path]) -> list[Where]:
 
 
 def describe_recordings(recordings: Sequence[Where]) -> str:
-    """Recordings in words, parts of one side by side."""
+    """Return the file names of recordings as text, the parts of one recording joined by `+`."""
     each = [[one] if isinstance(one, (str, Path)) else list(one) for one in recordings]
     return ", ".join(" + ".join(Path(part).name for part in parts) for parts in each)
 
 
 @contextmanager
 def naming_parts(recordings: Sequence[Where]) -> Iterator[None]:
-    """Add to an InputError of several tables how tables of one recording are named."""
+    """Context manager that adds to an InputError on several tables how to name those of one recording."""
     try:
         yield
     except InputError as error:
@@ -113,7 +113,7 @@ def naming_parts(recordings: Sequence[Where]) -> Iterator[None]:
 
 
 def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
-    """Several files as one recording."""
+    """Open several files as the parts of one recording."""
     if not paths:
         raise InputError("a recording of no files")
     if len({os.path.realpath(path) for path in paths}) < len(paths):
@@ -129,7 +129,7 @@ def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
 
 
 def _file(path: Path) -> Container:
-    """One file, by what it begins with."""
+    """Open one file as the format that its first bytes indicate."""
     require_regular(path)
     with open_binary(path) as stream:
         start = stream.read(16)
@@ -139,7 +139,7 @@ def _file(path: Path) -> Container:
 
 
 def _by_content(path: Path, data: Path) -> Container:
-    """The container in a file `data`, which is named `path`."""
+    """Open the file `data`, which messages name `path`, as the format that its first bytes indicate."""
     with data.open("rb") as stream:
         start = stream.read(_START)
     if start.startswith(ros1_bag.MAGIC):
@@ -169,7 +169,7 @@ def _by_content(path: Path, data: Path) -> Container:
 
 
 def _decompressed(path: Path) -> Container:
-    """A file compressed as a whole: unpacked into a temporary one, which goes with the container."""
+    """Open a file that is compressed as a whole, from a temporary copy that lives as long as the container."""
     whole = tempfile.NamedTemporaryFile(prefix="alidade-", suffix=".unpacked")  # noqa: SIM115
     limit = _SMALL + _LARGEST_RATIO * path.stat().st_size
     damaged = ""
@@ -193,7 +193,7 @@ def _decompressed(path: Path) -> Container:
 
 
 def _folder(path: Path) -> Container:
-    """A folder: of a bag with its metadata.yaml, of the parts of one recording, or of a data set in EuRoC's form."""
+    """Open a folder: a bag with its metadata.yaml, the parts of one recording, or a data set in EuRoC's form."""
     metadata = _metadata(path / METADATA)
     listed = parts_of_bag(metadata)
     if listed:
@@ -228,7 +228,7 @@ def file_identity(path: Path) -> str:
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a file has the mark of one that nobody writes any more; False too of forms that have none."""
+    """Whether a file has the end mark of a finished one; False also for formats without such a mark."""
     with path.open("rb") as stream:
         if stream.read(len(ros1_bag.MAGIC)) == ros1_bag.MAGIC:
             return ros1_bag.is_closed(stream)
@@ -238,7 +238,7 @@ def is_closed(path: Path) -> bool:
 
 
 def parts_in(path: Path) -> list[Path]:
-    """The files, by name, of the one recording in a folder. Raises InputError when there are several."""
+    """Return the files in a folder, by name, of the one recording there. Raises InputError if there are several."""
     there = sorted(file for file in path.iterdir() if file.suffix in PARTS and file.is_file())
     if len({_PART_NAME.sub("", file.name) for file in there}) > 1:
         names = ", ".join(file.name for file in there)
@@ -247,7 +247,7 @@ def parts_in(path: Path) -> list[Path]:
 
 
 def _tables_in(path: Path) -> list[Path]:
-    """The tables in a folder, and what has no rows of numbers left out: a phone's app writes one a sensor."""
+    """Return the tables in a folder that have rows of numbers; phone apps write a table for each sensor."""
     from alidade.pipelines.recording.tables import looks_like_text, table_form
 
     found = []
@@ -274,7 +274,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def bag_metadata(text: bytes | str) -> dict[str, Any]:
-    """Content of a bag's metadata.yaml, by its text; empty if that is something else."""
+    """Parse the text of a bag's metadata.yaml; empty if the text is anything else."""
     try:
         content = load_yaml(text, METADATA)
     except InputError:
@@ -284,13 +284,13 @@ def bag_metadata(text: bytes | str) -> dict[str, Any]:
 
 
 def parts_of_bag(metadata: dict[str, Any]) -> list[str]:
-    """The files that it names, in their order; what is no name of a file is none."""
+    """Return the names of a bag's files in the order in which its metadata lists them; invalid entries are left out."""
     names = metadata.get("relative_file_paths")
     return [Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
 
 
 def _stored(path: Path) -> Path | None:
-    """The file of that name, compressed or not."""
+    """Return the file of that name, or its compressed form `.zstd`; None if neither exists."""
     try:
         return next((one for one in (path, path.with_name(f"{path.name}.zstd")) if one.is_file()), None)
     except (OSError, ValueError):  # no file can have such a name
@@ -298,7 +298,7 @@ def _stored(path: Path) -> Path | None:
 
 
 def _part_of(paths: Sequence[Path]) -> Sequence[str]:
-    """A sentence if the files are parts of a bag, and others of it lie beside them."""
+    """Return a sentence if the files are some parts of a bag, but not all; else nothing."""
     listed = parts_of_bag(_metadata(paths[0].with_name(METADATA)))
     here = [i for i, name in enumerate(listed, start=1) if name in {path.name for path in paths}]
     if not here or len(here) == len(listed):

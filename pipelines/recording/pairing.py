@@ -40,7 +40,7 @@ _GAP = 3.0
 
 @dataclass(frozen=True)
 class Pairing:
-    """Agreement of a gyro and an attitude.
+    """Agreement between the rates of a gyro and those of an attitude.
 
     Attributes:
         correlation: of the norms of their rates, at the delay at which they agree best.
@@ -61,7 +61,7 @@ class Pairing:
 
 
 class _Gyro:
-    """Mean rates of a gyro over intervals, from rates (N, 3) rad/s at stamps; times are s from `start_ns`."""
+    """Mean rates of a gyro over time intervals, from rates (N, 3), rad/s, at stamps; times in s from `start_ns`."""
 
     def __init__(self, t_ns: Stamps, rates: Array, start_ns: int) -> None:
         order = np.argsort(t_ns, kind="stable")
@@ -72,7 +72,7 @@ class _Gyro:
         self._turned = np.concatenate([np.zeros((min(1, len(rates)), 3)), np.cumsum(turned, axis=0)])
 
     def mean(self, a: Array, b: Array) -> Array:
-        """Mean rates (n, 3) from a to b (n,)."""
+        """Return the gyro's mean rates (n, 3), rad/s, from a to b (n,), s."""
         ends = [np.stack([np.interp(x, self.t, column) for column in self._turned.T], axis=1) for x in (a, b)]
         return (ends[1] - ends[0]) / (b - a)[:, None]
 
@@ -88,7 +88,7 @@ def pair(
     wxyz: Array,
     others: Sequence[tuple[Stamps, Array]] = (),
 ) -> Pairing | None:
-    """Rates (N, 3) rad/s at stamps in ns, against unit quaternions (M, 4); None where there is too little motion.
+    """Compare gyro rates (N, 3), rad/s, with unit quaternions (M, 4), at stamps in ns; None with too little motion.
 
     `others` are further gyros, one of which may sit on what carries both and turn the reference of the attitude.
     """
@@ -114,7 +114,7 @@ def pair(
         return None
 
     def fits(later: float, of: Sequence[Array] = ways) -> list[tuple[float, float]]:
-        """Share explained and angle of both ways, at a delay."""
+        """Return the explained share of the rates and the rotation angle, rad, of both directions, at a delay, s."""
         inside = ours.covers(a + later, b + later)
         against = ours.mean(a[inside] + later, b[inside] + later)
         return [_fit(one[inside], against) for one in of]
@@ -135,7 +135,7 @@ def pair(
 
 
 class _Seen(NamedTuple):
-    """Mean rates (n, 3) of an attitude from a to b (n,), and the rotations from its frame into the body."""
+    """Mean rates (n, 3), rad/s, of an attitude from a to b (n,), s, and the rotations from its frame into the body."""
 
     a: Array
     b: Array
@@ -144,7 +144,7 @@ class _Seen(NamedTuple):
 
 
 def _refined(offset: float, seen: _Seen, gyro: _Gyro, others: Sequence[_Gyro]) -> float:
-    """The delay at which the gyro's rates, less those of a carrier if any, fit the attitude's rates best.
+    """Return the delay, s, at which the gyro's rates, less a carrier's if there is one, fit the attitude's rates best.
 
     An attitude relative to a moving carrier has the rate of the gyro less the carrier's, in the body. The fit is linear
     in the relative rotations of the sensors and in their biases.
@@ -161,7 +161,7 @@ def _refined(offset: float, seen: _Seen, gyro: _Gyro, others: Sequence[_Gyro]) -
     rates, ones = seen.rates[rows].ravel(), np.tile(np.eye(3), (int(rows.sum()), 1))
 
     def missed(delay: float, carrier: _Gyro | None) -> float:
-        """Sum of the squared rates that stay unexplained."""
+        """Return the sum of the attitude's squared rates that the gyros do not explain at a delay, s."""
         columns = [ones, _by_axes(gyro.mean(a + delay, b + delay), np.eye(3)[None])]
         if carrier is not None:
             columns.append(_by_axes(carrier.mean(a + delay, b + delay), to_body))
@@ -179,12 +179,12 @@ def _refined(offset: float, seen: _Seen, gyro: _Gyro, others: Sequence[_Gyro]) -
 
 
 def _by_axes(rates: Array, turned: Array) -> Array:
-    """Matrix (3 n, 9) that takes the rows of M to the stacked vectors turned M rates, (n, 3) each."""
+    """Return the matrix (3 n, 9) that maps the rows of M (3, 3) to the stacked vectors `turned` M `rates`."""
     return np.einsum("nij,nk->nijk", np.broadcast_to(turned, (len(rates), 3, 3)), rates).reshape(-1, 9)
 
 
 def _delay(middle: Array, norm: Array, a: Array, b: Array, gyro: _Gyro) -> tuple[float, float | None]:
-    """Correction of the attitude's times, s, and the correlation there; None where nothing moves."""
+    """Return the correction of the attitude's times, s, and the correlation there; None if nothing moves."""
     step = max(_FINEST, float(np.median(b - a)) / 2.0, (middle[-1] - middle[0]) / _MOST)
     grid = np.arange(max(middle[0], gyro.t[0]), min(middle[-1], gyro.t[-1]), step)
     half = 0.5 * float(np.median(b - a))
@@ -208,7 +208,7 @@ def _delay(middle: Array, norm: Array, a: Array, b: Array, gyro: _Gyro) -> tuple
 
 
 def _rates(first: Array, second: Array, steps: Array) -> Array:
-    """Rates in the body (n, 3), rad/s, between quaternions that are steps (n,), s, apart."""
+    """Return mean body rates (n, 3), rad/s, between pairs of quaternions (n, 4) that are `steps` (n,), s, apart."""
     return so3.log(so3.multiply(so3.inverse(first), second)) / steps[:, None]
 
 

@@ -55,7 +55,7 @@ _PASSING_S, _ASIDE = 0.25, 5
 
 
 def implausible(kind: str, values: Array) -> str:
-    """Fault in the unit of readings (N, 3), as a phrase; empty without fault, and for a gyro.
+    """Return a phrase about readings (N, 3) that are implausible in their unit; empty if plausible, and for a gyro.
 
     Args:
         kind: accel, gyro or mag.
@@ -84,7 +84,7 @@ def likely_unit(kind: str, norm: float) -> str:
 
 
 def lacks_gravity(norms: Array) -> bool:
-    """Whether norms (N,) of what an accelerometer read, in m/s^2 or g, are those of motion without gravity."""
+    """Whether accelerometer norms (N,), m/s^2 or g, are those of motion with gravity removed."""
     norm = float(np.median(norms))
     if len(norms) < _FEWEST or norm > _PLAUSIBLE["accel"][1] or any(low < norm < high for low, high in _WITH_GRAVITY):
         return False
@@ -92,7 +92,7 @@ def lacks_gravity(norms: Array) -> bool:
 
 
 def wrapped_bits(values: Array) -> int:
-    """Bits of counts (N, 3) of a signed sensor that were written as unsigned ones; 0 where they were not."""
+    """Return the bits of signed counts (N, 3) that were recorded as unsigned; 0 where they were not."""
     first = values[:_FEWEST]
     if not len(first) or not (np.isfinite(first).all() and (first >= 0).all() and (first == np.rint(first)).all()):
         return 0
@@ -107,12 +107,12 @@ def wrapped_bits(values: Array) -> int:
 
 
 def to_signed(values: Array, bits: int) -> Array:
-    """Counts of so many bits as signed numbers, by two's complement."""
+    """Convert unsigned counts of so many bits to signed numbers, by two's complement."""
     return np.where(values >= 1 << (bits - 1), values - (1 << bits), values)
 
 
 def is_there(kind: str, values: Array, covariance: Array) -> bool:
-    """Whether a sensor measured what a message holds (N, 3), or a driver filled it in.
+    """Whether values (N, 3) in messages are measurements of a sensor, not filled in by a driver.
 
     Args:
         kind: accel or gyro.
@@ -129,7 +129,7 @@ def is_there(kind: str, values: Array, covariance: Array) -> bool:
 
 
 def plausible_covariance(topic: str, kind: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
-    """Covariances (N, 3, 3), zero in place of implausible ones, which are counted in `dropped`.
+    """Return covariances (N, 3, 3) with zero in place of implausible ones, which are counted in `dropped`.
 
     Args:
         topic: for what is counted.
@@ -156,7 +156,7 @@ def plausible_covariance(topic: str, kind: str, covariance: Array, least: float,
 
 
 def density(topic: str, kind: str, t: Array, covariance: Array, least: float, dropped: dict[str, int]) -> float | None:
-    """Noise density, per sqrt(Hz), from the covariances (N, 3, 3) of samples: sigma/sqrt(rate); None if unknown.
+    """Return the noise density, per sqrt(Hz), that covariances (N, 3, 3) of samples state; None if they state none.
 
     Args:
         topic: for what is counted.
@@ -174,7 +174,7 @@ def density(topic: str, kind: str, t: Array, covariance: Array, least: float, dr
 
 
 def measured_once(topic: str, values: Array, dropped: dict[str, int]) -> NDArray[np.intp]:
-    """Rows of values (N, k), sorted by time, without those that repeat the row before where a driver holds them."""
+    """Return the rows of values (N, k), sorted by time, without repeats, if the driver repeats readings regularly."""
     everything = np.arange(len(values))
     if len(values) < _MIN_HELD:
         return everything
@@ -188,7 +188,7 @@ def measured_once(topic: str, values: Array, dropped: dict[str, int]) -> NDArray
 
 
 def dead_band(t: Array, values: Array) -> tuple[float, Array]:
-    """Half width of a device's dead band, 0 without one; on which side of it each of its readings (N, k) is.
+    """Return the half width of a device's dead band, 0 without one, and the side of it (-1, 0, 1) of readings (N, k).
 
     Within a dead band a device reports one value. That is the value of far more samples of an axis than the values next
     to it. The half width is half of what readings change by while they pass through, on average. Beyond it a device
@@ -212,7 +212,7 @@ def dead_band(t: Array, values: Array) -> tuple[float, Array]:
 
 
 def _one_value(values: Array) -> float | None:
-    """The value that readings (N,) have within a dead band, None if there is none."""
+    """Return the one value that readings (N,) have within a dead band; None without a dead band."""
     found, counts = np.unique(values, return_counts=True)
     within, beside = counts[1:-1], counts[:-2] + counts[2:]
     alone = np.flatnonzero((within >= _LEAST_WITHIN) & (within > _ALONE * beside))
@@ -220,7 +220,7 @@ def _one_value(values: Array) -> float | None:
 
 
 def _passed(t: Array, values: Array, side: Array) -> Array:
-    """What readings change by each time that they pass through the one value from one side to the other."""
+    """Return how far readings (N,) change in each passage through a dead band from one side to the other."""
     beyond = np.flatnonzero(side)
     beyond = beyond[(beyond >= _ASIDE) & (beyond < len(t) - _ASIDE)]
     first, last = beyond[:-1], beyond[1:]

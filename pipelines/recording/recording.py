@@ -94,7 +94,7 @@ def open_recording(where: Where, strict: bool = False) -> Recording:
 
 
 class Recording:
-    """The topics of a recording. Holds positions in the file and stamps, not the messages.
+    """Recording as arrays, topic by topic; keeps positions in the file and stamps, not the messages.
 
     What reading a topic shows (notes, delays, sigma of stamps) belongs to this object: `with_config` returns another
     one, which knows of the topics read through it alone.
@@ -132,7 +132,7 @@ class Recording:
         self._stamp_facts: dict[str, tuple[int | None, tuple[str, ...]]] = {}
 
     def with_config(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic] | None = None) -> Recording:
-        """The recording with other derived topics and, if there are any, other described columns of its tables.
+        """Return the recording with other derived topics and, if `columns` has any, with its tables described anew.
 
         Raises InputError when a table or a column is not there, or holds no numbers.
         """
@@ -150,7 +150,7 @@ class Recording:
         return {**self.recorded, **derived}
 
     def remark(self, sentence: str) -> None:
-        """Note an assumption about the recording, once."""
+        """Add a sentence about an assumption to the recording's notes, unless it is there already."""
         if sentence not in self._assumptions:
             self._assumptions = (*self._assumptions, sentence)
 
@@ -164,7 +164,7 @@ class Recording:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences about what is lost, what was assumed, and how stamps came about in the topics read by now."""
+        """Sentences about lost data, assumptions, and the origin of the stamps in the topics read so far."""
         container = self.container
         lost = container.notes(self.epoch_ns, self.duration_s) if container.losses or container.missing else ()
         return (*container.incomplete, *container.assumptions, *self._assumptions, *self._stamp_notes, *lost)
@@ -193,7 +193,7 @@ class Recording:
 
     @property
     def times(self) -> Mapping[str, Times]:
-        """Topic -> stamps (log times where there is no header to be read) and log times."""
+        """Topic -> stamps and log times, Unix ns; log times replace stamps where messages have no readable header."""
         found: dict[str, list[Times]] = {name: [] for name in self.recorded if name not in self._times}
         for name, block in self._blocks(found):
             found[name].append((self._formats[block.channel].stamps(block), block.log_ns))
@@ -202,17 +202,17 @@ class Recording:
         return {**self._times, **{name: self._times[base] for name, base in bases.items() if base in self._times}}
 
     def forget_times(self) -> None:
-        """Drop the stamps read by now, which would stay as long as the recording; `times` reads them anew."""
+        """Free the memory of all stamps read so far; `times` reads them anew."""
         self._all_stamp_facts()
         self._times.clear()
 
     def stamps(self, block: MessageBlock) -> NDArray[np.int64]:
-        """Stamps of the container's messages, Unix ns; log times where there are none."""
+        """Return the stamps of a block's messages, Unix ns; log times where there are none."""
         stamps = self._formats[block.channel].stamps(block)
         return np.where(is_unstamped(stamps, block.log_ns), block.log_ns, stamps)
 
     def there(self) -> str:
-        """A phrase that lists the recorded topics, and what is lost."""
+        """Return a phrase that lists the recorded topics and the lost data."""
         named = [
             f"{name} ({t.type.split('/')[-1]}{f', {t.encoding}' if t.encoding != ENCODING else ''})"
             for name, t in self.recorded.items()
@@ -231,7 +231,7 @@ class Recording:
     # -- topics of numbers
 
     def read_together(self, topics: Mapping[str, Sequence[str]]) -> None:
-        """Decode topics in one pass over the file, for the methods below.
+        """Decode several topics in one pass over the file; the readers below then use the result.
 
         A topic that has no numbers, or cannot be read, is left to the method, which says why.
 
@@ -250,7 +250,7 @@ class Recording:
         self._decoded_tables |= {(n, tuple(wanted[n])): table for n, table in tables.items() if n not in failed}
 
     def imu(self, topic: str, frame: str | None = None) -> series.ImuSeries:
-        """A sensor_msgs/Imu topic, or rates alone from a Vector3Stamped or TwistStamped one: accelerations NaN."""
+        """Read a sensor_msgs/Imu topic, or a Vector3Stamped or TwistStamped one as rates alone: accelerations NaN."""
         if topic in self._sources:
             return self._derived_imu(topic, self._sources[topic])
         if self._require(topic, *messages.RATES).type in messages.IMUS:
@@ -258,7 +258,7 @@ class Recording:
         return joined(self._series(series.VectorSeries, topic, frame), None)
 
     def magnetic(self, topic: str) -> series.MagneticSeries:
-        """A sensor_msgs/MagneticField topic."""
+        """Read a sensor_msgs/MagneticField topic."""
         source = self._sources.get(topic)
         if source is None:
             return self._series(series.MagneticSeries, topic)
@@ -268,15 +268,15 @@ class Recording:
         return dataclasses.replace(found, field=along(source.axes, found.field))
 
     def vector(self, topic: str) -> series.VectorSeries:
-        """A geometry_msgs/Vector3Stamped topic, a TwistStamped's rates or an AccelStamped's accelerations."""
+        """Read a topic of vectors: Vector3Stamped, the rates of TwistStamped, or the accelerations of AccelStamped."""
         return self._series(series.VectorSeries, topic)
 
     def quaternion(self, topic: str) -> series.QuaternionSeries:
-        """A geometry_msgs/QuaternionStamped topic."""
+        """Read a geometry_msgs/QuaternionStamped topic."""
         return self._series(series.QuaternionSeries, topic)
 
     def poses(self, topic: str, frame: str | None = None) -> series.PoseSeries:
-        """A topic of poses, or of attitudes alone, in any of the types of messages.ATTITUDES."""
+        """Read a topic of poses, or of attitudes alone, of any type in messages.ATTITUDES."""
         if topic in self._sources:
             return self.poses_of(self._sources[topic])
         kind = self._require(topic, *messages.ATTITUDES).type
@@ -288,7 +288,7 @@ class Recording:
         return series.PoseSeries(attitude.t_ns, attitude.wxyz, stamped_by_log=attitude.stamped_by_log)
 
     def poses_of(self, source: TopicSource) -> series.PoseSeries:
-        """The poses of a source that `with_config` need not know."""
+        """Read the poses of a topic source, whether or not it was given to `with_config`."""
         if source.topic is None:
             raise InputError(f"{self.path}: topic {source.name} is made of rates; it holds no attitude")
         frames = source.frames
@@ -296,15 +296,15 @@ class Recording:
         return inverted(poses) if source.invert else poses
 
     def fixes(self, topic: str) -> series.FixSeries:
-        """A sensor_msgs/NavSatFix topic."""
+        """Read a sensor_msgs/NavSatFix topic."""
         return self._series(series.FixSeries, topic)
 
     def temperature(self, topic: str) -> series.TemperatureSeries:
-        """A sensor_msgs/Temperature topic."""
+        """Read a sensor_msgs/Temperature topic."""
         return self._series(series.TemperatureSeries, topic)
 
     def joints(self, topic: str, names: Sequence[str]) -> series.JointSeries:
-        """Positions of the named joints on a sensor_msgs/JointState topic, in any order of the messages."""
+        """Read positions, rad, of the named joints on a sensor_msgs/JointState topic, in any order of the messages."""
         self._require(topic, messages.JOINT_STATE)
         table = self._table(topic, tuple(names))
         if not table.filled.any():
@@ -319,12 +319,12 @@ class Recording:
     # -- messages one by one
 
     def camera_info(self, topic: str) -> series.CameraInfo:
-        """The first message of a sensor_msgs/CameraInfo topic."""
+        """Read the first message of a sensor_msgs/CameraInfo topic."""
         with self._problems(topic):
             return single_messages.camera_info(next(self._decoded(topic, messages.CAMERA_INFO)))
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        """Pictures on a CompressedImage or Image topic as (stamp in ns, file), one by one.
+        """Yield the pictures on a CompressedImage or Image topic as (stamp in ns, file), one by one.
 
         Raw ones, and those of a video, are files in the Netpbm form.
         """
@@ -334,12 +334,12 @@ class Recording:
             yield from single_messages.pictures(found, info.type == messages.IMAGE)
 
     def detections(self, topic: str) -> series.DetectionSeries:
-        """An apriltag_msgs/AprilTagDetectionArray topic."""
+        """Read an apriltag_msgs/AprilTagDetectionArray topic."""
         with self._problems(topic):
             return single_messages.tag_detections(self._decoded(topic, messages.TAG_DETECTIONS))
 
     def transforms(self, topic: str) -> Mapping[tuple[str, str], series.PoseSeries]:
-        """Transforms on a tf2_msgs/TFMessage topic by (parent frame, child frame)."""
+        """Read the transforms on a tf2_msgs/TFMessage topic by (parent frame, child frame)."""
         if topic not in self._transforms:
             with self._problems(topic):
                 self._transforms[topic] = single_messages.transforms(self._decoded(topic, messages.TF))
@@ -348,7 +348,7 @@ class Recording:
     # -- derived topics
 
     def _derived_info(self, name: str, source: TopicSource) -> TopicInfo | None:
-        """A derived topic; None if a part is not there."""
+        """Return the facts of a derived topic; None if one of its parts is not recorded."""
         parts = [self.recorded[part] for part in source.parts if part in self.recorded]
         if len(parts) < len(source.parts):
             return None
@@ -367,7 +367,7 @@ class Recording:
         return dataclasses.replace(imu, gyro=along(source.axes, imu.gyro), accel=along(source.axes, imu.accel))
 
     def _part(self, topic: str, which: str) -> series.VectorSeries:
-        """The rates or accelerations on a topic that holds either."""
+        """Read the vectors of a topic, or one attribute of an IMU topic: `gyro` or `accel`."""
         info = self._require(topic, *messages.RATES, messages.ACCEL)
         if info.type not in messages.IMUS:
             return self._series(series.VectorSeries, topic)
@@ -377,7 +377,7 @@ class Recording:
         )
 
     def _between(self, topic: str, frames: tuple[str, str]) -> series.PoseSeries:
-        """The transforms of a pair of frames, parent and child."""
+        """Read the transforms between one pair of frames, (parent, child), on a TFMessage topic."""
         pairs = self.transforms(topic)
         found = pairs.get((frames[0].lstrip("/"), frames[1].lstrip("/")))
         if found is None:
@@ -389,7 +389,7 @@ class Recording:
         return found
 
     def _orientations(self, topic: str, frame: str | None) -> series.PoseSeries:
-        """The orientations of an Imu topic. Raises InputError where it has none."""
+        """Read the orientations of an Imu topic as poses. Raises InputError where the topic has none."""
         imu = self.imu(topic, frame)
         if (imu.wxyz_cov[:, 0, 0] < 0.0).all():
             raise InputError(
@@ -415,7 +415,7 @@ class Recording:
         return dict(sorted(topics.items()))
 
     def _require(self, topic: str, *types: str) -> TopicInfo:
-        """The recorded topic. Raises InputError unless it has messages, of one of the types, that can be decoded."""
+        """Return the recorded topic; raise InputError unless it has decodable messages of one of the types."""
         found = self.recorded.get(topic)
         if found is None:
             problem = f"no topic {topic} ({' or '.join(types)}); {self.there()}; `topics:` in the config can rename"
@@ -439,14 +439,14 @@ class Recording:
         return next(self._formats[number].advice for number, channel in channels if channel.topic == topic)
 
     def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, MessageBlock]]:
-        """Blocks of messages as (topic, messages), in file order."""
+        """Yield the blocks of messages of some topics as (topic, messages), in file order."""
         names = set(topics)
         wanted = {n: channel.topic for n, channel in self.container.channels.items() if channel.topic in names}
         for block in self.container.blocks(set(wanted)) if wanted else ():
             yield wanted[block.channel], block
 
     def _table(self, topic: str, joints: tuple[str, ...] = ()) -> ColumnTable:
-        """The decoded messages of a topic that has been required."""
+        """Return the decoded messages of a topic that `_require` has accepted."""
         table = self._decoded_tables.pop((topic, joints), None)
         if table is None:
             table = ColumnTable(self.recorded[topic].type, self.recorded[topic].count, joints)
@@ -458,7 +458,7 @@ class Recording:
         return table
 
     def _fill(self, tables: Mapping[str, ColumnTable]) -> dict[str, InputError]:
-        """Decode topics in one pass; returns those that cannot be read, with the reason."""
+        """Decode topics into their tables in one pass; return the reason for each topic that cannot be read."""
         failed: dict[str, InputError] = {}
         for topic, block in self._blocks(tables):
             if topic not in failed:
@@ -473,7 +473,7 @@ class Recording:
         return failed
 
     def _decoded(self, topic: str, *types: str) -> Iterator[DecodedMessage]:
-        """Messages one by one, in file order."""
+        """Yield the decoded messages of a topic one by one, in file order."""
         info = self._require(topic, *types)
         times = []
         for _, block in self._blocks([topic]):
@@ -496,7 +496,7 @@ class Recording:
 
     @contextmanager
     def _problems(self, topic: str) -> Iterator[None]:
-        """Make an InputError of messages that cannot be decoded, or whose fields are missing or something else."""
+        """Context manager that raises InputError for messages of a topic that cannot be decoded or lack a field."""
         try:
             yield
         except MessageError as error:
@@ -520,7 +520,7 @@ class Recording:
         return kind(t_ns, stamped_by_log=from_log, frame_id=next(iter(table.frames()), ""), **columns)
 
     def _sorted(self, topic: str, table: ColumnTable) -> tuple[NDArray[np.int64], int, dict[str, Array]]:
-        """Stamps, the number of them that are log times, and columns, by log time, of a clock that was not set."""
+        """Return stamps, how many of them are log times, and columns, by log time; InputError if the clock was set."""
         if self.recorded[topic].type in SENSOR_STAMPED_TYPES:
             check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, from_log, columns = table.sorted()
@@ -528,7 +528,7 @@ class Recording:
         return t_ns, from_log, columns
 
     def _choose_frame(self, topic: str, table: ColumnTable, frame: str | None) -> None:
-        """Keep the messages of a frame. Raises InputError where it has none, and where none is given of several.
+        """Keep the messages of one frame. Raises InputError if it has none, or if none of several is named.
 
         Frames that follow one another in time are one device that was renamed.
         """
@@ -551,7 +551,7 @@ class Recording:
 
     @property
     def _stamp_notes(self) -> tuple[str, ...]:
-        """Sentences about how the stamps came about in the topics read by now."""
+        """Sentences about the origin of the stamps in the topics read so far."""
         facts = self._all_stamp_facts()
         left_out = (
             f"topic {name}: {n} messages without a stamp, among others that have one, are left out"
@@ -568,7 +568,7 @@ class Recording:
         return self._stamp_facts
 
     def _note_unstamped(self, topic: str, t_ns: NDArray[np.int64], from_log: int) -> None:
-        """Note that log times replace stamps, and by how much they jitter."""
+        """Note that log times replace the missing stamps of a topic, and the log times' jitter."""
         if not from_log:
             return
         jitter = jitter_ns(np.diff(t_ns))

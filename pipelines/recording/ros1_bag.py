@@ -33,7 +33,7 @@ _TIME = struct.Struct("<II")
 
 @dataclass
 class _Chunk:
-    """A chunk: where its data lie in the file, how they are packed, and the messages of each connection."""
+    """Chunk of a bag: byte range of its data, compression, and number of messages of each connection."""
 
     start: int
     end: int
@@ -43,7 +43,7 @@ class _Chunk:
 
 
 class Ros1Bag(Container):
-    """A bag; the file is opened again for every read.
+    """ROS 1 bag as a container; the file is opened again for every read.
 
     Args:
         path: of the file, as it is named.
@@ -64,7 +64,7 @@ class Ros1Bag(Container):
         self.set_counts(total(chunk.counts for chunk in self._chunks))
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
-        """The messages of these connections, chunk by chunk."""
+        """Yield the messages of these connections, chunk by chunk."""
         with self.data.open("rb") as stream:
             for chunk in self._chunks:
                 if not channels & chunk.counts.keys():
@@ -80,7 +80,7 @@ class Ros1Bag(Container):
                     yield found[number]
 
     def _walk(self, stream: BinaryIO) -> None:
-        """Note where the chunks are, what connections there are, and where the file ends too early."""
+        """Index the bag's chunks and connections; record a loss if the file ends too early."""
         position, unpacked, indexed = len(MAGIC), 0, 0
         try:
             for op, header, start, end in _records(stream, position, self.size, "a record"):
@@ -130,7 +130,7 @@ class Ros1Bag(Container):
         self.channels[number] = Channel(number, topic, "ros1", number)
 
     def _messages(self, stream: BinaryIO, chunk: _Chunk) -> dict[int, MessageBlock]:
-        """The messages in a chunk, by connection. Raises DamagedError."""
+        """Return the messages in a chunk, a block for each connection. Raises DamagedError."""
         stream.seek(chunk.start)
         data = _unpacked(stream.read(chunk.end - chunk.start), chunk.compression, chunk.size)
         found: dict[int, tuple[list[int], list[int], list[int]]] = {}
@@ -165,7 +165,7 @@ class Ros1Bag(Container):
 
 
 def is_closed(stream: BinaryIO) -> bool:
-    """Whether a bag has been closed: its header says where the index is."""
+    """Whether a bag has been closed: its header then states the position of the index."""
     size = stream.seek(0, 2)
     try:
         _, header, _, _ = next(_records(stream, len(MAGIC), size, "a record"))
@@ -177,7 +177,7 @@ def is_closed(stream: BinaryIO) -> bool:
 def _records(
     stream: BinaryIO, position: int, stop: int, what: str
 ) -> Iterator[tuple[int, dict[bytes, bytes], int, int]]:
-    """Kind, header, begin and end of data of each record in [position, stop); DamagedError names `what`."""
+    """Yield kind, header, begin and end of data of each record in [position, stop); errors call a record `what`."""
     while position < stop:
         stream.seek(position)
         head = stream.read(4)
@@ -194,7 +194,7 @@ def _records(
 
 
 def _fields(header: bytes) -> dict[bytes, bytes]:
-    """name=value, each after its length. Raises DamagedError."""
+    """Return the ROS 1 header fields of a record as a mapping of name to bytes. Raises DamagedError."""
     fields, at = {}, 0
     while at < len(header):
         length = int.from_bytes(header[at : at + 4], "little")
@@ -207,7 +207,7 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
 
 
 def _unpacked(packed: bytes, compression: str, size: int) -> bytes:
-    """The data of a chunk. At most one byte more than it says is decompressed. Raises DamagedError."""
+    """Decompress the data of a chunk, at most one byte more than the chunk states. Raises DamagedError."""
     if compression not in ("none", "bz2", "lz4"):
         raise DamagedError(f"unknown compression {compression!r}")
     if size > min(_LARGEST_CHUNK, _SMALL + _LARGEST_RATIO * len(packed)):

@@ -37,7 +37,7 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Base of all series: fills in what is left out and checks shapes (ValueError)."""
+    """Base of all series: fills in arrays that are left out, and raises ValueError at a wrong shape."""
 
     TYPE: ClassVar[str]
     COLUMNS: ClassVar[dict[str, Column]]

@@ -28,7 +28,7 @@ _MEASURED = 20
 
 @dataclass(frozen=True)
 class Rows:
-    """Array that has one row a stamp.
+    """Annotation of an array with one row for each stamp.
 
     Attributes:
         shape: of a row; None: any.
@@ -40,7 +40,7 @@ class Rows:
     unmeasured: tuple[int, ...] = ()
 
     def read(self, name: str, value: Any) -> Array:
-        """User input for the array of that name, as floats; masked values are NaN.
+        """Convert user input for the array called `name` to floats; masked values become NaN.
 
         Raises:
             InputError: it has anything but numbers, no rows, or rows of another shape.
@@ -61,13 +61,13 @@ class Rows:
         return np.asarray(np.ma.filled(array.astype(float, copy=False), np.nan))
 
     def lost(self, values: Array) -> NDArray[np.intp]:
-        """The rows in which anything that has to be measured is not finite."""
+        """Return the indexes of the rows in which a required component is not finite."""
         for axis in range(1, values.ndim) if self.unmeasured else ():
             values = np.delete(values, self.unmeasured, axis)
         return np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
 
     def placeholders(self, values: Array) -> list[int]:
-        """Components of the rows (N, n) that need not be measured and were not: they read one value throughout.
+        """Return the optional components of the rows (N, n) that were not measured: they read one value throughout.
 
         A driver that measures two angles leaves the third as it is.
         """
@@ -83,7 +83,7 @@ Covariances = Annotated[Array, Rows((3, 3))]
 
 
 def as_dates(value: Any) -> NDArray[np.int64] | None:
-    """Dates or times since a start, of numpy or pandas, as integer ns, (N,); None where they are none."""
+    """Convert dates, or times since a start, of numpy or pandas to integer ns (N,); None for anything else."""
     if isinstance(value, list | tuple):
         if not value or not isinstance(value[0], datetime.datetime | datetime.timedelta | np.datetime64):
             return None
@@ -96,12 +96,12 @@ def as_dates(value: Any) -> NDArray[np.int64] | None:
 
 
 def _without_zone(date: Any) -> Any:
-    """A date in UTC, without its zone."""
+    """Return a date converted to UTC, without its time zone."""
     return date.astimezone(datetime.UTC).replace(tzinfo=None) if getattr(date, "tzinfo", None) else date
 
 
 def _odd_row(value: Any) -> str:
-    """End of a sentence: the first row of another length than row 0."""
+    """Return the end of a sentence about the first row whose length differs from row 0; empty if there is none."""
     try:
         lengths = [len(row) if hasattr(row, "__len__") else -1 for row in value]
     except TypeError:
@@ -111,7 +111,7 @@ def _odd_row(value: Any) -> str:
 
 
 def rows_by_name(kind: type) -> Mapping[str, Rows]:
-    """The arrays among the fields of a class of data."""
+    """Return the annotations of the array fields of a data class, by field name."""
     hints = typing.get_type_hints(kind, include_extras=True)
     return {name: rows for name, hint in hints.items() if (rows := _rows(hint)) is not None}
 

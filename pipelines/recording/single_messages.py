@@ -18,7 +18,7 @@ from alidade.pipelines.recording.messages import MessageError
 
 
 def camera_info(message: DecodedMessage) -> series.CameraInfo:
-    """The intrinsics in a sensor_msgs/CameraInfo."""
+    """Return the intrinsics in a sensor_msgs/CameraInfo message."""
     found = message.content
     k, r, p, d = (np.array(values, dtype=float) for values in (found.k, found.r, found.p, found.d))
     size = int(found.width), int(found.height)
@@ -27,7 +27,7 @@ def camera_info(message: DecodedMessage) -> series.CameraInfo:
 
 
 def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
-    """Pictures as (stamp in ns, file): raw ones and those of a video in the Netpbm form."""
+    """Yield pictures as (stamp in ns, file); raw ones and frames of a video become files in the Netpbm form."""
     files = (_file(message, is_raw) for message in messages)
     for t_ns, form, data in files:
         if form in images.ANNEX_B or form in images.BY_PYAV:
@@ -41,7 +41,7 @@ def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple
 
 
 def _file(message: DecodedMessage, is_raw: bool) -> tuple[int, str, bytes]:
-    """Stamp, form, and file or packet of a video."""
+    """Return a message's stamp, ns, its format, and its picture as a file, or its packet of a video."""
     found = message.content
     if is_raw:
         return message.t_ns, "netpbm", images.netpbm(found)
@@ -86,7 +86,7 @@ def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], seri
 
 
 def _poses(rows: list[tuple[int, bool, Any]]) -> series.PoseSeries:
-    """Poses of (stamp, whether it is a log time, translation and quaternion x, y, z, w)."""
+    """Make a series of poses from rows of stamp, whether that is a log time, and x, y, z, qx, qy, qz, qw."""
     numbers = np.array([row[2] for row in rows]).reshape(len(rows), 7)
     t_ns = np.array([row[0] for row in rows], dtype=np.int64)
     from_log = sum(row[1] for row in rows)

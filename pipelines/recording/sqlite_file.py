@@ -54,7 +54,7 @@ class SqliteFile(Container):
             raise InputError(f"{path}: nothing in it can be read")
 
     def _read_blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
-        """The messages of these channels in the order they were recorded."""
+        """Yield the messages of these channels in the order of recording."""
         left = {number: self.counts.get(number, 0) for number in channels}
         reason = ""
         with self._open() as database:
@@ -110,12 +110,12 @@ class SqliteFile(Container):
         raise InputError(f"{self.path}: cannot be opened (SQLite says: {last})")
 
     def _works_too_long(self) -> bool:
-        """Called by SQLite after each _GLANCE of its instructions; true ends the query."""
+        """Progress handler of SQLite: true ends a query that has yielded no row for _MOST_IDLE instructions."""
         self._idle += _GLANCE
         return self._idle > _MOST_IDLE
 
     def _keep_whole_pages(self) -> None:
-        """Read a truncated file through a copy of its whole pages, their number in its header.
+        """Replace a truncated file by a copy of its whole pages, with their number in the header.
 
         As it is, SQLite would refuse it, or take what is missing of the last page for zeros.
         """
@@ -140,7 +140,7 @@ class SqliteFile(Container):
         self.losses.append(DataLoss("cut", whole * page, size - whole * page, reason="it is cut short"))
 
     def _check_tables(self, database: sqlite3.Connection) -> None:
-        """Real tables of stored columns alone: whatever is computed could be anything, and last for ever."""
+        """Raise InputError unless the tables are real ones of stored columns; computed ones could run for ever."""
         found: list[Any] = database.execute("SELECT name, type, rootpage FROM sqlite_master LIMIT 100").fetchall()
         tables = {str(name) for name, kind, page in found if kind == "table" and isinstance(page, int) and page > 0}
         if not {"topics", "messages"} <= tables:
@@ -173,7 +173,7 @@ class SqliteFile(Container):
         return channels, schemas
 
     def _count(self, database: sqlite3.Connection) -> None:
-        """Messages of each channel; of a damaged file those that SQLite comes to."""
+        """Count the messages of each channel; of a damaged file those that SQLite can reach."""
         counts = Counter[int]()
         try:
             for (number,) in database.execute("SELECT topic_id FROM messages ORDER BY rowid"):

@@ -43,7 +43,7 @@ _MIN_MESSAGES = 50
 
 
 class Step(NamedTuple):
-    """A step of a clock: by how much, s, after which time, ns, and what stepped."""
+    """Step of a clock: size, s, last time before the step, ns, and which times step."""
 
     size: float
     after_ns: int
@@ -51,7 +51,7 @@ class Step(NamedTuple):
 
 
 def check_clock(topic: str, t_ns: Stamps, log_ns: Stamps, epoch_ns: int) -> None:
-    """Raise InputError if the clock was set between these stamps and log times, ns, in the order of the file."""
+    """Raise InputError if the clock that made stamps or log times, ns, in file order, was set meanwhile."""
     step = find_clock_step(t_ns, log_ns)
     if step is not None:
         way = "back" if step.size < 0.0 else "forward"
@@ -63,7 +63,7 @@ def check_clock(topic: str, t_ns: Stamps, log_ns: Stamps, epoch_ns: int) -> None
 
 
 def find_clock_step(t_ns: Stamps, log_ns: Stamps) -> Step | None:
-    """The first step of the clock, from stamps and log times in the order of the file; None if there is none."""
+    """Return the first clock step in stamps and log times, ns, in the order of the file; None if there is none."""
     if len(t_ns) < 2 * _MIN_RUN:
         return None
     twice = _runs_twice(log_ns)
@@ -88,7 +88,7 @@ def _is_sorted(times: Stamps) -> bool:
 
 
 def _runs_twice(times: Stamps) -> tuple[int, float] | None:
-    """Index of the last time before a step back, and its size, s."""
+    """Return the index of the last time before a backward step, and the step's size, s; None without a step."""
     if _is_sorted(times):
         return None
     late = times < np.maximum.accumulate(times)
@@ -109,7 +109,7 @@ def _runs_twice(times: Stamps) -> tuple[int, float] | None:
 
 
 def _against_log(t_ns: Stamps, log_ns: Stamps) -> Step | None:
-    """A lasting step of the clock that stamps a topic, against the log times."""
+    """Return a lasting step, against the log times, of the clock that stamps a topic; None if there is none."""
     ahead = t_ns - log_ns
     if ahead.max() - ahead.min() <= MIN_CLOCK_STEP_S * 1e9:
         return None
@@ -135,7 +135,7 @@ def _against_log(t_ns: Stamps, log_ns: Stamps) -> Step | None:
 
 
 def stamp_notes(topic: str, t_ns: Stamps, log_ns: Stamps) -> tuple[str, ...]:
-    """Sentences about the stamps of a topic, from them and its log times, (N,) ns each; none without a conclusion."""
+    """Return sentences about faults of a topic's stamps, seen against its log times, (N,) ns each; none if sound."""
     if len(t_ns) < _MIN_MESSAGES:
         return ()
     steps, logged = _steps(t_ns), _steps(log_ns)
@@ -155,7 +155,7 @@ def stamp_notes(topic: str, t_ns: Stamps, log_ns: Stamps) -> tuple[str, ...]:
 
 
 def jitter_ns(steps: Stamps) -> float:
-    """Sigma of the single times, ns, from the steps between them (N,): robust, 0 where there are none."""
+    """Return a robust sigma of times, ns, from the steps between them (N,); 0 without steps."""
     return 1.4826 / np.sqrt(2.0) * float(np.median(np.abs(steps - np.median(steps)))) if len(steps) else 0.0
 
 
@@ -164,7 +164,7 @@ def _steps(times: Stamps) -> Stamps:
 
 
 def _burst_share(steps: Stamps) -> float:
-    """Share of steps within bursts; steps of zero are duplicates, and counted as such."""
+    """Share of steps (N,) within bursts; steps of zero belong to duplicates and are in none."""
     across = min(_INTERVAL_SAMPLES, len(steps))
     time = np.concatenate([[0], np.cumsum(steps)])
     usual = float(np.median(time[across:] - time[:-across])) / across
@@ -172,5 +172,5 @@ def _burst_share(steps: Stamps) -> float:
 
 
 def _even_share(steps: Stamps) -> float:
-    """Share of steps that are the usual one."""
+    """Share of steps (N,) that equal the median step within _EVEN_NS."""
     return float(np.mean(np.abs(steps - np.median(steps)) <= _EVEN_NS))

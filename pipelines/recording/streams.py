@@ -52,7 +52,7 @@ class Samples(Generic[AnySeries]):
     series: AnySeries
 
     def rows(self, rows: NDArray[np.intp]) -> Samples[AnySeries]:
-        """The selected samples."""
+        """Return the samples in the selected rows."""
         return Samples(checks.take_rows(self.t, rows), _rows(self.series, rows))
 
 
@@ -65,16 +65,16 @@ class Temperature:
 
     @property
     def first(self) -> float:
-        """The first one, degrees Celsius: biases are stated at it."""
+        """First temperature, degrees Celsius, at which biases are stated."""
         return float(self.celsius[0])
 
     def above(self, reference: float, at: ArrayLike) -> Array:
-        """Difference (n,), K, from a reference, degrees Celsius, at times (n,), s: linear between messages."""
+        """Return temperatures above a reference, K, at times (n,), s, interpolated linearly between messages."""
         return np.asarray(np.interp(np.asarray(at, dtype=float), self.t, self.celsius) - reference)
 
 
 class StreamReader:
-    """Reads the sensors of a recording.
+    """Reads the sensors of a recording and counts the samples that cannot be used.
 
     Args:
         recording: it.
@@ -91,7 +91,7 @@ class StreamReader:
         recording.read_together(topics)
 
     def count(self, topic: str, reason: str, number: int) -> None:
-        """Count samples of a topic in `dropped`."""
+        """Add a number of samples of a topic to the entry of a reason in `dropped`."""
         checks.count(self.dropped, f"{topic}: {reason}", number)
 
     def clean(
@@ -110,7 +110,7 @@ class StreamReader:
         may_be_constant: bool = False,
         may_be_held: bool = False,
     ) -> Samples[AnySeries]:
-        """Samples of a series in which all of the quantities (attributes of it) are finite and without faults.
+        """Return the samples of a series whose `quantities` (names of attributes) are finite and without faults.
 
         Args:
             topic: for messages.
@@ -138,7 +138,7 @@ class StreamReader:
         return samples.rows(sound)
 
     def gyro(self, topic: str, least: int = 2, may_be_constant: bool = False) -> Samples[ImuSeries]:
-        """Samples of an Imu topic with usable rates, rad/s; a reading that the driver repeats is used once.
+        """Read the samples of an Imu topic with usable rates, rad/s; a reading that the driver repeats is used once.
 
         `may_be_constant`: a parked platform may read zero throughout, by a simulator or a driver that cuts off noise.
         """
@@ -155,7 +155,7 @@ class StreamReader:
         return samples
 
     def force(self, topic: str, imu: Samples[ImuSeries]) -> Array | None:
-        """Specific force (N, 3), m/s^2, of samples that `gyro` returned; None where the Imu has none.
+        """Return the specific force (N, 3), m/s^2, of samples from `gyro`; None where the topic has no accelerometer.
 
         It has none when it is a placeholder, when a number is missing, or when it is not in m/s^2, gravity in it.
         """
@@ -168,7 +168,7 @@ class StreamReader:
         return force
 
     def magnetic_field(self, topic: str) -> Samples[MagneticSeries]:
-        """Samples of a MagneticField topic, T; a reading that the driver repeats is used once."""
+        """Read the samples of a MagneticField topic, T; a reading that the driver repeats is used once."""
         return self.samples(topic, self.recording.magnetic(topic), "field", may_be_held=True)
 
     def density(self, topic: str, kind: str, samples: Samples[AnySeries]) -> float | None:
@@ -233,7 +233,7 @@ def imu_series(
     accel_density: float | None = None,
     frame_id: str = "imu",
 ) -> ImuSeries:
-    """The series of an IMU, to be written: samples at times t (N,), s, that state noise densities, SI per sqrt(Hz)."""
+    """Make an IMU series for writing, from samples at times t (N,), s, and noise densities, SI per sqrt(Hz)."""
     t_ns, force = checks.nanoseconds(t, epoch_ns), np.zeros(3) if accel is None else accel
     gyro_cov, accel_cov = white_covariance(t, density), white_covariance(t, accel_density)
     return ImuSeries(t_ns, gyro, force, gyro_cov=gyro_cov, accel_cov=accel_cov, frame_id=frame_id)
@@ -245,7 +245,7 @@ def white_covariance(t: Array, density: float | None) -> Array:
 
 
 def _check_recorded(topic: str, found: AnySeries, name: str) -> None:
-    """Refuse an IMU that states by its covariance of -1 that it has no such sensor, and has none."""
+    """Raise InputError for an IMU without a sensor: it states a covariance of -1 and has no plausible readings."""
     if not isinstance(found, ImuSeries) or name not in _NAMES:
         return
     values, cov = getattr(found, name), getattr(found, f"{name}_cov")
@@ -256,7 +256,7 @@ def _check_recorded(topic: str, found: AnySeries, name: str) -> None:
 
 
 def _rows(found: AnySeries, rows: NDArray[np.intp]) -> AnySeries:
-    """Rows of a series."""
+    """Return a series with the selected rows alone."""
     names = ("t_ns", *(found.COLUMNS if isinstance(found, Series) else ("position",)))
     kept: dict[str, Any] = {name: checks.take_rows(getattr(found, name), rows) for name in names}
     return dataclasses.replace(found, **kept)

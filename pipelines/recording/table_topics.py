@@ -122,14 +122,14 @@ class TableTopic(BaseModel):
 
     @property
     def names(self) -> list[str]:
-        """The columns that are needed."""
+        """Names of the table's columns that the topic needs."""
         stamps = [] if self.time is None else [self.time]
         return [*stamps, *self.where, *(name for found in self._given.values() for name in found)]
 
     def to_series(
         self, topic: str, form: TableForm, columns: Mapping[str, NDArray[np.str_]]
     ) -> tuple[series.Topic, list[str]]:
-        """The topic as a series, and sentences about what was concluded or left out.
+        """Return the topic as a series, and sentences about assumptions and left-out rows.
 
         Rows without a number in any of its columns are left out. Raises InputError.
 
@@ -177,7 +177,7 @@ class TableTopic(BaseModel):
 
     @property
     def _given(self) -> dict[str, list[str]]:
-        """Quantity -> its columns."""
+        """Quantity -> names of its columns."""
         return {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
 
     @property
@@ -185,7 +185,7 @@ class TableTopic(BaseModel):
         return any(getattr(self, name) is not None for name in _SLOW)
 
     def _rows(self, path: Path, columns: Mapping[str, NDArray[np.str_]]) -> NDArray[np.bool_]:
-        """Mask of the rows with the values of `where`. Raises InputError where none has."""
+        """Mask of the rows that have the values of `where`. Raises InputError where no row has them."""
         rows = np.ones(len(next(iter(columns.values()))), dtype=bool)
         for name, value in self.where.items():
             rows &= np.array([_is_value(text, value) for text in columns[name].tolist()], dtype=bool)
@@ -208,7 +208,7 @@ class TableTopic(BaseModel):
         return stated
 
     def _scale(self, name: str, form: TableForm, notes: list[str]) -> float:
-        """SI of the unit that the config says, else the header of all its columns, else 1."""
+        """Return the factor to SI of a quantity's unit: by the config, else by the header of its columns, else 1."""
         if name in self.units:
             return UNITS[self.units[name]]
         stated = {unit_of(name, form.units[form.index(column)]) for column in self._columns(name)}
@@ -228,12 +228,12 @@ def _absent(names: set[str]) -> dict[str, Any]:
 
 
 def _measures(name: str, unit: str) -> bool:
-    """Whether a unit is one of what the columns hold."""
+    """Whether a unit is one that the quantity `name` can have."""
     return name in _QUANTITIES and unit in COMPATIBLE[_QUANTITIES[name]]
 
 
 def _is_value(text: str, value: str | float | int) -> bool:
-    """Whether a cell has a value: as it is written, or as a number."""
+    """Whether a cell has a value, compared as text or as a number."""
     if text == str(value):
         return True
     try:
@@ -245,7 +245,7 @@ def _is_value(text: str, value: str | float | int) -> bool:
 def _without_erased(
     path: Path, t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]], notes: list[str]
 ) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
-    """Without last rows that are all the same, time and numbers, as flash memory that was never written."""
+    """Remove last rows that all repeat one time and its numbers, as erased flash memory reads."""
     if len(t_ns) < 3 or t_ns[-1] != t_ns[-2]:
         return t_ns, values
     alike = t_ns == t_ns[-1]
@@ -262,7 +262,7 @@ _NUMBERS = (
 
 
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:
-    """A container with its tables read as the config describes them. Raises InputError at a table that is not there."""
+    """Return a container with its tables read as the config describes. Raises InputError for a missing table."""
     tables = tables_of(container)
     by_file: dict[str, dict[str, TableTopic]] = {}
     for topic, table in columns.items():

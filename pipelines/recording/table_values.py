@@ -58,7 +58,7 @@ _ENDINGS = ("dps", "mdps", "rads", "radps", "mps2", "ms2", "mg", "g", "ut", "nt"
 
 
 def unit_named(text: str) -> str:
-    """The unit that a text is the name of, in the words of UNITS and TIME_UNITS; empty where it is none."""
+    """Return the unit that a text names, as UNITS and TIME_UNITS spell it; empty for any other text."""
     plain = _plain(text)
     if plain in UNITS or plain in TIME_UNITS:
         return plain
@@ -79,12 +79,12 @@ def unit_hinted(name: str) -> str:
 
 
 def unit_of(quantity: str, unit: str) -> str:
-    """A unit as it is meant of a quantity: an accelerometer's G is g, a magnetometer's g is gauss."""
+    """Return the unit that is meant for a quantity: an accelerometer's G is g, a magnetometer's g is gauss."""
     return _OF_QUANTITY.get((quantity, unit), unit)
 
 
 def _plain(text: str) -> str:
-    """A unit without brackets and blanks, in ASCII."""
+    """Return the text of a unit without brackets and blanks, in ASCII."""
     text = text.strip().strip("()[]{}").strip()
     for sign, letters in {
         "\u00b5": "u",
@@ -110,7 +110,7 @@ _BITS, _PART = (16, 24, 32), 8
 
 
 def nanoseconds(path: Path, texts: NDArray[np.str_], unit: str) -> Stamps:
-    """Times as written, exactly, as integer ns. Raises InputError at one that is no time, or of another unit."""
+    """Convert times as written to integer ns, exactly. Raises InputError at one that is no time, or of another unit."""
     if not len(texts):
         return np.empty(0, np.int64)
     if any(":" in text for text in texts[:2].tolist()):
@@ -132,12 +132,12 @@ def nanoseconds(path: Path, texts: NDArray[np.str_], unit: str) -> Stamps:
 
 
 def of_rate(count: int, rate_hz: float) -> Stamps:
-    """Stamps (n,), ns, of rows that come at a rate, from 0 on."""
+    """Return stamps (n,), ns, from 0 on, of rows at a constant rate."""
     return np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def check_steps(path: Path, name: str, t_ns: Stamps, unit: str, slowest_s: float) -> None:
-    """Raise InputError where steps between stamps are no sensor's, but would be in another unit of time.
+    """Raise InputError where steps between stamps are plausible for a sensor only in another unit of time.
 
     Args:
         path: of the table.
@@ -171,7 +171,7 @@ def _check_size(path: Path, largest_ns: float, unit: str) -> None:
 
 
 def _unwrapped(ticks: Stamps) -> Stamps:
-    """A counter that ran over, counted on; as it is where its steps back are others."""
+    """Return ticks of a counter without its overflows; unchanged where backward steps are no overflows."""
     steps = np.diff(ticks)
     back = np.flatnonzero(steps < 0)
     if not len(back) or ticks.min() < 0:
@@ -184,7 +184,7 @@ def _unwrapped(ticks: Stamps) -> Stamps:
 
 
 def _of_clock(path: Path, texts: NDArray[np.str_]) -> Stamps:
-    """Dates as ISO 8601 has them, or times of a day."""
+    """Convert ISO 8601 dates, or times of day, to integer ns."""
     out = np.empty(len(texts), np.int64)
     dated = _DATED.fullmatch(str(texts[0])) is not None
     for i, text in enumerate(texts.tolist()):

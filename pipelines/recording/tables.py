@@ -46,7 +46,7 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|
 
 @dataclass(frozen=True)
 class TableForm:
-    """A table in a text file, by its format: encoding, delimiter, decimal mark, columns.
+    """Format of a table in a text file: encoding, delimiter, decimal mark, columns.
 
     Attributes:
         path: as it was named.
@@ -87,7 +87,7 @@ class TableForm:
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
-    """A trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a table, whose topics the config has to describe.
+    """Read a text file: a trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a table that the config describes.
 
     Args:
         path: as it was named.
@@ -103,7 +103,7 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
 
 
 class CsvFile(ArrayContainer):
-    """A table; without topics until `table_topics.described` says which column is what."""
+    """Container of a table; has no topics until `table_topics.described` assigns the columns."""
 
     def __init__(self, form: TableForm) -> None:
         columns = ", ".join(form.names[:40])
@@ -113,14 +113,14 @@ class CsvFile(ArrayContainer):
 
 
 def looks_like_text(start: bytes) -> bool:
-    """Whether a file that begins with these bytes is one of text."""
+    """Whether the first bytes of a file are those of a text file."""
     if start.startswith(tuple(_BOMS)):
         return True
     return bool(start) and not any(byte < 32 and byte not in b"\t\n\r\f" for byte in start)
 
 
 def table_form(path: Path, data: Path) -> TableForm:
-    """Format of a table. Raises InputError where it has no row of numbers."""
+    """Return the format of a table from the start of its file. Raises InputError for a file that is no table."""
     with data.open("rb") as stream:
         start = stream.read(_HEAD)
     encoding = _encoding(start)
@@ -163,7 +163,7 @@ def table_form(path: Path, data: Path) -> TableForm:
 
 
 def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:
-    """Refuse rows of twice as many cells as names, but for a time perhaps: commas mark their decimals too."""
+    """Raise InputError for rows of about twice as many cells as names: commas mark the decimals too."""
     names = _cells(_uncommented(next((line for line in reversed(above) if line.strip()), "")), ",")
     if len(names) > 2 and width in (2 * len(names) - 1, 2 * len(names)):
         raise InputError(
@@ -173,7 +173,7 @@ def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:
 
 
 def read_columns(form: TableForm, names: Sequence[str]) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-    """The named columns as texts, row by row, and sentences about rows that are left out.
+    """Return the named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
     are no rows; a last row that is cut short is left out, and so are others up to 1 % of all.
@@ -189,7 +189,7 @@ def read_columns(form: TableForm, names: Sequence[str]) -> tuple[dict[str, NDArr
 
 
 def numbers(path: Path, columns: Mapping[str, NDArray[np.str_]], names: Sequence[str]) -> Array:
-    """Columns as numbers (N, len(names)), NaN where there is none. Raises InputError, naming the cell, at a word."""
+    """Convert columns to numbers (N, len(names)), NaN for missing ones. Raises InputError, naming the cell, at text."""
     table = np.stack([columns[name] for name in names], axis=1)
     try:
         return np.where(table == "", "nan", table).astype(float)
@@ -213,7 +213,7 @@ def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
 
 
 def _whole_rows(form: TableForm, wanted: Sequence[int]) -> tuple[list[list[str]], list[str]]:
-    """The wanted cells of each row, and sentences about rows that are left out; see `read_columns`."""
+    """Return the wanted cells of each whole row, and sentences about rows that are left out; see `read_columns`."""
     rows: list[list[str]] = []
     cut: list[tuple[int, int]] = []
     headers, needed = 1, max(form.width, *(i + 1 for i in wanted))
@@ -245,7 +245,7 @@ def _encoding(start: bytes) -> str:
 
 
 def _separators(lines: Sequence[str]) -> tuple[str, str]:
-    """Delimiter and decimal mark: those by which most cells of a sample of lines are numbers and fewest are not."""
+    """Return the delimiter and decimal mark by which most cells in a sample of lines are numbers."""
     sample = [line for line in lines if line.strip() and not _is_comment(line)][-_SAMPLE:]
     best = (0, ",", ".")
     for delimiter in ("\t", ";", ",", "|", " "):
@@ -261,7 +261,7 @@ def _separators(lines: Sequence[str]) -> tuple[str, str]:
 
 
 def _header(lines: Sequence[str], delimiter: str, width: int) -> tuple[int | None, int | None]:
-    """Line numbers of the header and of the line of units, above the first row."""
+    """Return the line numbers of the header and of the line of units above the first row; None where missing."""
     there = [i for i, line in enumerate(lines) if line.strip()]
     found: list[int] = []
     for i in reversed(there):
@@ -282,13 +282,13 @@ def _header(lines: Sequence[str], delimiter: str, width: int) -> tuple[int | Non
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether these are units, known by name: of most columns, and no names beside them."""
+    """Whether all cells that are not empty name units."""
     filled = [cell for cell in cells if cell]
     return bool(filled) and all(unit_named(cell) for cell in filled)
 
 
 def _rows(form: TableForm) -> Iterator[tuple[int, list[str]]]:
-    """Number of the line and stripped cells of each row; blank lines and comments are none."""
+    """Yield the line number and the stripped cells of each row; skips blank lines and comments."""
     with form.data.open(encoding=form.encoding, errors="replace", newline=None) as stream:
         for _ in range(form.first):
             stream.readline()
@@ -320,7 +320,7 @@ def _uncommented(line: str) -> str:
 
 
 def _is_row(cells: Sequence[str], usual: int) -> bool:
-    """Whether these are cells of a row: numbers or times, or nothing, in most of them.
+    """Whether most cells are numbers, times or empty, as in a row of a table.
 
     What begins with a word is one if it has as many cells as rows usually have, three numbers or more among them: a
     label, and no line of a preamble.

@@ -76,7 +76,7 @@ Axes = Annotated[tuple[Axis, Axis, Axis], Field(strict=False), AfterValidator(_e
 
 
 def along(axes: Axes | None, vectors: Array) -> Array:
-    """Vectors (N, 3) in other axes."""
+    """Return vectors (N, 3) along other axes, each given as a signed axis of the recorded ones."""
     if axes is None:
         return vectors
     signs = [-1.0 if axis.startswith("-") else 1.0 for axis in axes]
@@ -131,7 +131,7 @@ class TopicSource(BaseModel):
 
     @property
     def is_made(self) -> bool:
-        """Whether it is more than a name."""
+        """Whether the source is derived, that is, more than the name of a recorded topic."""
         return self.topic is None or self.frames is not None or self.invert or bool(self.frame or self.axes)
 
     @property
@@ -150,7 +150,7 @@ class TopicSource(BaseModel):
 
 
 def inverted(poses: series.PoseSeries) -> series.PoseSeries:
-    """Poses with the inverse of every attitude.
+    """Return poses with the inverse of every attitude.
 
     The covariance of the rotation is that of delta in R*Exp(delta) before and after: of R' = R^T it is R*cov*R^T.
     Positions' covariances are left out, zero.
@@ -164,7 +164,7 @@ def inverted(poses: series.PoseSeries) -> series.PoseSeries:
 
 
 def joined(gyro: series.VectorSeries, accel: series.VectorSeries | None) -> series.ImuSeries:
-    """Rates with the accelerations at their stamps, between samples by straight lines; NaN outside of them."""
+    """Join rates with accelerations, interpolated linearly at the stamps of the rates; NaN outside of the samples."""
     if accel is None or len(accel) == 0:
         values: Array = np.full(3, np.nan)
     elif np.array_equal(gyro.t_ns, accel.t_ns):

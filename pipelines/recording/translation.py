@@ -64,7 +64,7 @@ class Translation:
             self._parse = _protobuf(recorded) if recorded.encoding == "protobuf" else _json
 
     def __call__(self, data: bytes) -> bytes:
-        """The CDR bytes of one message."""
+        """Translate one message into the bytes of a CDR message."""
         try:
             tree = self._parse(data)
             return self._definition.encode(self._message(self._definition.name, tree))
@@ -121,7 +121,7 @@ def _scalar(kind: str, found: Any) -> Any:
 
 
 def _get(tree: Any, name: str) -> Any:
-    """A field by its ROS name, whatever the case of its letters; None if there is none."""
+    """Return a field by its ROS name, in lower or upper case; None if there is none."""
     if isinstance(tree, Mapping):
         found = tree.get(name)
         return tree.get(name.upper()) if found is None else found
@@ -135,7 +135,7 @@ def _get(tree: Any, name: str) -> Any:
 
 
 def _any(tree: Any, names: tuple[str, ...]) -> Any:
-    """The first of several fields that is there, else 0."""
+    """Return the first of several fields that a message has, else 0."""
     return next((found for name in names if (found := _get(tree, name)) is not None), 0)
 
 
@@ -147,7 +147,7 @@ def _json(data: bytes) -> Any:
 
 
 def _protobuf(schema: Schema) -> Callable[[bytes], Any]:
-    """Parses messages of the type that a FileDescriptorSet defines."""
+    """Return a parser of messages of the type that a FileDescriptorSet defines."""
     from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
 
     try:
@@ -156,7 +156,7 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Any]:
         added: set[str] = set()
 
         def add(name: str) -> None:
-            """A file after those it depends on."""
+            """Add a file to the pool, after the files on which it depends."""
             if name in added or name not in files:
                 return
             added.add(name)

@@ -31,7 +31,7 @@ ENU_FROM_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 
 
 def read_ulog(path: Path, data: Path) -> ArrayContainer:
-    """The sensors, attitudes and fixes in a log, each under the name of its topic there, `/sensor_combined`.
+    """Read the sensors, attitudes and fixes of a PX4 log as topics with the log's names, `/sensor_combined`.
 
     Further instances of a sensor are `/sensor_gyro/1` and so on, a sensor's temperature `/sensor_gyro/temperature`.
     Raises InputError when pyulog is not installed or the file is damaged beyond reading.
@@ -60,7 +60,7 @@ def read_ulog(path: Path, data: Path) -> ArrayContainer:
 def log_container(
     path: Path, data: Path, topics: Mapping[str, series.Topic], assumptions: list[str], offset: int, is_damaged: bool
 ) -> ArrayContainer:
-    """What an autopilot logged, with times that no fix put into Unix time where the offset is 0."""
+    """Return the container of an autopilot's log; notes that its times are not Unix times if the offset is 0."""
     if not offset:
         assumptions.append("no fix says what time it was: times are those since the autopilot was switched on")
     container = ArrayContainer(path, topics, assumptions, data)
@@ -70,7 +70,7 @@ def log_container(
 
 
 def _topics(found: Any, offset: int) -> Iterator[tuple[str, series.Topic]]:
-    """Topics from a topic of the log, with the sensor's temperature where it has one."""
+    """Yield topics by name from one topic of the log, with the sensor's temperature where there is one."""
     if len(found.data["timestamp"]) == 0:
         return
     name = f"/{found.name}" + (f"/{found.multi_id}" if found.multi_id else "")
@@ -94,14 +94,14 @@ def _unix_offset(topics: list[Any]) -> int:
 
 
 def _stamps(data: Columns, offset: int) -> NDArray[np.int64]:
-    """When it was measured, Unix ns."""
+    """Return times of measurement, Unix ns."""
     sampled = data.get("timestamp_sample")
     stamps = data["timestamp"] if sampled is None or not np.any(sampled) else sampled
     return (stamps.astype(np.int64) + offset) * 1000
 
 
 def columns(data: Columns, *names: str) -> Array:
-    """Columns (n, len(names)) of messages, side by side."""
+    """Return named columns of messages side by side, (n, len(names))."""
     return np.stack([data[name].astype(float) for name in names], axis=1)
 
 
@@ -115,7 +115,7 @@ def _sensor_combined(data: Columns, offset: int) -> series.ImuSeries:
 
 
 def _vehicle_imu(data: Columns, offset: int) -> series.ImuSeries:
-    """Means over the interval that ends at the stamp, given at its middle."""
+    """Return mean rates and accelerations over each integration interval, stamped at its middle."""
     turned, moved = _indexed(data, "delta_angle", 3), _indexed(data, "delta_velocity", 3)
     spans = [data[name] for name in ("delta_angle_dt", "delta_velocity_dt")]
     turning, moving = (span * (1e-6 if span.dtype.kind in "iu" else 1.0) for span in spans)
@@ -128,7 +128,7 @@ def _vector(data: Columns, offset: int) -> series.VectorSeries:
 
 
 def _fifo(data: Columns, offset: int) -> series.VectorSeries:
-    """Readings that the sensor kept, `samples` in a message; the last was taken at the stamp."""
+    """Return the readings of a sensor's FIFO, `samples` in a message, the last of which was taken at the stamp."""
     most = sum(1 for name in data if name.startswith("x["))
     raw = np.stack([_indexed(data, axis, most) for axis in "xyz"], axis=2) * data["scale"].astype(float)[:, None, None]
     samples = data["samples"].astype(int)[:, None]
