@@ -265,7 +265,7 @@ def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel 
 
 
 def _data(method: Method, given: Any) -> Any:
-    """The method's data from its fields, by name or as an object of its class; None is what was not recorded."""
+    """Make the method's data from fields by name, or an object of its class; None stands for what was not recorded."""
     kind = method.data
     if is_dataclass(given):
         if not isinstance(given, kind):
@@ -288,7 +288,7 @@ def _data(method: Method, given: Any) -> Any:
 
 
 def _checked(method: Method, data: Any) -> Any:
-    """The data with all arrays as floats, sorted by their stamps, without the same row twice.
+    """Return the data with all arrays as floats, sorted by their stamps, without repeated rows.
 
     Raises:
         InputError: an array is none of numbers or has rows of another shape than its class says, stamps are not in s
@@ -345,7 +345,7 @@ def _checked(method: Method, data: Any) -> Any:
 
 @contextmanager
 def _of_arrays() -> Iterator[None]:
-    """Has what is said of a topic said of an array."""
+    """Context manager that makes of an InputError about a topic one about an array."""
     try:
         yield
     except InputError as error:
@@ -353,7 +353,7 @@ def _of_arrays() -> Iterator[None]:
 
 
 def _in_order(name: str, t: Array, carried: Sequence[Array], dropped: dict[str, int]) -> NDArray[np.int64] | None:
-    """The rows to keep, by time, as of a file; None for all of them as they are."""
+    """Return the rows to keep, in the order of time, as for a file; None if all rows are in order."""
     if (np.diff(t) > 0.0).all():
         return None
     values = np.hstack([t[:, None] * 0.0, *(np.nan_to_num(one).reshape(len(t), -1) for one in carried)])
@@ -376,7 +376,7 @@ def _check_stamps(name: str, given: Any, t: Array) -> None:
 
 
 def _placed(data: Any, config: _BaseConfig) -> Any:
-    """The data at the config's place, as of a file. Raises InputError where the data say another."""
+    """Return the data with the place that the config states. Raises InputError where the data state another."""
     given = {
         "latitude": None if config.latitude_deg is None else np.deg2rad(config.latitude_deg),
         "longitude": None if config.longitude_deg is None else np.deg2rad(config.longitude_deg),

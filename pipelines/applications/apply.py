@@ -67,7 +67,7 @@ class CorrectedTopic:
 
 @dataclass(frozen=True, eq=False)
 class Applied:
-    """A corrected recording: the file, its corrected topics, and sentences that their reader has to know."""
+    """Corrected recording: its file, its corrected topics, and notes for people who use the file."""
 
     path: Path
     topics: tuple[CorrectedTopic, ...]
@@ -149,7 +149,7 @@ def _notes(calibration: SavedCalibration) -> Iterator[str]:
 def _corrected(
     recording: Recording, config: Config, calibration: SavedCalibration, correction: Correction, suffix: str
 ) -> CorrectedTopic | None:
-    """A corrected topic; None where the calibration has nothing for the sensors that are there."""
+    """Return a topic with corrected sensors; None if the calibration has no formula for the sensors in it."""
     base, topic = config.base(correction.topic), config.topic(correction.topic)
     if f"{base}{suffix}" in recording.topics:
         raise InputError(f"{recording.path}: topic {base}{suffix} is there already; give another suffix")
@@ -192,7 +192,7 @@ def _is_measured(read: Any, column: str) -> bool:
 
 
 def _derivative(corrected: Any, measured: Mapping[str, Array], name: str, result: str) -> Array:
-    """Derivative (3, 3) of a result with respect to a measured vector, where the sensors usually are."""
+    """Return the derivative (3, 3) of a result with respect to a measured vector, at the mean of the measurements."""
     usual = {key: np.nanmean(values, axis=0) for key, values in measured.items()}
     size = float(np.sqrt(np.nanmean(measured[name] ** 2))) or 1.0
 
@@ -204,7 +204,7 @@ def _derivative(corrected: Any, measured: Mapping[str, Array], name: str, result
 
 
 def _write(stream: BinaryIO, recording: Recording, topics: Sequence[CorrectedTopic]) -> None:
-    """The messages of a recording, and behind each block the corrected ones of its stamps."""
+    """Write the messages of a recording, each block followed by the corrected messages with its stamps."""
     container = recording.container
     attached = {name: container.attachment(name, needed=False) for name in container.attachments}
     out = McapOutput(stream, {name: data for name, data in attached.items() if data is not None})
@@ -223,7 +223,7 @@ def _write(stream: BinaryIO, recording: Recording, topics: Sequence[CorrectedTop
 
 
 def _of_stamps(corrected: series.Series, order: Stamps, stamps: Stamps, log_ns: Stamps) -> MessageBlock:
-    """The corrected messages with these stamps, logged when those were."""
+    """Return the corrected messages that have these stamps, with the log times of the recorded messages."""
     rows = order[np.minimum(np.searchsorted(corrected.t_ns, stamps, sorter=order), len(order) - 1)]
     same = corrected.t_ns[rows] == stamps
     some = {name: getattr(corrected, name)[rows[same]] for name in ("t_ns", *corrected.COLUMNS)}

@@ -32,7 +32,7 @@ _TROUBLE = {"InputError": exit_codes.BAD_INPUT, "IndeterminateError": exit_codes
 
 
 class _WithPlugins(TyperGroup):
-    """The commands below and those of other distributions."""
+    """Command group of the commands below and those of installed plug-ins."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*super().list_commands(ctx), *_of_plugins()]
@@ -41,7 +41,7 @@ class _WithPlugins(TyperGroup):
         return super().get_command(ctx, cmd_name) or _of_plugins().get(cmd_name)
 
     def get_params(self, ctx: Any) -> Any:
-        """Flags all of them: those of typer default to None, and typer imports pydantic to check that; not False."""
+        """Set the default of flags to False: for typer's own, None, the check of values imports pydantic."""
         params = super().get_params(ctx)
         for flag in params:
             flag.default = flag.default or False
@@ -766,14 +766,14 @@ def cube_print(
 
 
 def _beside(session: Path, what: str) -> Path:
-    """The folder for results where none is named: beside the recording, under its name."""
+    """Return the default folder of results: beside the recording, named after the recording."""
     session = session if session.name else session.resolve()
     name = "".join(letter for letter in session.stem if letter not in "*?[]").rstrip("_-.") or "recording"
     return session.with_name(f"{name}-{what}")
 
 
 def _file_name(source: str) -> str:
-    """A source by a name that a file may have: a stream by letters and digits alone."""
+    """Return a source as a file name: a stream's address by letters, digits and `-` alone."""
     if source == "-":
         return "stdin"
     return re.sub(r"\W+", "-", source.partition("://")[2]).strip("-") if "://" in source else source
@@ -782,7 +782,7 @@ def _file_name(source: str) -> str:
 def _tell(
     calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool, everything: bool = False
 ) -> NoReturn:
-    """Show a calibration and where its results are; its status is the exit code."""
+    """Show a calibration and the place of its files; exit with the code of its status."""
     from alidade.pipelines.reports.calibration_report import calibration_report, short_report
     from alidade.pipelines.reports.result_json import results_json
 
@@ -794,7 +794,7 @@ def _tell(
 def _show(
     as_json: bool, text: Callable[[], str], report: "Callable[[], Report] | None", *lines: str, everything: bool = False
 ) -> None:
-    """Print a command's result: as JSON alone, or as its report, if it has one, followed by lines."""
+    """Print a command's result: as JSON alone, or as its report, if any, followed by lines."""
     if as_json:
         print(text().removesuffix("\n"))
         return
@@ -817,7 +817,7 @@ def _results_in(folder: Path, written: Sequence[Path]) -> str:
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is behind an error, as it is behind the ImportError of a module that it met half loaded."""
+    """Whether Ctrl-C caused an error, also the ImportError of a module whose loading it interrupted."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
@@ -841,7 +841,7 @@ def main() -> None:
 
 
 def _of_system(error: OSError) -> str:
-    """A file or a folder that the system refuses, TMPDIR without room among them, in one line."""
+    """Describe in one line a file or folder that the system refuses, such as a full TMPDIR."""
     where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
     return f"{printable(where)}: {error.strerror or printable(str(error))}"
 

@@ -44,11 +44,11 @@ class Comparison:
     tested: bool = False
 
     def of(self, solver: str) -> Calibration | None:
-        """The calibration of the named solver."""
+        """Return the calibration by the named solver; None if that solver did not run."""
         return next((c for c in self.calibrations if c.estimate.solver == solver), None)
 
     def difference(self, solver: str) -> SolverDifference | None:
-        """The largest difference of a solver from batch, in the solver's sigmas; None where they cannot be compared."""
+        """Return a solver's largest difference from batch, in that solver's sigmas; None where not comparable."""
         other, batch = self.of(solver), self.of("batch")
         if other is None or batch is None or other.estimate.names != batch.estimate.names:
             return None
@@ -63,13 +63,13 @@ class Comparison:
 
     @property
     def far(self) -> dict[str, float]:
-        """Parameter -> difference of the halves in sigmas, of those beyond the threshold, the largest first."""
+        """Parameter -> difference of both halves, sigmas, where beyond the threshold, largest first."""
         beyond = {name: half.z for name, half in self.halves.items() if abs(half.z) > self.limit}
         return dict(sorted(beyond.items(), key=lambda item: -abs(item[1])))
 
     @property
     def answer(self) -> Answer:
-        """Whether batch and incremental agree, and both halves where these were solved."""
+        """Whether batch and incremental agree, and both halves where these were solved: yes, no or cannot say."""
         online = self.difference("incremental")
         if self.far or (online is not None and abs(online.z) > MAX_DIFFERENCE):
             return "no"
@@ -90,7 +90,7 @@ class Comparison:
 
 
 def compared(session: Session, window: float | None = 1.0, halves: bool = True) -> Comparison:
-    """Solve a session by all solvers, and its halves. Raises InputError, IndeterminateError."""
+    """Solve a session and the halves of its recording by all solvers. Raises InputError, IndeterminateError."""
     calibrations = tuple(session.calibrations(SOLVERS, window))
     if not halves:
         return Comparison(calibrations)

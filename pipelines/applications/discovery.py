@@ -77,7 +77,7 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
 
 
 def with_suggested(recording: Recording, config: Config, method: str | None = None) -> tuple[Recording, Config]:
-    """The recording and config with the topics suggested for a method, or for the only one that they would serve.
+    """Return recording and config with the topics suggested for a method, or for the only one that could be served.
 
     Both are as they were where nothing is lacking; the recording notes what was chosen. Raises InputError when no
     method could be served, or several.
@@ -102,7 +102,7 @@ def with_suggested(recording: Recording, config: Config, method: str | None = No
 
 
 def nearest_suggestion(found: Sequence[Suggestion]) -> str:
-    """Phrase with the suggestion for the method that lacks least; empty if there is none."""
+    """Return a phrase with the suggestion for the method that lacks least; empty if there is no suggestion."""
     if not found:
         return ""
     best = min(found, key=lambda suggestion: len(suggestion.missing))
@@ -125,7 +125,7 @@ def unused(recording: Recording, config: Config) -> tuple[str, ...]:
 
 
 def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
-    """Sentences about topics that a method could read as another of its sensors, and does not."""
+    """Return sentences about topics that a method does not read, but could read as another of its sensors."""
     chosen = methods.method(method)
     sources = (config.topics.get(topic.key, TopicSource(topic=topic.name)) for topic in chosen.topics)
     read = {part for source in sources for part in source.parts}
@@ -145,7 +145,7 @@ def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
 
 
 def empty(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
-    """Sentences about topics of a method that are there without a message."""
+    """Return sentences about a method's topics that are recorded, but have no message."""
     names = dict.fromkeys(config.topic(topic) for topic in methods.method(method).topics)
     there = [name for name in names if name in recording.topics and not recording.topics[name].count]
     return tuple(f"topic {name} has no messages: it counts as not recorded" for name in there)
@@ -176,7 +176,7 @@ class _Search:
         self._reasons: list[str] = []
 
     def suggestion(self) -> Suggestion:
-        """The topics that were found, and what would still be missing."""
+        """Search topics for all sensors of the method; return those found, and what would still be missing."""
         config, there = self._config, self._recording.topics
         doubtful: set[str] = set()
         for attitude in self._attitudes:
@@ -192,7 +192,7 @@ class _Search:
         return Suggestion(self._method.name, self._topics, tuple(self._reasons), missing)
 
     def _propose(self, topic: Topic, is_needed: bool) -> None:
-        """Find a topic by its type and its name."""
+        """Take as source of `topic` the recorded topic of its type with the most similar name, if there is one."""
         used = self._taken | {part for source in self._topics.values() for part in (source.name, *source.parts)}
         split = self._split_imu(used) if is_needed and _is_gyro(topic) else None
         if split is not None:
@@ -218,7 +218,7 @@ class _Search:
         )
 
     def _pair_up(self, attitude: Topic, gyro: Topic) -> set[str]:
-        """The gyro and the attitude that turn together most alike, of those that may serve.
+        """Take as sources the gyro and the attitude, of those that may serve, whose rates correlate best.
 
         Returns the keys that people have to choose a topic for: several turn alike, or an attitude fits in a way only
         that is not taken without being asked for.
@@ -260,7 +260,7 @@ class _Search:
         return to_choose
 
     def _twin(self, gyro: str) -> str | None:
-        """The gyro of the method with which another one turns, which is then on the same body; None without one."""
+        """Return the method's gyro that turns with a given one, so that both are on one body; None without one."""
         named = {each.key: TopicSource(topic=each.name) for each in (*self._gyros, *self._attitudes)}
         sources = named | self._config.topics | self._topics
         for own in self._gyros:
@@ -272,12 +272,12 @@ class _Search:
         return None
 
     def _as_high(self, correlation: float) -> float:
-        """The least correlation not lower by more than chance: three sigmas of Fisher's z of independent samples."""
+        """Return the least correlation as high but for chance: 3 sigmas of Fisher's z of independent samples."""
         sigma = np.sqrt(2.0 * INTERVAL / max(self._recording.duration_s, INTERVAL))
         return float(np.tanh(np.arctanh(min(correlation, _HIGHEST)) - 3.0 * sigma))
 
     def _candidates(self, topic: Topic) -> list[TopicSource]:
-        """Recorded topics of a type of the topic that serve nothing else: the one the config names, if it is there.
+        """Return unused recorded topics of a type of `topic`: only the one that the config names, if it is recorded.
 
         An attitude may be between any two frames of a TFMessage.
         """
@@ -298,7 +298,7 @@ class _Search:
         return self._pairings[key]
 
     def _split_imu(self, used: set[str]) -> TopicSource | None:
-        """A gyro and an accelerometer on two topics, as some drivers publish them; None where there are not both."""
+        """Return a gyro and an accelerometer that a driver publishes on two topics, as one source; None if not both."""
         recording = self._recording
         free = [n for n, t in recording.topics.items() if t.type in messages.IMUS and t.count and n not in used]
         there = {name: imu for name in free if (imu := _rates(recording, name)) is not None} if len(free) > 1 else {}
@@ -309,7 +309,7 @@ class _Search:
         return None if gyro is None else TopicSource(gyro=gyro, accel=accel)
 
     def _of_type(self, topic: Topic, used: set[str]) -> list[str]:
-        """Recorded topics that a topic of a method could be, by type; attitudes of an Imu are found by pairing."""
+        """Return the unused recorded topics that have a type of `topic`; pairing finds attitudes in Imu messages."""
         of_type = {n: t for n, t in self._recording.topics.items() if t.type in topic.types and n not in used}
         there = {n: t.type == messages.IMU for n, t in of_type.items() if t.count and t.is_readable}
         if _is_attitude(topic):
@@ -335,7 +335,7 @@ def _to_choose(topic: Topic, names: Sequence[str]) -> str:
 
 
 def _moving_pairs(recording: Recording, topic: str) -> list[tuple[str, str]]:
-    """The pairs of frames of a TFMessage topic that occur most often, as moving ones are."""
+    """Return the pairs of frames on a TFMessage topic that have most messages, as moving frames do."""
     try:
         counts = {pair: len(found) for pair, found in recording.transforms(topic).items()}
     except InputError:
@@ -362,7 +362,7 @@ def _rates(recording: Recording, topic: str) -> ImuSeries | None:
 
 
 def _by_name(topic: Topic, there: Sequence[str], is_needed: bool) -> str | None:
-    """The one of several topics whose name is most alike; an optional one if it is alike, or the only gyro."""
+    """Return the topic whose name is most like that of `topic`; None unless it is clearly the most alike."""
     words = topic.key.replace("_", " ")
     alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
     ranked = sorted(there, key=lambda name: -alike[name])

@@ -69,7 +69,7 @@ _NO_VARIABLE = 0
 
 @dataclass(frozen=True, eq=False)
 class Alone:
-    """Calibration of one recording by itself, kept for the joint one.
+    """Calibration of one recording by itself, kept for the joint calibration.
 
     Attributes:
         calibration: what result.json says of it by itself, without the data behind it.
@@ -179,7 +179,7 @@ def calibrate_together(
 
 
 def _one_device(alone: Sequence[Alone]) -> Method:
-    """The method of all. Raises InputError when they cannot be of one device, or one is named twice."""
+    """Return the method of all recordings. Raises InputError if they are of several methods or one is named twice."""
     if not alone:
         raise InputError("no recordings are named")
     first = alone[0].calibration
@@ -197,13 +197,13 @@ def _one_device(alone: Sequence[Alone]) -> Method:
 
 
 def _rates(method: Method, alone: Sequence[Alone]) -> dict[str, float]:
-    """How far each of the device's numbers walks. Raises InputError as `walks` does."""
+    """Return the random-walk rates of the device's parameters, SI per root day. Raises InputError as `walks` does."""
     names = list(dict.fromkeys(name for each in alone for name in each.quantities))
     return walks(method, alone[0].calibration.config, names)
 
 
 def _with_those_before(session: Session, alone: Sequence[Alone], sqrt_info: SqrtInformation) -> dict[str, float]:
-    """A recording's numbers as they are with the recordings before it; none where these are of another device."""
+    """Return a recording's parameter values given those before it; empty if these are of another device."""
     if not alone or alone[0].calibration.method is not session.method:
         return {}
     rates = _rates(session.method, alone)
@@ -235,7 +235,7 @@ def _far_apart(joined: Joined) -> bool:
 
 
 def _walks(alone: Sequence[Alone], rates: Mapping[str, float]) -> dict[str, Rate]:
-    """Kind of numbers -> how far these walk, where that is stated, or estimated from the recordings."""
+    """Return kind of parameters -> random-walk rate, SI per root day, where stated or to be estimated."""
     config = alone[0].calibration.config
     asked = {kind(name) for name in stated_walks(config, list(rates))}
     days = [each.day for each in alone]
@@ -250,7 +250,7 @@ def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
 
 
 def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
-    """The joint estimate, and by how much it moved last, in sigmas."""
+    """Return the joint estimate, and by how many sigmas its last iteration moved it."""
     sqrt_info, days = [each.sqrt_info for each in alone], [each.day for each in alone]
     joined, step = join(sqrt_info, rates, days), np.inf
     if _far_apart(joined):
@@ -273,7 +273,7 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
 
 
 def _again(method: Method, alone: Alone, others: GaussianPrior, rates: Mapping[str, float]) -> SqrtInformation:
-    """What a recording says, linear where the others have the device to be."""
+    """Return the information of one recording, linearised at the estimate of the device by all others."""
     problem = with_priors(method.graph(alone.loaded(), alone.calibration.config), [others])
     estimate = alone.calibration.estimate
     known = information_at_levels(problem, estimate.levels, rates)
@@ -288,7 +288,7 @@ def _calibration(
     step: float,
     known: Mapping[str, Rate],
 ) -> Calibration:
-    """The joint estimate as a calibration: of the device as it was last, with that recording's own numbers."""
+    """Return the joint estimate as a calibration of the device at the last recording, with that one's parameters."""
     last = len(alone) - 1
     gaussian_prior = joined.all(last)
     found = dict(zip(gaussian_prior.names, gaussian_prior.mean.tolist(), strict=True))
@@ -338,14 +338,14 @@ def _calibration(
 
 
 def _with_extra(shares: Mapping[str, float], k: int, covariance: Array, extra: Array) -> dict[str, float]:
-    """Shares of a number's variance with that of what its graph does not model."""
+    """Return a parameter's variance shares by source, with the share of errors that its graph does not model."""
     beyond = float(extra[k, k] / covariance[k, k])
     sqrt_info = {source: share * (1.0 - beyond) for source, share in shares.items()}
     return {**sqrt_info, "not modelled": beyond} if beyond else sqrt_info
 
 
 def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, float]) -> tuple[Parameter, ...]:
-    """The parameters of the last recording, and those of the device that others alone determine.
+    """Return the parameters of the last recording, and those of the device that only the others determine.
 
     What is fixed in the last recording and known from others is as the others have it.
     """
@@ -359,7 +359,7 @@ def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, f
 
 
 def _inflation(name: str, alone: Sequence[Alone]) -> float:
-    """By what a number's sigma grows."""
+    """Return the ratio of inflated to nominal sigma of a parameter in the joint estimate."""
     found = [p for each in alone if (p := each.calibration.parameters.get(name)) is not None]
     return grown([p.sigma for p in found], [p.inflation for p in found])
 
@@ -391,7 +391,7 @@ _OWN_NOTES = ("rejection", "change")
 
 
 def _of_recording(calibration: Calibration) -> Finding | None:
-    """What makes a recording inconsistent by itself, and notes on its residuals; None: nothing."""
+    """Return a finding on what is inconsistent in one recording by itself, and on its residuals; None without any."""
     own = [
         finding
         for finding in calibration.findings
@@ -405,7 +405,7 @@ def _of_recording(calibration: Calibration) -> Finding | None:
 
 
 def _device_changes(changed: Changes, alone: Sequence[Alone]) -> Iterator[Finding]:
-    """Steps of the device between recordings, the most significant first; else all parameters together."""
+    """Yield findings on steps of the device between recordings, most significant first; else of all parameters."""
     places = [(each.name, each.calibration.start) for each in alone]
     for step in sorted(changed.found, key=lambda step: -abs(step.z)):
         names, dates = zip(*places[step.after : step.after + 2], strict=True)
@@ -423,7 +423,7 @@ def _disagreement(names: Sequence[str], dates: Sequence[str], chi_square: float,
 
 
 def _combined_levels(each: Sequence[Sequence[Level]]) -> tuple[Level, ...]:
-    """Noise levels of all recordings as one: estimates weighted by their information, the mean of what is used."""
+    """Combine the noise levels of all recordings: estimates weighted by information, used levels by their mean."""
     names = dict.fromkeys(level.noise.name for levels in each for level in levels)
     return tuple(
         _combined([level for levels in each for level in levels if level.noise.name == name]) for name in names
@@ -458,12 +458,12 @@ def _counts(each: Sequence[Mapping[str, int]]) -> dict[str, int]:
 
 
 def _named(names: Sequence[str]) -> str:
-    """Recordings in a few words."""
+    """Return the names of recordings as a short phrase."""
     return ", ".join(names) if len(names) <= _MOST_NAMED else f"{names[0]} to {names[-1]}, {len(names)} recordings"
 
 
 def _facts(facts: Sequence[SessionFacts]) -> SessionFacts:
-    """The recordings' as one's: it starts when the last does, with which the result is up to date."""
+    """Combine the facts of all recordings; the start is that of the last, whose date the result has."""
     last = facts[-1]
     lost = _counts([each.lost for each in facts])
     notes = tuple(dict.fromkeys(note for each in facts for note in each.notes))
@@ -473,7 +473,7 @@ def _facts(facts: Sequence[SessionFacts]) -> SessionFacts:
 
 
 def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
-    """What a recording has of its own, from all recordings, and what it says of the device by itself."""
+    """Return a recording's entry: its own parameters in the joint estimate, and what it finds by itself."""
     by_itself, part = alone.calibration, joined.parts[i]
     gaussian_prior = joined.all(i).of([*part.own, *joined.walking])
 
@@ -499,6 +499,6 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
 
 
 def _freedoms(by_itself: Calibration) -> float | None:
-    """Degrees of freedom of a recording about its own noise; None: it was stated, or there is no chi-square."""
+    """Return the degrees of freedom of a recording's noise estimate; None if stated, or without chi-square."""
     chi_square, levels = by_itself.estimate.chi_square, by_itself.estimate.levels
     return chi_square.dof if chi_square and any(level.noise.estimated for level in levels) else None

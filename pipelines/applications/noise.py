@@ -68,7 +68,7 @@ class SensorNoise:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NoiseStudy:
-    """Noise of all sensors of a recording; notes are sentences about what is lost of it or could not be used."""
+    """Noise of all sensors of a recording; `notes` are sentences about lost and unusable data."""
 
     recording: str
     epoch_ns: int
@@ -88,7 +88,7 @@ class NoiseStudy:
 
 
 class _Device(NamedTuple):
-    """What one topic measured: stamps, and the samples (N, 3) of each sensor by its kind."""
+    """Data of one topic: stamps, ns, and the samples (N, 3) of each sensor by kind."""
 
     t_ns: NDArray[np.int64]
     sensors: dict[str, Array]
@@ -146,14 +146,14 @@ def noise(
 
 
 def _rates_alone(settings: Config) -> set[str]:
-    """Topics that the config names where a gyro's rates will do."""
+    """Return the names of topics in the config for which a gyro's rates alone suffice."""
     known = [topic for name in methods.names() for topic in methods.method(name).topics]
     takes = {topic.key for topic in known if set(messages.RATES) <= set(topic.types)}
     return {source.name for key, source in settings.topics.items() if key in takes}
 
 
 def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[SensorNoise]:
-    """The sensors of a topic. Raises InputError when it cannot be used; nothing of one without sensors."""
+    """Yield the noise of each sensor of a topic, none of a topic without sensors. Raises InputError."""
     device = _device(recording, name)
     if not device.sensors:
         return
@@ -222,7 +222,7 @@ def _device(recording: Recording, name: str) -> _Device:
 
 
 def _pieces(t: Array, values: Array, rests: Array) -> tuple[list[Array], float, int]:
-    """Evenly sampled pieces (n, 3) of static intervals, time between samples, s, and number of samples filled in."""
+    """Return evenly sampled pieces (n, 3) of static intervals, sampling interval, s, and number of filled samples."""
     pieces, lengths, intervals, filled = [], [], [], 0
     for start, end in rests:
         inside = slice(*np.searchsorted(t, [start, end + 1e-9]))
@@ -237,7 +237,7 @@ def _pieces(t: Array, values: Array, rests: Array) -> tuple[list[Array], float, 
 
 
 def even_pieces(t: Array, values: Array) -> tuple[list[Array], float, int]:
-    """Pieces of evenly spaced samples, their interval, s, and the number of samples filled in.
+    """Return pieces (n, k) of evenly spaced samples, their interval, s, and the number of samples filled in.
 
     Jittering stamps count as evenly spaced; the stamps beside a hole distinguish lost samples from late stamps. Short
     holes are filled by straight lines, long ones split the record.
@@ -267,7 +267,7 @@ def even_pieces(t: Array, values: Array) -> tuple[list[Array], float, int]:
 
 
 def _lost(t: Array, interval: float) -> NDArray[np.intp]:
-    """Samples lost between each and the next (N-1,)."""
+    """Return the number of samples lost between each sample and the next, (N-1,)."""
     out = np.zeros(len(t) - 1, dtype=np.intp)
     late = t - interval * np.arange(len(t))
     for i in np.flatnonzero(np.diff(t) > _STEP * interval):

@@ -29,7 +29,7 @@ _RATE_HZ = 50.0
 
 
 class _Result:
-    """What the results below have beside their numbers."""
+    """Base of the results below: the calibration that their numbers are from."""
 
     calibration: Calibration
 

@@ -75,12 +75,12 @@ class Prediction:
 
     @property
     def status(self) -> Status:
-        """Predicted: calibrated, weak or unobservable."""
+        """Predicted status: calibrated, weak or unobservable."""
         return status(self.directions)
 
     @property
     def missing(self) -> dict[str, float]:
-        """Parameter -> predicted sigma over the one required, of those that fall short."""
+        """Parameter -> ratio of predicted to required sigma, where it exceeds one."""
         sigmas = self.sigmas
         estimated = [q for q in self.quantities if q.prior_sigma != 0.0 and not q.relative]
         return {q.name: sigmas[q.name] / q.require for q in estimated if sigmas[q.name] > q.require}
@@ -177,7 +177,7 @@ def predict(
     seeds: Sequence[int] | None = None,
     made: Made | None = None,
 ) -> Prediction:
-    """The sigmas that a recording of this motion would end with, the largest of some draws of what is drawn in it.
+    """Predict the sigmas after a recording of this motion, the largest over several random draws of the scenario.
 
     Args:
         method_name, config_file, require: as in `plan`.
@@ -207,7 +207,7 @@ def predict(
 def _predicted(
     method_name: str, scenario: Scenario, config_file: Settings, require: Mapping[str, float], seed: int
 ) -> Prediction:
-    """Of one draw."""
+    """Predict the estimate of a recording of the motion with one seed."""
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError
@@ -227,7 +227,7 @@ def _predicted(
 
 
 def requirements(given: Sequence[str]) -> dict[str, float]:
-    """Parameter -> sigma from words like delta_px=1e-4. Raises InputError when one is no such thing."""
+    """Return parameter -> required sigma from words like delta_px=1e-4. Raises InputError for any other word."""
     found = {}
     for word in given:
         name, _, number = word.partition("=")
@@ -244,7 +244,7 @@ def requirements(given: Sequence[str]) -> dict[str, float]:
 def _candidates(
     method: Method, before: Prediction, config_file: Settings, require: Mapping[str, float], made: Made
 ) -> Iterator[Step]:
-    """Each possible change with what it would bring to the worst draw; those that cannot be recorded are left out."""
+    """Yield each possible change of the motion with its gain for the worst draw; skip those that cannot be recorded."""
     seeds = (before.worst,)
     now = predict(method.name, before.scenario, config_file, require, seeds, made)
     for change, scenario in method.guidance.variations(before.scenario):
@@ -256,7 +256,7 @@ def _candidates(
 
 
 def _gain(before: Prediction, after: Prediction) -> float:
-    """Fall of what is missing, nats, less what a recording as long would bring by its length."""
+    """Return the reduction of excess sigmas over the required ones, nats, beyond that of the longer time alone."""
     sigmas = after.sigmas
     required = {q.name: q.require for q in after.quantities}
     by_time = 0.5 * float(np.log(after.duration / before.duration))

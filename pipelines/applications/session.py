@@ -157,7 +157,7 @@ class Session:
         return session if prior is None else session.beginning_from(prior)
 
     def beginning_from(self, prior: Path) -> Session:
-        """Session with an earlier calibration of the device as prior, a result.json or calibration.yaml.
+        """Return the session with an earlier calibration of the device, result.json or calibration.yaml, as prior.
 
         Raises:
             InputError: it cannot be used, is another method's, or was made of this recording.
@@ -166,13 +166,13 @@ class Session:
         return replace(self, config=self.config.with_prior(gaussian_prior))
 
     def again(self, recording: Recording) -> Session:
-        """Session of another recording, or part of one, with the same method and config. Raises InputError."""
+        """Return a session of another recording, or part of one, with the same method and config. Raises InputError."""
         recording = recording.with_config(self.config.topics.values(), self.config.columns)
         return replace(self, data=self.method.read(recording, self.config), recording=recording)
 
     @classmethod
     def of(cls, method: Method, simulated: Simulated, config_file: Settings = None) -> Session:
-        """Session of a simulated recording that was never written."""
+        """Return a session of simulated data that were never written to a file."""
         config = load_config(simulated.config.encode(), config_file)
         return cls(method, simulated.data, config, known=simulated.truth)
 
@@ -208,7 +208,7 @@ class Session:
             ) from error
 
     def problem(self) -> Problem:
-        """The graph. Raises InputError when the data are too few, or the config says what the method has no use for."""
+        """Return the factor graph. Raises InputError for too few data, or config keys that the method does not use."""
         return self._problem
 
     @cached_property
@@ -223,7 +223,7 @@ class Session:
 
     @cached_property
     def facts(self) -> SessionFacts:
-        """Topics, rates, gaps and losses of the recording, whose stamps are not kept then; the length of arrays."""
+        """Facts about the recording: topics, rates, gaps, losses (then its stamps are freed); of arrays the length."""
         if self.recording is None:
             start, stop = self.method.faults.span(self.data)
             return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
@@ -255,7 +255,7 @@ class Session:
         check: bool = False,
         report: bool = True,
     ) -> list[Calibration]:
-        """Calibrations of the recording, one a solver; see `calibrate`."""
+        """Return a calibration of the recording by each solver; see `calibrate`."""
         if isinstance(solvers, str):
             raise InputError(f"solvers: a list of names is needed, not the text {solvers!r}")
         for solver in solvers:
@@ -267,7 +267,7 @@ class Session:
             return self.judged(solved, {} if self.read_s is None else {"read": self.read_s}, check, report)
 
     def calibrated_beside(self, others: Callable[[SqrtInformation], Mapping[str, float]]) -> Calibration:
-        """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
+        """Calibrate by batch, with the information linearised where other recordings have the parameters.
 
         Args:
             others: of what the recording says, linear about its solution, the numbers as they are with the others.
@@ -277,7 +277,7 @@ class Session:
         return calibration
 
     def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
-        """Context with the time limit of a calibration where no command has set one."""
+        """Context manager with the default time limit of a calibration, where no command has set one."""
         stamps = [time for time in self.method.faults.times(self.data) if len(time)]
         start = min((float(time[0]) for time in stamps), default=0.0)
         return deadline.usual(max((float(time[-1]) for time in stamps), default=0.0) - start, online)
@@ -289,7 +289,7 @@ class Session:
         check: bool = False,
         report: bool = True,
     ) -> list[Calibration]:
-        """Estimates, each with the problem it solves, ready to be reported.
+        """Return a calibration for each estimate with the problem it solves: findings added, ready for reports.
 
         Args:
             solved: as above.
@@ -349,14 +349,14 @@ class Session:
         return found
 
     def _at_gyro_rate(self, problem: Problem, estimate: Estimate) -> tuple[Estimate, list[Finding]]:
-        """The estimate with its attitudes at the rate that is wanted, and a note of how far apart they were."""
+        """Return the estimate with attitudes at the wanted rate, and a note on the gaps between those by vision."""
         if self.attitude_rate == "vision" or estimate.attitudes is None or problem.at_gyro_rate is None:
             return estimate, []
         dense = problem.at_gyro_rate(estimate.attitudes, problem.numbers(estimate))
         return replace(estimate, attitudes=dense), [_carried(estimate.attitudes, dense)]
 
     def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float], str, tuple[str, ...]]:
-        """Parameters of both halves, held-out residuals by family, what the time limit stopped, halves not solved."""
+        """Return the split-half test, held-out residuals by family, what the time limit stopped, unsolved halves."""
         with self.usual_time():
             halves, unsolved, predicted = dict[str, SplitHalf](), tuple[str, ...](), dict[str, float]()
             if not deadline.passed(_HALVES):
@@ -369,7 +369,7 @@ class Session:
     def _findings(
         self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None
     ) -> tuple[Finding, ...]:
-        """The findings on an estimate; hypotheses are tested where it is suspect."""
+        """Return the findings on an estimate; hypotheses are tested if the estimate is suspect."""
         contradicted = self._contradictions(estimate, quantities)
         findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted)
         if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
@@ -388,7 +388,7 @@ class Session:
         return diagnose(estimate, quantities, problem.advice, change, hypotheses, () if hypotheses else contradicted)
 
     def _contradictions(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Finding, ...]:
-        """What the config fixes and the recording contradicts."""
+        """Return findings on inputs that the config fixes and the recording contradicts."""
         if estimate.solver == "published" or not estimate.converged or self._freed is None:
             return ()
         from alidade.pipelines.solvers.freed import freed_information
@@ -402,7 +402,7 @@ class Session:
 
     @cached_property
     def _freed(self) -> tuple[Config, Problem] | None:
-        """The config with everything free that it fixes, and its graph; None where it fixes nothing."""
+        """Config with all its fixed parameters free, and the graph of it; None where the config fixes nothing."""
         config = freed_config(self.config, self.problem().quantities)
         try:
             return None if config is None else (config, self.method.graph(self.data, config).near(self.near))
@@ -410,7 +410,7 @@ class Session:
             return None
 
     def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
-        """The test for a change, and the finding where there is one, with the steps between its two sides."""
+        """Test for a change; return the test's result, and if there is one a finding with the steps at it."""
         if estimate.solver == "published" or not estimate.converged:
             return None, None
         ratios = [] if estimate.sandwich is None else estimate.sandwich[[q.judged for q in quantities]].tolist()
@@ -433,7 +433,7 @@ class Session:
     def _with_conclusion(
         self, estimate: Estimate, quantities: Sequence[Quantity], report: bool
     ) -> tuple[Estimate, SolverDifference | None]:
-        """The batch solution at the end of an incremental run, and the run's difference from it.
+        """Return batch's estimate at the end of an incremental run, and the run's difference from that estimate.
 
         Where batch does not converge, the run's own estimate, and None.
         """
@@ -480,7 +480,7 @@ class Session:
             return estimate, problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
-        """Each fixed input of the graph, and the graph with that input off by its step."""
+        """Yield the name of each fixed input of the graph, and the graph with that input off by its step."""
         for exact in self.method.faults.exact:
             if deadline.passed(_SENSITIVITY):
                 return
@@ -494,7 +494,7 @@ class Session:
             yield exact.name, problem
 
     def _published(self) -> Estimate | None:
-        """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""
+        """Return the published solver's estimate; None if that solver, which needs more data, cannot serve."""
         try:
             return self._solve("published", None)[0]
         except InputError:
@@ -556,7 +556,7 @@ def _refused(method: Method, recording: Recording, config: Config) -> str:
 
 
 def missing_for(name: str, recording: Recording, config: Config) -> tuple[str, ...]:
-    """Phrases for what a recording with this config lacks for a method; none if it can serve it."""
+    """Return phrases for what a recording with this config lacks for a method; none if the method can read it."""
     return lacking(methods.method(name).requirements, recording, config)
 
 
@@ -628,7 +628,7 @@ def sha256_of(data: Any) -> str:
 
 
 def _feed(digest: hashlib._Hash, data: Any) -> None:
-    """The arrays and numbers of a dataclass, and of those inside it, with their names into a hash."""
+    """Hash the arrays and numbers of a dataclass, and of dataclasses in it, with the names of their fields."""
     for one in fields(data):
         value = getattr(data, one.name)
         digest.update(one.name.encode())
@@ -641,7 +641,7 @@ def _feed(digest: hashlib._Hash, data: Any) -> None:
 
 
 def _check_sheets(method: Method, config: Config) -> None:
-    """Raise InputError when something is stated that the method has no use for: it would be ignored in silence."""
+    """Raise InputError for config keys that the method does not use and would ignore in silence."""
     if "vision" in config.model_fields_set and "vision_attitude" not in {topic.key for topic in method.topics}:
         raise InputError(f"vision: method {method.name} has no use for it; it reads no attitudes by vision")
     if "field" in config.model_fields_set and "field" not in method.data_sheets:
@@ -668,7 +668,7 @@ def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference 
 
 
 def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
-    """The problem's steps; those fed one by one are shown as they are taken, by time in the recording."""
+    """Yield the problem's steps; if one by one, with progress by recording time, until the deadline."""
     if chunk > 1:
         return problem.steps(chunk)
     name = "the run at {:.1f} s of {:.1f} s".format
@@ -677,7 +677,7 @@ def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
 
 
 def _concluded(online: Estimate, batch: Estimate) -> Estimate:
-    """The solution of all rows at the end of an online run, whose estimates over time are that run's until then."""
+    """Return batch's estimate at the end of an online run, with that run's estimates over time before it."""
     history = online.history
     if history is not None and len(history.time):
         history = History(
@@ -690,7 +690,7 @@ def _concluded(online: Estimate, batch: Estimate) -> Estimate:
 
 
 def _carried(seen: Attitudes, dense: Attitudes) -> Finding:
-    """What was done where there are no attitudes nearby."""
+    """Return a note that the gyro carries the attitudes across the gaps between those by vision."""
     time = np.sort(seen.time)
     gaps = np.diff(time)
     where = f", over {gaps.max():.2g} s at most, at {time[gaps.argmax()]:.6g} s" if len(gaps) else ""
@@ -702,6 +702,6 @@ def _carried(seen: Attitudes, dense: Attitudes) -> Finding:
 
 
 def _stopped() -> list[Finding]:
-    """A note where something ended for want of time."""
+    """Return a note on what the time limit stopped; empty if nothing."""
     text = deadline.stopped()
     return [Finding("remark", Severity.NOTE, {"text": text})] if text else []

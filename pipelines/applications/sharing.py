@@ -24,8 +24,7 @@ DAY_S = 86_400.0
 
 
 def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, float]:
-    """Parameter of the device -> how far it walks in the root of a day, SI; 0: not at all, or as far as several
-    recordings say. Those of recordings are not among them.
+    """Return the random-walk rates of the device's parameters, SI per root day; 0: constant, or to be estimated.
 
     Raises:
         InputError: the config's `share` names no parameter.
@@ -42,12 +41,12 @@ def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, flo
 
 
 def stated_walks(config: Config, names: Sequence[str]) -> list[str]:
-    """The parameters whose walk several recordings are to determine."""
+    """Return the names of the parameters whose walk is to be estimated from several recordings."""
     return [name for name in names if _share(config, name) == "walks"]
 
 
 def _share(config: Config, name: str) -> str | float | None:
-    """What the config says of a parameter, the last that fits."""
+    """Return the config's `share` of a parameter, by the last pattern that fits; None if no pattern fits."""
     found = [share for pattern, share in config.share.items() if fnmatchcase(name, pattern)]
     return found[-1] if found else None
 

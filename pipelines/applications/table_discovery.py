@@ -63,7 +63,7 @@ _MOST_DEG_S = 7000.0
 
 @dataclass(frozen=True)
 class Columns:
-    """Meaning of a table's columns, as far as it can be concluded.
+    """Proposed meaning of a table's columns.
 
     Attributes:
         columns: topic -> its columns, as under `columns:`.
@@ -96,7 +96,7 @@ class Columns:
 
 
 def propose_columns(recording: Recording) -> Columns | None:
-    """Proposed meaning of a recording's tables that no config describes; None where there is no such table."""
+    """Propose the columns of a recording's tables that no config describes; None if there is no such table."""
     tables = tables_of(recording.container)
     if not tables:
         return None
@@ -115,7 +115,7 @@ def propose_columns(recording: Recording) -> Columns | None:
 
 
 def with_columns(recording: Recording, config: Config) -> tuple[Recording, Config]:
-    """The recording and config with the columns that are proposed, where the config has none; noted in the recording.
+    """Return recording and config with proposed columns where the config has none; noted in the recording.
 
     Raises InputError where nothing can be concluded.
     """
@@ -131,7 +131,7 @@ def with_columns(recording: Recording, config: Config) -> tuple[Recording, Confi
 
 
 class _Table:
-    """What one table holds."""
+    """Sensors, units and time that are recognised in one table."""
 
     def __init__(self, table: CsvFile, is_named: bool) -> None:
         self.path, self._form = table.path, table.form
@@ -145,7 +145,7 @@ class _Table:
         self._values = [self._numbers(i) for i in range(len(names))]
 
     def topics(self) -> dict[str, TableTopic]:
-        """Topic -> columns."""
+        """Return topic -> its columns."""
         time = self._time()
         triads = self._triads()
         named = {kind: columns for kind, columns in triads.items() if kind in _WORDS}
@@ -200,7 +200,7 @@ class _Table:
             return np.full(len(self._texts[i]), np.nan)
 
     def _names(self, columns: Sequence[int]) -> list[str]:
-        """Names of columns, by number where a name is there twice."""
+        """Return the names of columns, numbers in place of names that occur twice."""
         names = self._form.names
         return [names[i] if names.count(names[i]) == 1 else f"column {i + 1}" for i in columns]
 
@@ -209,7 +209,7 @@ class _Table:
         return self._names(found[:1])[0] if found else None
 
     def _time(self) -> dict[str, Any]:
-        """Column and unit of the time: by its name, and that it increases; without names the first that does."""
+        """Return column and unit of the time: an increasing column, by its name; without names the first column."""
         increasing = [i for i in range(len(self._values)) if self._increases(i)]
         called = [i for i in increasing if _TIME.search(_bare(self._form.names[i]))]
         called += [i for i in increasing if self._stated(i) in TIME_UNITS]
@@ -231,7 +231,7 @@ class _Table:
         return {"time": name} if unit == "s" else {"time": name, "unit": unit}
 
     def _stated(self, i: int) -> str:
-        """The unit of a column by its header; empty where it has none."""
+        """Return the unit of column `i` by its header; empty where there is none."""
         return self._form.units[i] or unit_hinted(self._form.names[i])
 
     def _increases(self, i: int) -> bool:
@@ -243,7 +243,7 @@ class _Table:
         return len(steps) > 2 and bool(np.mean(steps >= 0.0) > 0.99) and bool(np.mean(steps > 0.0) > 0.4)
 
     def _triads(self) -> dict[str, tuple[int, ...]]:
-        """Kind -> columns along x, y and z: by names, or the file's of three alone, and without a header by numbers."""
+        """Return kind -> columns along x, y, z: by names, as a file's only three, or, without a header, by numbers."""
         out: dict[str, tuple[int, ...]] = {}
         along = _along_axes(self._form.names)
         first = 1 if self._increases(0) else 0
@@ -276,7 +276,7 @@ class _Table:
         return out
 
     def _kind_of_units(self, columns: Sequence[int]) -> str:
-        """The sensor that measures in the unit that three columns state; empty: none."""
+        """Return the kind of sensor that measures in the unit of three columns; empty for none."""
         stated = {self._stated(i) for i in columns}
         units = next(iter(stated)) if len(stated) == 1 else ""
         return next((kind for kind, si in _SI.items() if units in COMPATIBLE[si]), "")
@@ -286,7 +286,7 @@ class _Table:
         return norms[np.isfinite(norms)]
 
     def _moves(self, columns: Sequence[int]) -> bool:
-        """Whether what three columns read turned: each changes by a good part of their norm."""
+        """Whether the vector in three columns turned: each component varies by a good part of the norm."""
         norms = self._norms(columns)
         spread = min(float(np.nanstd(self._values[i])) for i in columns) if len(norms) else 0.0
         return bool(spread > _TURNED * float(np.median(norms))) if len(norms) else False
@@ -296,13 +296,13 @@ class _Table:
         return bool(len(norms)) and lacks_gravity(norms)
 
     def _size(self, kind: str, columns: Sequence[int]) -> str:
-        """The unit in which a sensor of that kind reads what is there; empty where there is none."""
+        """Return the unit in which the columns' median norm is plausible for that kind of sensor; empty for none."""
         norms = self._norms(columns)
         norm = float(np.median(norms)) if len(norms) else 0.0
         return next((unit for unit, (low, high) in _SIZES[kind].items() if low < norm < high), "")
 
     def _unit(self, kind: str, columns: Sequence[int]) -> str:
-        """The unit of three columns: by their header, else by their numbers; empty for counts."""
+        """Return the unit of three columns: by their header, else by their numbers; empty for counts."""
         stated = {unit_of(kind, self._stated(i)) for i in columns}
         (unit,) = stated if len(stated) == 1 else ("",)
         if unit in UNITS:
@@ -321,7 +321,7 @@ class _Table:
         return found
 
     def _quaternion(self) -> list[str]:
-        """Columns w, x, y, z, which have unit norm."""
+        """Return the columns w, x, y, z of a quaternion of unit norm; empty without one."""
         names = [_bare(name) for name in self._form.names]
         for stem in {name[:-1] for name in names if _QUATERNION.search(name)}:
             if all(f"{stem}{axis}" in names for axis in "wxyz"):
@@ -332,7 +332,7 @@ class _Table:
 
 
 def _kind(name: str) -> str:
-    """The sensor that a name, lower case, is about; empty: none."""
+    """Return the kind of sensor that a lower-case name mentions; empty for none."""
     return next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
 
 
@@ -343,13 +343,13 @@ def _bare(name: str) -> str:
 
 
 def _unit_word(name: str) -> str:
-    """The unit of time in a name that is one: millis, seconds_elapsed."""
+    """Return the unit of time that is a word of a name (millis, seconds_elapsed); empty for none."""
     words = (unit_named(word) for word in re.split(r"[_ ]", name))
     return next((unit for unit in words if unit in TIME_UNITS), "")
 
 
 def _time_unit(values: Array) -> str:
-    """The unit of times: by their size where they are Unix time, else by their usual step."""
+    """Return the unit of times: by their size where they are Unix times, else by their median step."""
     values = values[np.isfinite(values)]
     steps = np.diff(values)
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
@@ -363,7 +363,7 @@ def _time_unit(values: Array) -> str:
 
 
 def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
-    """Names without their axis, lower case, and columns of those that differ in x, y, z, 0, 1, 2 or p, q, r alone."""
+    """Return lower-case names without their axis, and columns whose names differ only in x, y, z (0, 1, 2; p, q, r)."""
     there = {name: i for i, name in reversed(list(enumerate(names)))}
     found: list[tuple[str, tuple[int, ...]]] = []
     for name in names:
@@ -382,5 +382,5 @@ def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
 
 
 def _free(topic: str, path: Path, taken: Mapping[str, TableTopic]) -> str:
-    """The topic's name, with the table's where another table has made one of that name."""
+    """Return the topic's name, extended by the table's name if another table has a topic of that name."""
     return topic if topic not in taken else f"{topic}/{re.sub(r'[^a-z0-9]+', '_', path.stem.lower())}"

@@ -53,12 +53,12 @@ class Validated:
 
     @property
     def applied(self) -> Sequence[Validation]:
-        """Errors with the calibration, the turn-on bias and the like re-estimated from this recording where it can."""
+        """Errors with the calibration; turn-on bias and the like are re-estimated from this recording if possible."""
         return self.device or self.validations
 
     @property
     def verdict(self) -> Verdict:
-        """Holds, changed, or unknown; same of the very recording, which always agrees."""
+        """Verdict on the calibration: holds, changed, unknown, or same for the recording that it was made of."""
         if self.same_recording:
             return "same"
         return "unknown" if self.held is None else self.held.verdict
@@ -84,7 +84,7 @@ class Validated:
 
     @property
     def _resolution(self) -> str:
-        """The largest change that would not be noticed, by unit, of the device's parameters first."""
+        """Phrase with the largest change, by unit, that would not be significant."""
         assert self.held is not None
         largest: dict[str, float] = {}
         for step in self.held.steps:
@@ -150,7 +150,7 @@ def validate(
 
 
 def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float]:
-    """Values with some parameters fixed elsewhere, x + P_f P_ff^+ (fixed - x_f): the conditional mean, linearised."""
+    """Return values given fixed parameters: x + P_f P_ff^+ (fixed - x_f), the conditional mean, linearised."""
     given = [i for i, name in enumerate(estimate.names) if estimate.sigmas[i] > 0.0 and name in fixed]
     scale = np.where(estimate.sigmas > 0.0, estimate.sigmas, 1.0)
     correlation = estimate.covariance[:, given] / np.outer(scale, scale[given])
@@ -160,7 +160,7 @@ def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float
 
 
 def _held(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Estimate, dict[str, float]] | None:
-    """What the recording says of the calibration, its own estimate and numbers; None where it cannot be solved."""
+    """Test the calibration against the recording's own estimate; return both, and its values; None if not solved."""
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError
 

@@ -70,7 +70,7 @@ class Population:
 
     @property
     def control(self) -> tuple[float, float] | None:
-        """Lower and upper control limit, three standard deviations about the centre, for the typical sigma."""
+        """Lower and upper control limit: centre -+ 3 standard deviations, at the median sigma; None without spread."""
         if self.spread is None:
             return None
         reach = 3.0 * float(np.hypot(self.spread.tau, np.median(self.sigmas)))
@@ -78,19 +78,19 @@ class Population:
 
     @property
     def beyond(self) -> int:
-        """Recordings more than three standard deviations off, each with its own sigma."""
+        """Number of recordings more than three standard deviations off the centre, each by its own sigma."""
         return int((np.abs(self.z) > 3.0).sum())
 
 
 def counting(result: RecordingResult | UnitResult) -> list[str]:
-    """Names of the parameters by which a recording is compared with others."""
+    """Return the names of the parameters that a recording determines, by which it is compared with others."""
     if result["status"] not in _COUNTED:
         return []
     return [name for name, p in result["parameters"].items() if p["verdict"] in _DETERMINED]
 
 
 def populations(results: Mapping[str, UnitResult], histories: Sequence[History] = ()) -> list[Population]:
-    """Every parameter of the fleet, in the order of the recordings' own lists; units that changed by `histories`."""
+    """Return a Population for each parameter of the fleet, in the recordings' order; `histories` mark changed units."""
     members: dict[tuple[str, str], list[str]] = {}
     for recording, result in results.items():
         for name in counting(result):
@@ -104,7 +104,7 @@ def populations(results: Mapping[str, UnitResult], histories: Sequence[History] 
 
 
 def table(results: Mapping[str, UnitResult], fleet: Sequence[Population]) -> list[Row]:
-    """A row a recording: what became of it, then value, sigma and z of every parameter, SI."""
+    """Return a row for each recording: status, then value, sigma and z of every parameter, SI."""
     z = {(r, p.name): float(p.z[i]) for p in fleet if p.spread for i, r in enumerate(p.recordings)}
     rows: list[Row] = []
     for recording, result in results.items():
@@ -123,7 +123,7 @@ def table(results: Mapping[str, UnitResult], fleet: Sequence[Population]) -> lis
 
 
 def iso(date: float | None) -> str | None:
-    """Unix s as ISO 8601, UTC, to the second."""
+    """Return a time, Unix s, as ISO 8601 in UTC, to the second."""
     if date is None:
         return None
     return datetime.datetime.fromtimestamp(round(date), datetime.UTC).isoformat().replace("+00:00", "Z")

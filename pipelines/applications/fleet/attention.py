@@ -24,7 +24,7 @@ _MOST_NAMED = 12
 
 @dataclass(frozen=True)
 class Finding:
-    """Something about a unit that stands out; `z` is how far in sigmas, None where that is not the question."""
+    """Finding about a unit that stands out; `z` is the distance, sigmas, None for a finding without a distance."""
 
     kind: Kind
     text: str
@@ -33,7 +33,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit of the fleet with what stands out in it, the worst first."""
+    """Unit of the fleet with its findings, the worst first."""
 
     name: str
     findings: tuple[Finding, ...]
@@ -42,7 +42,7 @@ class Unit:
 def units_of_interest(
     results: Mapping[str, UnitResult], fleet: Sequence[Population], found: Sequence[History]
 ) -> list[Unit]:
-    """The units that need attention: changed ones first, then outliers by distance."""
+    """Return the units that need attention: changed units first, then outliers by distance."""
     units: dict[str, list[Finding]] = {}
     populations = {(p.method, p.name): p for p in fleet}
     for history in found:
@@ -91,7 +91,7 @@ def _changed(history: History, fleet: Mapping[tuple[str, str], Population]) -> l
 
 
 def _farthest(p: Population) -> list[int]:
-    """Of each outlying unit, the recording that is farthest off."""
+    """Return the index of the farthest recording of each outlying unit."""
     far: dict[str, int] = {}
     for i in np.flatnonzero(p.outlying).tolist():
         if abs(p.z[i]) > abs(p.z[far.setdefault(p.units[i], i)]):

@@ -41,7 +41,7 @@ _PATIENCE = 60.0
 
 
 class Killed:
-    """Stands for the result of a task that killed its worker each time it was tried, at last alone."""
+    """Result of a task that killed its worker each time it was tried, the last time alone on the worker."""
 
 
 @cache
@@ -55,7 +55,7 @@ def source_version() -> str:
 
 @contextmanager
 def cluster(scheduler: str | None, jobs: int | None) -> Iterator[Client]:
-    """A client of the scheduler at that address, or of a new local one with so many worker processes.
+    """Yield a client of the scheduler at an address, or of a new local one with `jobs` worker processes.
 
     Args:
         scheduler: tcp://host:8786; None starts workers on this machine for the time of the `with` block.
@@ -94,7 +94,7 @@ def work_off(
     scheduler: str | None,
     jobs: int | None,
 ) -> bool:
-    """Give the result of every task to `take`, by its name; returns whether Ctrl-C came before the end.
+    """Pass the name and result of every task to `take`; return whether Ctrl-C came before the end.
 
     Args:
         function: see `completed`.
@@ -118,7 +118,7 @@ def work_off(
 def completed(
     client: Client, function: Callable[..., Any], tasks: Mapping[str, tuple[Any, ...]]
 ) -> Iterator[tuple[str, Any]]:
-    """Name and result of every task as it ends: what the function returned, or Killed.
+    """Yield the name and result of each task as it ends: the function's return value, or Killed.
 
     The function and its arguments travel to the workers, its result travels back. Leaving the loop early withdraws
     what is not running yet.
@@ -165,7 +165,7 @@ def _ended(
 
 
 def _work(version: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """What a worker does. Workers that joined late have not been asked for their version before."""
+    """Run a task on a worker. Raises InputError on another version: workers that joined late were not asked."""
     if (own := source_version()) != version:
         from distributed import get_worker
 
@@ -210,7 +210,7 @@ def _local(jobs: int | None) -> Iterator[Any]:
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     class Cluster(LocalCluster):  # type: ignore[misc]
-        """Closed by its block alone: one that Ctrl-C has met half made is none that could be closed at exit."""
+        """Local cluster that only its block closes, not Python's exit: Ctrl-C may have left it half made."""
 
         shutdown_on_close = property(lambda _: False, lambda *_: None)
 

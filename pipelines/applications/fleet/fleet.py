@@ -48,7 +48,7 @@ _UNIT = "{unit}"
 
 @dataclass(frozen=True)
 class Settings:
-    """How every recording of a fleet is calibrated.
+    """Settings with which every recording of a fleet is calibrated.
 
     Attributes:
         method: overrides the recordings' own; None: what fits.
@@ -69,7 +69,7 @@ class Settings:
     def of(
         cls, method: str | None, config: Path | None, solver: str, window: float | None, prior: str | None = None
     ) -> Settings:
-        """Settings with the text of a config file. Raises InputError: no such method, or a file cannot be used."""
+        """Make settings with the text of a config file. Raises InputError for an unknown method or unusable file."""
         require_extra()
         if method is not None:
             methods.method(method)  # there is one of that name
@@ -169,7 +169,7 @@ def calibrate_fleet(
 def calibrate_recording(
     recording: Recording, settings: Settings, unit: str | None = None, known: tuple[str, str | None] | None = None
 ) -> RecordingResult | None:
-    """Calibrate one recording on the worker; None when its result was made of the very same.
+    """Calibrate one recording on the worker; None if the known result was made from the same files.
 
     A result without `sha256` is of a file that could not be read at all; the next run tries again.
 
@@ -192,17 +192,17 @@ def calibrate_recording(
 
 
 def _inputs(result: RecordingResult | None) -> tuple[str, str | None] | None:
-    """What a result was made of."""
+    """Return the SHA-256 of the recording and of the prior that a result was made from; None without a result."""
     return (result["sha256"], result["prior_sha256"]) if result else None
 
 
 def _unchanged(recording: Recording, settings: Settings, kept: RecordingResult | None) -> bool:
-    """Whether a kept result stands by what the listing says, so that nothing is to be fetched for it."""
+    """Whether the tag in the listing shows that a kept result is up to date, so that no file is to be fetched."""
     return bool(kept and recording.tag and kept.get("tag") == recording.tag and settings.prior is None)
 
 
 def _prior(settings: Settings, unit: str) -> AbstractContextManager[Path | None]:
-    """The earlier calibration that a unit begins from, on this machine; None: of none."""
+    """Context manager of the local file of the earlier calibration that a unit begins from; None without one."""
     return nullcontext() if settings.prior is None else _earlier(settings.prior.replace(_UNIT, unit))
 
 
@@ -216,7 +216,7 @@ def _earlier(address: str) -> Iterator[Path]:
 
 
 def _metadata(path: Path) -> dict[str, str]:
-    """Unit and date by the recording's own metadata."""
+    """Return unit and date in the recording's own metadata, without a date that is none."""
     return {key: value for key, value in from_metadata(path).items() if key != "date" or as_date(value)}
 
 
@@ -237,7 +237,7 @@ def _calibration(path: Path, settings: Settings, config: Path | None, prior: Pat
 
 
 def _summary(calibration: Calibration) -> dict[str, Any]:
-    """The numbers of a calibration that a fleet is about; SI."""
+    """Return the figures of a calibration that a fleet compares and keeps, SI."""
     names = [q.name for q in calibration.problem.quantities]
     return {
         "start_ns": calibration.facts.epoch_ns,
@@ -260,7 +260,7 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
 
 
 def _says(calibration: Calibration) -> SqrtInformation:
-    """Information of a calibration about its numbers; of solvers without it, from their covariance."""
+    """Return a calibration's square-root information on its parameters; if the solver has none, from the covariance."""
     from alidade.pipelines.solvers.posterior import sqrt_information_of
 
     estimate = calibration.estimate
@@ -273,7 +273,7 @@ def _says(calibration: Calibration) -> SqrtInformation:
 
 
 def _placed(name: str, result: RecordingResult, named: Mapping[str, str]) -> UnitResult:
-    """With unit and date: by the file's name, else by the recording's metadata, else the file and its start."""
+    """Return a result with unit and date: by the file's name, else the metadata, else file name and start."""
     unit = named.get("unit") or result.get("unit") or Path(name).stem
     text = named.get("date") or result.get("date")
     date = as_date(text).timestamp() if text else result.get("start_ns", 0) * 1e-9 or None
@@ -281,5 +281,5 @@ def _placed(name: str, result: RecordingResult, named: Mapping[str, str]) -> Uni
 
 
 def _sha256(path: Path) -> str:
-    """Of a file, or of all that is in a folder."""
+    """Return the SHA-256 of a file, or of all files in a folder, hexadecimal."""
     return combined_sha256(map(file_sha256, sorted(path.iterdir()))) if path.is_dir() else file_sha256(path)

@@ -43,12 +43,12 @@ class History:
     found: tuple[Change, ...]
 
     def after(self, step: Change) -> tuple[str, ...]:
-        """The recordings of a unit after a step."""
+        """Return the names of the unit's recordings after a step."""
         return self.recordings[step.after + 1 :]
 
     @property
     def together(self) -> tuple[int, ...]:
-        """After which recordings all numbers together changed, where none did by itself."""
+        """Indexes of recordings after which all parameters together changed, if none changed by itself."""
         return () if self.changes.found else tuple(each.after for each in self.changes.together if each.significant)
 
 
@@ -61,7 +61,7 @@ def packed(sqrt_info: SqrtInformation) -> str:
 
 
 def unpacked(text: str) -> SqrtInformation:
-    """The square-root information in a text of `packed`."""
+    """Return the square-root information in a text that `packed` made."""
     with np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False) as arrays:
         return SqrtInformation(**{**arrays, "names": tuple(arrays["names"].tolist())})
 
@@ -83,7 +83,7 @@ def histories(results: Mapping[str, UnitResult], asked: Mapping[str, Sequence[st
 
 
 def change_table(found: Sequence[History]) -> list[Row]:
-    """Rows of changes.csv: a step of a unit's device between two recordings each, SI."""
+    """Return the rows of changes.csv: each step of a device's parameter between two recordings, SI."""
     return [
         {
             "unit": history.unit,
@@ -123,7 +123,7 @@ def _history(
 
 
 def _red(each: Sequence[History]) -> list[History]:
-    """The same, without steps that are no larger than most units make: these differ between recordings by nature."""
+    """Return the histories without steps that most units make as well, of parameters that vary by nature."""
     made: dict[tuple[str, str], list[Change]] = {}
     for history in each:
         for step in history.changes.judged:

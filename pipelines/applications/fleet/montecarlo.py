@@ -65,11 +65,11 @@ class Study:
     interrupted: bool
 
     def estimates(self, solver: str) -> list[RunResult]:
-        """The results of the runs in which this solver came to an estimate whose truth is known."""
+        """Return the results of the runs in which a solver reached an estimate whose truth is known."""
         return [run[solver] for run in self.results.values() if solver in run and run[solver].get("dof")]
 
     def failures(self, solver: str) -> dict[int, str]:
-        """Reasons why a seed has no estimate, by seed."""
+        """Return seed -> reason why a solver has no estimate."""
         return {
             seed: run[solver]["reason"]
             for seed, run in self.results.items()
@@ -91,7 +91,7 @@ class Study:
         return np.array([p["error"] / p["sigma"] for r in self.estimates(solver) for p in r["parameters"].values()])
 
     def accuracies(self, solver: str) -> dict[str, tuple[statistics.Accuracy, ParameterError]]:
-        """Parameter -> accuracy over the runs, and what one result says of the parameter (unit, require)."""
+        """Return parameter -> accuracy over the runs, and the entry of one run, for unit and required accuracy."""
         members: dict[str, list[ParameterError]] = {}
         for result in self.estimates(solver):
             for name, parameter in result["parameters"].items():
@@ -177,7 +177,7 @@ def simulate_and_solve(
 
 
 def run_table(study: Study) -> list[Row]:
-    """A row a seed and solver: verdict, NEES, chi-square, and of every parameter error and sigma, SI."""
+    """Return a row for each seed and solver: status, NEES, chi-square, error and sigma of every parameter, SI."""
     rows: list[Row] = []
     for seed, run in study.results.items():
         for solver, result in run.items():
@@ -192,7 +192,7 @@ def run_table(study: Study) -> list[Row]:
 
 
 def summary_table(study: Study) -> list[Row]:
-    """A row a solver and parameter, and one for all parameters of a solver together; SI."""
+    """Return a row for each solver and parameter, and one for all parameters of a solver together, SI."""
     rows: list[Row] = []
     for solver in study.solvers:
         if not study.estimates(solver):
@@ -221,7 +221,7 @@ def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
 
 
 def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, str, dict[str, float]]:
-    """Identity of the recordings of a study: method, data of one, their config and truth."""
+    """Return what identifies a study's recordings: method, SHA-256 of the data of one seed, config and truth."""
     from alidade.pipelines.applications.session import sha256_of
 
     simulated = method.simulate(scenario, seed)
@@ -229,7 +229,7 @@ def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, st
 
 
 def _numbers(calibration: Calibration) -> dict[str, Any]:
-    """Errors against sigmas, of what was estimated and whose truth is known."""
+    """Return errors, sigmas and NEES of the estimated parameters whose truth is known."""
     from alidade.pipelines.reports.result_json import truth_errors
 
     errors = truth_errors(calibration)

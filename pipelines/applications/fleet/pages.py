@@ -88,7 +88,7 @@ def study_report(study: Study) -> Report:
 
 
 def _attention(found: Sequence[Unit], units: int, parameters: bool) -> Summary:
-    """Which units need attention."""
+    """Return the summary of the units that need attention."""
     question = "Which units need attention?"
     if not found:
         answer = "none" if parameters else "cannot say"
@@ -103,7 +103,7 @@ def _attention(found: Sequence[Unit], units: int, parameters: bool) -> Summary:
 
 
 def _attention_blocks(attention: Sequence[Unit], several: int) -> tuple[Block, ...]:
-    """A row a finding, and of which units changes could be found at all."""
+    """Return a table with a row for each finding, and a text on the units in which changes can be found."""
     rows = tuple(
         (
             unit.name if i == 0 else "",
@@ -129,7 +129,7 @@ def _attention_blocks(attention: Sequence[Unit], several: int) -> tuple[Block, .
 
 
 def _parameter_table(fleet: Sequence[Population]) -> Table:
-    """A row a parameter, in the unit people read."""
+    """Return a table with a row for each parameter, in the unit people read."""
     several = len({p.method for p in fleet}) > 1
     columns = (
         "parameter",
@@ -172,7 +172,7 @@ def _parameter_row(p: Population, several: bool) -> tuple[Cell | str, ...]:
 
 
 def _component(component: Component | None, factor: float) -> str:
-    """A standard deviation with its sigma, or what it is not more than."""
+    """Format a standard deviation with its sigma, or the upper bound of one that is 0."""
     if component is None:
         return ""
     if component.value == 0.0:
@@ -182,7 +182,7 @@ def _component(component: Component | None, factor: float) -> str:
 
 
 def population_plot(p: Population) -> Plot:
-    """Values of a parameter over the dates, those of a unit joined, with the control limits; and their histogram."""
+    """Plot a parameter's values by date, those of a unit joined, with the control limits, and their histogram."""
     unit, factor = shown_unit(p.unit, p.require)
     out = Figure(unit, "date", share=0.8, x_scale="datetime")
     counts = Figure("", "recordings", share=0.2, y_shared=True)
@@ -209,7 +209,7 @@ def population_plot(p: Population) -> Plot:
 
 
 def _joined(p: Population, factor: float) -> tuple[Array, Array]:
-    """Dates, ms, and values of the recordings, unit by unit in the order of time, a gap between units."""
+    """Return dates, ms, and values of the recordings, unit by unit in the order of time, NaN between units."""
     order = sorted(range(len(p.values)), key=lambda i: (p.units[i], p.dates[i]))
     dates, values = milliseconds(iso(p.dates[i]) for i in order), factor * p.values[order]
     gaps = [k for k in range(1, len(order)) if p.units[order[k]] != p.units[order[k - 1]]]
@@ -227,7 +227,7 @@ def _add_recordings(out: Figure, p: Population, some: Any, factor: float, name: 
 def _add_counts(
     out: Figure, values: Array, edges: Array, name: str, color: str, below: NDArray[np.intp] | int = 0
 ) -> NDArray[np.intp]:
-    """Bars that lie down beside the values, counted here: the page does not grow with the fleet. Returns their ends."""
+    """Draw a horizontal histogram, counted here so that the page does not grow with the fleet; return its ends."""
     ends = below + np.histogram(values, edges)[0]
     out.boxes(np.broadcast_to(below, ends.shape), ends, edges[:-1], edges[1:], name, color)
     return ends
@@ -237,7 +237,7 @@ def _add_counts(
 
 
 def _consistency(study: Study, solvers: Sequence[str]) -> Summary:
-    """Whether the sigmas are consistent; those of the published solver, which are not ours, count where it is alone."""
+    """Return the summary of whether the sigmas are consistent; the published solver counts only where it is alone."""
     question = "Are the sigmas consistent?"
     judged = {solver: study.nees(solver) for solver in solvers}
     if not judged:

@@ -31,7 +31,7 @@ _FIELDS = {"{unit}": r"(?P<unit>.+?)", "{date}": r"(?P<date>\d{4}-?\d\d-?\d\d(?:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording of a fleet.
+    """Recording of a fleet: a file or a bag folder, on this machine or a remote one.
 
     Attributes:
         file: where it is.
@@ -45,7 +45,7 @@ class Recording:
 
 
 def find(patterns: Sequence[str]) -> dict[str, Recording]:
-    """The recordings that match, by name, in order: files, and bag folders in place of their parts.
+    """Find recordings by patterns: name -> recording, in order; a bag folder in place of its parts.
 
     Raises InputError when a pattern matches none or cannot be looked up.
     """
@@ -68,7 +68,7 @@ def find(patterns: Sequence[str]) -> dict[str, Recording]:
 
 
 def _bags_and_files(fs: Any, listed: Mapping[str, _Info]) -> tuple[set[str], dict[str, _Info]]:
-    """Where the bag folders are among what a pattern lists, and the other files."""
+    """Split what a pattern lists into the paths of bag folders, and the other files."""
     files = {name: info for name, info in listed.items() if info["type"] == "file" or _links_to(fs.isfile, info)}
     folders = {name for name, info in listed.items() if info["type"] == "directory" or _links_to(fs.isdir, info)}
     # One that matches alone in its folder is a recording: to look beside each of a million would take hours.
@@ -82,7 +82,7 @@ def _bags_and_files(fs: Any, listed: Mapping[str, _Info]) -> tuple[set[str], dic
 
 
 def _parts(fs: Any, folder: str) -> set[str]:
-    """Where the files of a bag are, its metadata.yaml among them; nothing if the folder is none."""
+    """Return the paths of a bag's files, metadata.yaml included; empty if the folder is no bag."""
     at = f"{folder}/" if folder else ""
     try:
         text = fs.cat_file(at + METADATA, end=MAX_YAML_BYTES + 1)
@@ -102,7 +102,7 @@ def _links_to(kind: Callable[[str], bool], info: _Info) -> bool:
 
 @contextmanager
 def local(file: OpenFile, is_folder: bool = False) -> Iterator[Path]:
-    """The file, or folder, on this machine. Raises InputError when it cannot be read."""
+    """Yield a file or folder as a path on this machine. Raises InputError when it cannot be read."""
     if _is_local(file):
         yield Path(file.path)
         return
@@ -115,7 +115,7 @@ def local(file: OpenFile, is_folder: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def _told(what: str, done: str) -> Iterator[None]:
-    """Makes one line of whatever goes wrong: file systems raise what the libraries below them raise."""
+    """Context manager that makes an InputError in one line of any error that a file system raises."""
     try:
         yield
     except Exception as error:
@@ -123,7 +123,7 @@ def _told(what: str, done: str) -> Iterator[None]:
 
 
 def from_name(name: str, names: str | None) -> dict[str, str]:
-    """Unit and date in the file's name, as far as the pattern has them.
+    """Return unit and date in a file's name, those of the two that the pattern has.
 
     Args:
         name: the file's, with or without folders.
@@ -148,7 +148,7 @@ def from_name(name: str, names: str | None) -> dict[str, str]:
 
 
 def from_metadata(path: Path) -> dict[str, str]:
-    """Unit and date in the recording's metadata, as far as they are there.
+    """Return unit and date in a recording's metadata, those of the two that are there.
 
     Any MCAP metadata record with a key `unit` or `date`, or the custom data of rosbag2 (`ros2 bag record --custom-data
     unit=U17`), of a folder that in its metadata.yaml.
@@ -158,7 +158,7 @@ def from_metadata(path: Path) -> dict[str, str]:
 
 
 def _recorded(path: Path) -> dict[str, str]:
-    """What the metadata records of an MCAP file say."""
+    """Return the entries in the metadata records of an MCAP file, rosbag2's custom data included."""
     from mcap.reader import make_reader
 
     found: dict[str, str] = {}
@@ -174,7 +174,7 @@ def _recorded(path: Path) -> dict[str, str]:
 
 
 def _custom(text: bytes | str) -> dict[str, str]:
-    """rosbag2's custom data, in YAML: in a metadata record or a metadata.yaml. All of it is text, `unit: 007` too."""
+    """Return rosbag2's custom data in the YAML of a metadata record or metadata.yaml, as text (`unit: 007`)."""
     try:
         content = load_yaml(text, METADATA, as_text=True)
     except InputError:

@@ -40,7 +40,7 @@ class Nees:
 
     @property
     def needed(self) -> int:
-        """Runs from which on the interval shows sigmas that are a fifth too small, errors squared 1.44 times as large.
+        """Number of runs whose interval shows sigmas that are a fifth too small (errors squared 1.44 times as large).
 
         The mean of n runs has the relative standard deviation sqrt(2 / (n dof)); 2.576 of these are to be at most 0.44.
         """
@@ -48,12 +48,12 @@ class Nees:
 
     @property
     def consistent(self) -> bool:
-        """Whether the mean lies in the interval."""
+        """Whether the mean NEES lies in its interval."""
         return self.low <= self.mean <= self.high
 
 
 def mean_nees(nees: Array, dof: Array) -> Nees:
-    """The mean of e' P^-1 e over runs (n,), each of `dof` (n,) parameters; n times it is chi-square (Bar-Shalom)."""
+    """Return the mean of e' P^-1 e over runs (n,) of `dof` (n,) parameters; n times it is chi-square (Bar-Shalom)."""
     n, total = len(nees), float(dof.sum())
     return Nees(float(nees.mean()), quantile(0.005, total) / n, quantile(0.995, total) / n, n, total / n)
 
@@ -89,25 +89,25 @@ def accuracy(errors: Array, sigmas: Array) -> Accuracy:
 
 
 def coverage(normalised: Array) -> tuple[float, float, float]:
-    """Share of errors, in sigmas, within 1, 2 and 3."""
+    """Return the shares of errors, in sigmas, within 1, 2 and 3."""
     size = np.abs(normalised)
     return float((size < 1.0).mean()), float((size < 2.0).mean()), float((size < 3.0).mean())
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Distribution of a parameter in the fleet: `centre`, and the spread `tau` that sigmas do not explain."""
+    """Distribution of a parameter in the fleet: `centre`, and the standard deviation `tau` beyond the sigmas."""
 
     centre: float
     tau: float
 
     def z(self, values: Array, sigmas: Array) -> Array:
-        """Distances from the centre in standard deviations: the fleet's spread and the own sigma together."""
+        """Return distances of values from the centre in standard deviations, of spread and own sigma together."""
         return np.asarray((values - self.centre) / np.hypot(self.tau, sigmas))
 
 
 def spread(values: Array, sigmas: Array, centre: float | None = None) -> Spread:
-    """Robust centre and spread of values (n,) with sigmas (n,); a centre that is known is kept."""
+    """Return a robust centre and spread of values (n,) with sigmas (n,); a given centre is kept."""
     tau = 0.0
     where = centre if centre is not None else float(np.median(values))
     for _ in range(20):
@@ -121,7 +121,7 @@ def spread(values: Array, sigmas: Array, centre: float | None = None) -> Spread:
 
 
 def limit(tests: int, values: int | None = None) -> float:
-    """|z| that none of so many tests exceeds by chance, but for one page in a hundred.
+    """Return the |z| that no test of so many exceeds by chance, except on one page in a hundred.
 
     Args:
         tests: made on the whole page.
@@ -135,7 +135,7 @@ def limit(tests: int, values: int | None = None) -> float:
 
 @dataclass(frozen=True)
 class Trend:
-    """A straight line through values over time: change per unit of time, and its sigma."""
+    """Straight line through values over time: slope per unit of time, and the sigma of the slope."""
 
     slope: float
     sigma: float
@@ -147,7 +147,7 @@ class Trend:
 
 
 def trend(time: Array, values: Array, sigmas: Array) -> Trend | None:
-    """Weighted least squares with these sigmas (n,), the spread included; None without two moments."""
+    """Fit a line by least squares with sigmas (n,) that include the spread; None without three values and two times."""
     weights = 1.0 / sigmas**2
     centred = time - np.average(time, weights=weights)
     information = float((weights * centred**2).sum())
@@ -158,7 +158,7 @@ def trend(time: Array, values: Array, sigmas: Array) -> Trend | None:
 
 @dataclass(frozen=True)
 class Component:
-    """A standard deviation of what values scatter by beyond their sigmas.
+    """Variance component: the standard deviation of values beyond their sigmas.
 
     Attributes:
         value: of the largest likelihood; 0 where the sigmas suffice.
@@ -197,7 +197,7 @@ def components(values: Array, sigmas: Array, units: NDArray[np.intp]) -> tuple[C
 
 
 def _component(values: Array, sigmas: Array, groups: NDArray[np.intp]) -> Component:
-    """Of values (n,) about the means of their groups (n,), each of which has two at least."""
+    """Return the scatter, beyond their sigmas, of values (n,) about the means of their groups (n,) of two or more."""
     groups = np.unique(groups, return_inverse=True)[1]
 
     def sums(weights: Array) -> Array:
@@ -222,7 +222,7 @@ def varies(z: Array) -> bool:
 
 
 def _excess(squares: Array, variances: Array) -> float:
-    """tau with median(squares / (tau^2 + variances)) = the median of chi-square; 0 if the variances suffice."""
+    """Return tau with median(squares / (tau^2 + variances)) = median of chi-square; 0 if the variances suffice."""
     from scipy.optimize import brentq
 
     def over(excess: float) -> float:

@@ -43,7 +43,7 @@ class ParameterNumbers(TypedDict):
 
 
 class _Calibrated(TypedDict, total=False):
-    """What became of a recording: without an estimate, a reason and no parameters."""
+    """Result of a recording's calibration; without an estimate, a reason and no parameters."""
 
     status: Required[RunStatus]
     exit_code: Required[int]
@@ -61,14 +61,14 @@ class _Calibrated(TypedDict, total=False):
 
 
 class RecordingResult(_Calibrated, total=False):
-    """A result as it is kept; unit and date as the recording's metadata have them."""
+    """Result of a recording as it is kept, with unit and date as the recording's metadata state them."""
 
     unit: str
     date: str
 
 
 class UnitResult(_Calibrated, total=False):
-    """A result in its place in the fleet; the date in Unix s, None where there is none."""
+    """Result of a recording with its unit and date, Unix s; the date is None where unknown."""
 
     unit: Required[str]
     date: Required[float | None]
@@ -103,7 +103,7 @@ def settings_key(*settings: Any) -> str:
 
 
 class Store(Generic[Result]):
-    """Results of a kind by name in `results.jsonl` of a folder; only those of the same settings count.
+    """Results of one kind by name, in `results.jsonl` of a folder; those of other settings are ignored.
 
     Raises InputError when the folder cannot be written to, or another process keeps its results there.
     """
@@ -122,7 +122,7 @@ class Store(Generic[Result]):
         self._load()
 
     def add(self, name: str, result: Result) -> None:
-        """Append a result to the file; it is written when this returns."""
+        """Append a result to the file, and flush the file before returning."""
         line = json.dumps({"settings": self._settings, "name": name, "result": result}, allow_nan=False)
         try:
             self._stream.write(line.encode() + b"\n")
@@ -147,7 +147,7 @@ class Store(Generic[Result]):
 
 
 class _Entry(BaseModel):
-    """A line of the file."""
+    """Line of `results.jsonl`: a result, its name, and the hash of its settings."""
 
     model_config = ConfigDict(strict=True)
 
@@ -169,7 +169,7 @@ def require_writable(folder: Path) -> None:
 
 
 def run_isolated(summarise: Callable[[Calibration], dict[str, Any]], calibrate: Callable[[], Calibration]) -> Any:
-    """Status, exit code, reason, seconds of wall time, and the keys of `summarise`; an exception is a failure."""
+    """Run a calibration; return status, exit code, reason, wall time, s, and the keys of `summarise`."""
     from alidade.pipelines.solvers.chain import IndeterminateError
 
     try:
@@ -190,7 +190,7 @@ def run_isolated(summarise: Callable[[Calibration], dict[str, Any]], calibrate: 
 
 
 def failure(exit_code: int, reason: str) -> Any:
-    """The result of a calibration without an estimate, of a recording or a run."""
+    """Return the result of a calibration that gave no estimate."""
     return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
 
 

@@ -18,7 +18,7 @@ Row = Mapping[str, Cell]
 
 
 def csv_text(rows: Sequence[Row]) -> str:
-    """Numbers with all their digits; empty where a row has nothing; text that is no formula to any spreadsheet."""
+    """Return rows as CSV: numbers with all digits, empty where a value is missing, no text that spreadsheets run."""
     stream = StringIO()
     writer = csv.DictWriter(stream, columns(rows), restval="", lineterminator="\n")
     writer.writeheader()
@@ -31,7 +31,7 @@ def _inert(cell: Cell) -> Cell:
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
-    """Columns of text, whole numbers or float64, null where a row has nothing."""
+    """Write a Parquet file of columns of text, whole numbers or float64, null where a row has no value."""
     from arro3.core import Array, DataType, Table
     from arro3.io import write_parquet as write
 

@@ -85,7 +85,7 @@ def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found:
 
 
 def write_study(out: Path, study: Study) -> tuple[Path, ...]:
-    """runs.csv, summary.csv and montecarlo.html, whole or not at all; returns their paths."""
+    """Write runs.csv, summary.csv and montecarlo.html, all or none of them; return their paths."""
     return write_whole(
         out,
         {

@@ -52,7 +52,7 @@ MAX_CHANNELS = 1000
 
 
 class _Topic(NamedTuple):
-    """A channel as a bridge describes it, whatever its number."""
+    """Description of a bridge's channel without its number."""
 
     name: str
     encoding: str
@@ -60,7 +60,7 @@ class _Topic(NamedTuple):
 
 
 class Bridge(Stream):
-    """The messages of a bridge. Raises InputError when websockets is not installed.
+    """Source of the messages of a Foxglove WebSocket bridge. Raises InputError when websockets is not installed.
 
     Args:
         url: ws://host:port or wss://.
@@ -100,13 +100,13 @@ class Bridge(Stream):
             self._say(f"{self._url}: {self.refused} messages refused")
 
     def _tell(self, sentence: str) -> None:
-        """Say it, but not twice in a row."""
+        """Pass a sentence to `say` unless the sentence before was the same."""
         if sentence != self._sentence:
             self._sentence = sentence
             self._say(sentence)
 
     def _listen(self, connection: Any, record: _Record) -> None:
-        """Take what one connection brings, until it closes."""
+        """Record the messages of one connection until the connection closes."""
         wanted: dict[int, _Topic] = {}  # by subscription, which are numbered as the bridge's channels
         while not self._over.is_set():
             try:
@@ -137,7 +137,7 @@ class Bridge(Stream):
             self._refuse(str(error))
 
     def _announced(self, text: str, wanted: dict[int, _Topic]) -> dict[int, _Topic]:
-        """New channels of use that a message advertises. Those that it withdraws are wanted no more: ids are reused."""
+        """Return the usable channels that a message advertises; remove those it withdraws, whose ids are reused."""
         found: dict[int, _Topic] = {}
         try:
             message = read_message(text)
@@ -167,7 +167,7 @@ class Bridge(Stream):
 
 
 class _Record:
-    """An MCAP file of what comes, readable up to the last message at any time."""
+    """MCAP file of received messages, readable at any time up to the last flush."""
 
     def __init__(self, out: Spool) -> None:
         self._out, self._writer = out, Writer(out, use_chunking=False)  # type: ignore[arg-type]
@@ -176,7 +176,7 @@ class _Record:
         self._flushed = time.monotonic()
 
     def add(self, topic: _Topic, log_ns: int, data: bytes) -> None:
-        """A message of a topic. Raises RefusedError when its topic had another type."""
+        """Write a message of a topic. Raises RefusedError when the topic had another type before."""
         if self._out.is_full:
             self.flush()
         if self._out.is_full:
@@ -196,19 +196,19 @@ class _Record:
             self.flush()
 
     def flush(self) -> None:
-        """Let readers see it."""
+        """Flush buffered messages to the file, where readers see them."""
         self._flushed = time.monotonic()
         self._out.flush()
 
     def close(self) -> None:
-        """With what a closed file ends with, if anything has come."""
+        """Write the end of the MCAP file, if it has any message, and flush the file."""
         if self._channels:
             self._writer.finish()  # type: ignore[no-untyped-call]
         self._out.flush()
 
 
 def _described(channel: Any) -> tuple[int, _Topic]:
-    """A channel's number and description, with what a bridge may leave out. Raises RefusedError."""
+    """Return a channel's number and description, completed where a bridge may leave parts out. Raises RefusedError."""
     if not isinstance(channel, dict):
         raise RefusedError("a channel that is no object")
     given = [channel.get(name) or "" for name in ("topic", "encoding", "schemaName", "schemaEncoding", "schema")]
@@ -224,6 +224,6 @@ def _described(channel: Any) -> tuple[int, _Topic]:
 
 
 def _is_of_use(topic: _Topic) -> bool:
-    """Whether the messages are a sensor's, and can be read."""
+    """Whether a channel has messages of a sensor's type that can be decoded."""
     form = MessageFormat(Channel(1, topic.name, topic.encoding, 1), topic.schema)
     return form.is_readable and form.type in SENSORS

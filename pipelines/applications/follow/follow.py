@@ -33,7 +33,7 @@ def follow(
     origins: Sequence[str] = (),
     speed: float | None = None,
 ) -> Calibration:
-    """Follow a recording until it ends, shown in the terminal, with a port served on it, and on a page.
+    """Follow a recording until it ends, in the terminal, on a port for Foxglove and on a page.
 
     The first Ctrl-C ends it with what is there, the second at once. A server or page that fails is given up, and costs
     nothing else. Raises as `source_of` and `Follower.follow` do.
@@ -87,7 +87,7 @@ def follow(
 
 @contextmanager
 def _interrupted(answer: Callable[[], None]) -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets, answered at once; the next one is as ever."""
+    """Yield an event that the first Ctrl-C sets, which also calls `answer`; the second one interrupts as usual."""
     event = threading.Event()
 
     def heard(_: int, __: FrameType | None) -> None:

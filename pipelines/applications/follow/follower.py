@@ -78,7 +78,7 @@ class Settings:
 
 
 class Follower:
-    """Calibration of a recording while it is written.
+    """Calibrates a recording while it is being written.
 
     Args:
         source: of the recording.
@@ -119,7 +119,7 @@ class Follower:
             load_known(settings.prior)  # refused now, not when the recording has begun
 
     def follow(self) -> Calibration:
-        """Until the recording is finished, stops growing, or `stopped`; then the calibration by all there is.
+        """Follow the recording until it is finished, stops growing, or `stopped`; then calibrate with all data.
 
         Raises:
             InputError: the file does not appear, is no MCAP, cannot be used in the end, or the checkpoint is of
@@ -147,7 +147,7 @@ class Follower:
     # -- one look
 
     def _look(self) -> float:
-        """Take what is settled of what is there now; returns what it took of a core to read it, s."""
+        """Read what has been recorded, pass the settled steps to the solver; return the CPU time of reading, s."""
         started = time.thread_time()
         try:
             problem, steps = self._end_alone() or self._whole()
@@ -161,7 +161,7 @@ class Follower:
         return cost
 
     def _may_settle(self) -> bool:
-        """Whether what has come may settle a step: to look takes long, and another look has to wait for this one."""
+        """Whether new data may settle a further step; only then is the recording read again, which takes long."""
         run, held = self._run, self._held
         last_ns = self._growing.last_log_ns(self.source.parts)
         if run is None or held is None or last_ns is None:
@@ -170,7 +170,7 @@ class Follower:
         return last_ns >= self._epoch_ns + self._delay_ns + int(settled_s * 1e9)
 
     def _settled(self, steps: Iterable[Step], revision_horizon: float) -> Iterator[Step]:
-        """The steps that are so much older, s, than the last, which may still grow; the first that is not is held."""
+        """Yield the steps older than the last one by the revision horizon, s; keep the first that is not."""
         held: deque[Step] = deque()
         for step in steps:
             held.append(step)
@@ -179,7 +179,7 @@ class Follower:
         self._held = held[0] if held else None
 
     def _whole(self) -> tuple[Problem, Iterator[Step]]:
-        """The graph of all there is, and its steps that were not taken yet."""
+        """Return the graph of all data so far, and its steps that the run has not processed."""
         recording = Recording(self._growing.refresh(self.source.parts, None))
         session = self._read(recording)
         problem = self._guessed_before(session) or _that_grows(session.problem(), session)
@@ -194,7 +194,7 @@ class Follower:
         return Session.read(recording, settings.method, settings.config, prior=settings.prior)
 
     def _guessed_before(self, session: Session) -> Problem | None:
-        """The graph from the first guesses of a look before, where that is not long ago: they take most of the time."""
+        """Return the graph with the initial values of a recent look, which take most of the time; None without one."""
         run = self._run
         if run is None or run.problem.continuation is None or run.time > _LONG_AGO * self._guessed:
             self._guessed = 0.0 if run is None else run.time
@@ -202,7 +202,7 @@ class Follower:
         return run.problem.continuation(session.data, -np.inf)
 
     def _end_alone(self) -> tuple[Problem, Iterator[Step]] | None:
-        """The graph from where the past was marginalised out, and its new steps; None where that is too little."""
+        """Return the graph from the marginalised past on, and its new steps; None where that part is too short."""
         run, session = self._run, self._session
         if run is None or run.state.marginal is None or run.problem.continuation is None or session is None:
             return None
@@ -221,7 +221,7 @@ class Follower:
         return None
 
     def _wait(self, reason: str) -> None:
-        """Say once why the recording cannot be read yet."""
+        """Report once why the recording cannot be read yet."""
         for path in (self.source.path, *self.source.parts):
             reason = reason.removeprefix(f"{path}: ")
         if reason != self._waiting:
@@ -229,7 +229,7 @@ class Follower:
             self._say(f"{WAITING}{reason}")
 
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
-        """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
+        """Yield the steps that the run has not processed; begin a new run if the past has changed."""
         belongs = self._identify(session)
         # A sensor whose first message comes late may bring variables of its own.
         if self._run is not None and _names(self._run.problem) != _names(problem):
@@ -252,7 +252,7 @@ class Follower:
         return problem.steps_after(self._run.time)
 
     def _collect(self, session: Session) -> None:
-        """What there is by now; what was enough once stays so."""
+        """Update the checklist of collected data; an item that was complete once stays complete."""
         before, self._checklist = self._checklist, {}
         for item in session.method.guidance.checklist(session.data, session.config):
             earlier = before.get(item.what, item)
@@ -298,7 +298,7 @@ class Follower:
         return run
 
     def _identify(self, session: Session) -> dict[str, str]:
-        """What a checkpoint belongs to, in words."""
+        """Return what a checkpoint belongs to, as text: recording, method, config, window, prior, version."""
         return {
             "recording": f"one that starts at {session.epoch_ns} ns ({file_identity(self.source.parts[0])})",
             "method": session.method.name,
@@ -311,7 +311,7 @@ class Follower:
     # -- the end
 
     def _end(self, finished: bool, size: int) -> Calibration:
-        """Everything there is."""
+        """Calibrate the recording with all its data at the end."""
         if size <= 0:
             wait = "" if finished else f", after {self.settings.patience:g} s of waiting"
             raise InputError(f"{self.source.name}: nothing there, or nothing in it{wait}")
@@ -343,13 +343,13 @@ class Follower:
 
 
 def _min_delay_ns(session: Session) -> int:
-    """Least delay of the log times after the stamps, ns, of the topics that were read."""
+    """Return the least delay of log times after stamps, ns, of the topics that have been read."""
     assert session.recording is not None
     return session.recording.delay_ns
 
 
 def _is_misplaced(run: IncrementalSolver) -> bool:
-    """Whether pictures of a run are certainly far from its keyframes by now."""
+    """Whether the estimated clock certainly places pictures of a run far from its keyframes."""
     keyframes, names = run.problem.keyframes, _names(run.problem)
     if not run.started or keyframes is None or not set(_CLOCK) <= set(names):
         return False
@@ -359,10 +359,10 @@ def _is_misplaced(run: IncrementalSolver) -> bool:
 
 
 def _names(problem: Problem) -> list[str]:
-    """Of all numbers that are estimated."""
+    """Return the names of all estimated quantities of a graph."""
     return [quantity.name for quantity in problem.quantities]
 
 
 def _that_grows(problem: Problem, session: Session) -> Problem:
-    """The graph of all data in the form in which a recording that grows is continued, if it has one."""
+    """Return the graph of all data in the form that can be continued while the recording grows, if it has one."""
     return (problem.continuation and problem.continuation(session.data, -np.inf)) or problem

@@ -33,7 +33,7 @@ class _Admitted:
 
 
 class Gate:
-    """Limit on the connections of a server; safe in any thread.
+    """Limit on the number of connections of a server; safe in any thread.
 
     Args:
         most: connections of either kind.
@@ -49,7 +49,7 @@ class Gate:
         return len(self._admitted)
 
     def admit(self, connection: Hashable, address: str, close: Callable[[], None]) -> None:
-        """Take a connection in, which has shown nothing yet; closes the oldest such one when they are too many."""
+        """Admit a connection that is not trusted yet; close the oldest such one if there are too many."""
         with self._lock:
             admitted = self._admitted[connection] = _Admitted(network_of(address), close)
             gone = self._surplus(admitted)
@@ -57,7 +57,7 @@ class Gate:
             gone.close()
 
     def trust(self, connection: Hashable) -> None:
-        """A connection may read; closes the oldest such one when they are too many."""
+        """Mark a connection as trusted to read; close the oldest trusted one if there are too many."""
         with self._lock:
             admitted = self._admitted.pop(connection, None)
             if admitted is None:
@@ -69,7 +69,7 @@ class Gate:
             gone.close()
 
     def close_untrusted(self, connection: Hashable) -> None:
-        """Close a connection that has not shown by now that it may read."""
+        """Close a connection unless it has been trusted by now."""
         with self._lock:
             each = self._admitted.get(connection)
             gone = self._admitted.pop(connection) if each is not None and not each.trusted else None
@@ -82,7 +82,7 @@ class Gate:
             self._admitted.pop(connection, None)
 
     def _surplus(self, new: _Admitted) -> _Admitted | None:
-        """Take out what is too many with a new one, if anything is."""
+        """Remove and return the oldest connection of the same trust if a new one is one too many; else None."""
         same = [key for key, each in self._admitted.items() if each.trusted == new.trusted]
         own = [key for key in same if self._admitted[key].address == new.address]
         if len(own) > self._per_address:
@@ -91,7 +91,7 @@ class Gate:
 
 
 class Attempts:
-    """Wrong tokens by address: a few at once, then one now and then."""
+    """Limit on wrong tokens by address: a few at once, then one at intervals."""
 
     def __init__(self) -> None:
         self._left: dict[str, tuple[float, float]] = {}  # attempts left, and when that was
@@ -115,7 +115,7 @@ class Attempts:
 
 
 def network_of(address: str) -> str:
-    """An address as one that owns it counts: IPv6 by its network of 64 bits."""
+    """Return the address by which a client is counted: of IPv6 its network of 64 bits."""
     try:
         found = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

@@ -30,7 +30,7 @@ _BEGIN_ANEW = Motion("look what moved, and begin anew")
 
 @dataclass(frozen=True)
 class View:
-    """The state of a recording being followed.
+    """State of the calibration of a recording that is being followed.
 
     Attributes:
         time: s from the session's start up to which the recording was taken.
@@ -61,14 +61,14 @@ class View:
 
     @property
     def verdicts(self) -> dict[str, Verdict]:
-        """Parameter -> verdict, of those with a required accuracy; none while there is too little."""
+        """Parameter -> verdict, of those with a required accuracy; empty while there are too few data."""
         if self.covariance is None or self.values is None:
             return {}
         return verdicts(self.quantities, self.covariance, self.findings, self.values)
 
     @property
     def status(self) -> str:
-        """Status of the estimate; empty while there is too little for one."""
+        """Status of the estimate; empty while there are too few data for one."""
         return "" if self.covariance is None else status(self.findings)
 
     @property
@@ -80,19 +80,19 @@ class View:
 
     @property
     def done(self) -> bool:
-        """Whether every parameter is as accurate as required, by what was recorded and not by its prior alone."""
+        """Whether the recording, not priors alone, gives every parameter its required accuracy, and none changed."""
         return self.status == "calibrated" and self.change is None
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Sentences about what to collect and then what to do, in the order of `motion`, each once."""
+        """Sentences about data to collect, then about motions to make, each once, in the order of `motion`."""
         wanted = tuple(f"{c.what}: {c.wanted}" for c in self.checklist if c.wanted)
         advice = tuple(finding.evidence["advice"] for finding in self._directions)
         return tuple(dict.fromkeys((*wanted, *advice)))
 
     @property
     def motion(self) -> Motion | None:
-        """What to do now: to collect what is missing, then to determine the worst direction; None: go on as now."""
+        """Motion to make now: for missing data, then for the weakest direction; None: continue as now."""
         if self.change is not None:
             return _BEGIN_ANEW
         if self.done:
@@ -107,14 +107,14 @@ class View:
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        """Sentences about what is wrong with the recording rather than missing in it."""
+        """Sentences about what is wrong with the recording, as opposed to missing."""
         if self.change is not None:
             return (self.headline,)
         return (self._verdict,) if self.status == "inconsistent" else ()
 
     @property
     def shown(self) -> tuple[int, ...]:
-        """Rows of the parameters to be shown: all that are estimated, or those furthest from what is required."""
+        """Indexes of the parameters to show: all that are estimated, or those farthest from their required accuracy."""
         rows = [i for i, q in enumerate(self.quantities) if _is_estimated(q)]
         if self.sigmas is None:
             return tuple(rows[:_MOST_SHOWN])
@@ -128,7 +128,7 @@ class View:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The state in words, as clients receive it."""
+        """State as a mapping of words and numbers, as clients receive it."""
         return {
             "time_s": self.time,
             "status": self.status,
@@ -161,7 +161,7 @@ class View:
 
 
 class Watch:
-    """Whether what a run calibrates stays as it is.
+    """Watches whether the parameters that a run calibrates stay constant.
 
     Attributes:
         change: as of the last look; None: none was found.
@@ -172,7 +172,7 @@ class Watch:
         self.change: Stability | None = None
 
     def look(self, run: IncrementalSolver) -> None:
-        """Update the view if the run has advanced since the last one."""
+        """Test for a change of the parameters, if the run has advanced since the last test."""
         now = run, run.moments
         if not run.started or now == self._seen:
             return
@@ -188,7 +188,7 @@ def _is_estimated(q: Quantity) -> bool:
 def view_of(
     epoch_ns: int, run: IncrementalSolver, checklist: tuple[ChecklistItem, ...], change: Stability | None = None
 ) -> View:
-    """The view of a run up to now."""
+    """Return the current view of an incremental run."""
     quantities, advise = run.problem.quantities, run.problem.advice
     time = run.time if np.isfinite(run.time) else 0.0
     if not run.started:

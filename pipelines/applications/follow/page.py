@@ -179,7 +179,7 @@ class LivePage:
         self._tell(over={"status": status, "headline": headline})
 
     def _tell(self, *new: dict[str, Any], **more: Any) -> None:
-        """The state with what is new in it, to everybody."""
+        """Send the state, with what changed in it, to all clients."""
         with self._lock:
             for changed in (*new, more):
                 self._state |= changed
@@ -189,7 +189,7 @@ class LivePage:
         return [sentence for at, sentence in self._noted if time.monotonic() - at < _FRESH]
 
     def _remember(self, view: View) -> None:
-        """How far each sigma was from what is required, as log10 of their ratio, over time."""
+        """Add to the histories log10 of each sigma over its required value, at the view's time."""
         if view.sigmas is None:
             return
         for q, sigma in zip(view.quantities, view.sigmas.tolist(), strict=True):
@@ -228,7 +228,7 @@ class LivePage:
     # -- answers
 
     def _may(self, request: Request) -> bool:
-        """Whether whoever asks is to be answered; its connection is trusted then."""
+        """Whether a request may be answered; if so, mark its connection as trusted."""
         known = self._asks_for_this_machine(request) and (
             not self.is_open or _equal(request.cookies.get(self._cookie, ""), self._key)
         )
@@ -252,7 +252,7 @@ class LivePage:
 
     @property
     def _cookie(self) -> str:
-        """Its name; ports of a machine share their cookies."""
+        """Name of the page's cookie, with the port: all ports of a machine share their cookies."""
         return f"alidade-{self._port}"
 
     async def _document(self, request: Request) -> Response:
@@ -306,7 +306,7 @@ _TOO_MANY = "Too many wrong addresses from this device: wait a minute.\n"
 
 
 def _listening(host: str, port: int) -> tuple[socket.socket, Sequence[socket.AddressFamily]]:
-    """A listening socket and the address families that reach it: `::` is reached by IPv4 as well where that can be."""
+    """Return a listening socket and the address families that reach it; `::` serves IPv4 as well where possible."""
     try:
         family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
         both = family == socket.AF_INET6 and host == "::" and socket.has_dualstack_ipv6()
@@ -325,21 +325,21 @@ def _is_address(host: str) -> bool:
 
 
 def _equal(given: str, secret: str) -> bool:
-    """In a time that does not depend on where they differ."""
+    """Compare a text with a secret in a time that does not depend on where they differ."""
     return secrets.compare_digest(given.encode(errors="replace"), secret.encode())
 
 
 def _token() -> str:
-    """128 bits, in letters and digits that can be typed on a phone; good for one use."""
+    """Return a token of 128 random bits, in letters and digits that people can type on a phone, for one use."""
     return base64.b32encode(secrets.token_bytes(16)).decode().rstrip("=").lower()
 
 
 def _bounded(gate: Gate) -> type[Any]:
-    """Uvicorn's protocol, each connection of which passes the gate."""
+    """Return Uvicorn's protocol class with each connection subject to the gate."""
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     class BoundedProtocol(H11Protocol):
-        """One connection."""
+        """Connection over HTTP that the gate admits and may close."""
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
@@ -356,7 +356,7 @@ def _bounded(gate: Gate) -> type[Any]:
 
 
 def _outward(families: Sequence[socket.AddressFamily]) -> str:
-    """Address of this machine that others on its network reach by one of the families; its name without a network."""
+    """Return an address of this machine that others on its network reach; the host name without a network."""
     for family in families:
         with socket.socket(family, socket.SOCK_DGRAM) as probe, suppress(OSError):
             probe.connect(_ELSEWHERE[family])

@@ -21,7 +21,7 @@ class RefusedError(Exception):
 
 
 def read_message(text: str) -> dict[str, Any]:
-    """A text message: a JSON object of numbers and Unicode text. Raises RefusedError."""
+    """Parse a text message: a JSON object of numbers and Unicode text. Raises RefusedError."""
     try:
         content = json.loads(text, parse_constant=_refuse_constant)
         if "\\u" in text:
@@ -34,7 +34,7 @@ def read_message(text: str) -> dict[str, Any]:
 
 
 def read_id(value: Any) -> int:
-    """The number of a channel or a subscription. Raises RefusedError."""
+    """Check and return the number of a channel or a subscription. Raises RefusedError."""
     if type(value) is not int or not 0 <= value <= LARGEST_ID:
         raise RefusedError("a number of a channel that is none")
     return value
@@ -45,7 +45,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def websockets() -> Any:
-    """The library websockets. Raises InputError when it is not installed."""
+    """Import the library websockets. Raises InputError when it is not installed."""
     try:
         import websockets.sync.client
         import websockets.sync.server

@@ -89,7 +89,7 @@ def _collected(view: View) -> Table:
 
 
 def qr(address: str) -> Text:
-    """An address as a QR code for a phone's camera, dark on light whatever the terminal's own colours are."""
+    """Return an address as a QR code for a phone's camera, black on white whatever the terminal's own colours."""
     import cv2  # takes long, and most runs show no code
 
     dark = np.pad(cv2.QRCodeEncoder.create().encode(address) == 0, _QUIET)

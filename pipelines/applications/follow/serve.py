@@ -112,7 +112,7 @@ class LiveServer:
         self._server.shutdown()
 
     def show(self, view: View) -> None:
-        """Send a view to whoever is connected; its log time is that of the recording."""
+        """Send a view to all clients, with the recording's time as log time."""
         at = view.epoch_ns + round(view.time * 1e9)
         if view.values is not None and view.sigmas is not None:
             for q, value, sigma in zip(view.quantities, view.values.tolist(), view.sigmas.tolist(), strict=True):
@@ -128,7 +128,7 @@ class LiveServer:
         self._log("/status", _STATUS, {}, view.summary, at)
 
     def _advertise(self, topic: str, schema: dict[str, Any], metadata: dict[str, str]) -> int:
-        """The number of a topic's channel; a new one is announced to everybody."""
+        """Return the number of a topic's channel; announce a new channel to all clients."""
         with self._changed:
             if topic not in self._channels:
                 self._channels[topic] = {
@@ -155,7 +155,7 @@ class LiveServer:
     # -- one client: this thread listens, another one sends
 
     def _bounded(self, connected: socket.socket, address: tuple[Any, ...]) -> None:
-        """A connection, as long as there is room for it."""
+        """Serve a connection as long as the gate has room for it."""
         self._gate.admit(connected, str(address[0]), lambda: _hang_up(connected))
         try:
             self._handle(connected, address)
@@ -180,7 +180,7 @@ class LiveServer:
         sender.join()
 
     def _send(self, connection: Any, client: _Client) -> None:
-        """All channels, and of those that are wanted each last message once, until the client is gone."""
+        """Send all channels, and each last message of the wanted ones once, until the client is gone."""
         from websockets.exceptions import ConnectionClosed as Closed
 
         info = {"op": "serverInfo", "name": "alidade", "capabilities": [], "supportedEncodings": [], "metadata": {}}
@@ -206,13 +206,13 @@ class LiveServer:
         return self._over or client.gone or len(self._channels) > client.channels or bool(self._due(client))
 
     def _due(self, client: _Client) -> dict[int, _Last]:
-        """The last messages that a client has not got yet, by subscription."""
+        """Return subscription -> last message, for messages that the client has not received."""
         wanted = {subscription: self._last.get(channel) for subscription, channel in client.wanted.items()}
         return {s: last for s, last in wanted.items() if last is not None and last.number > client.sent.get(s, 0)}
 
 
 class _Last(NamedTuple):
-    """The last message of a channel: how many there were, its time, its bytes."""
+    """Last message of a channel: its running number, time, ns, and bytes."""
 
     number: int
     at_ns: int
@@ -220,7 +220,7 @@ class _Last(NamedTuple):
 
 
 class _Client:
-    """What a client wants, subscription -> channel, and what it has got."""
+    """State of a client: the channels it wants, by subscription, and the last message sent to each."""
 
     def __init__(self) -> None:
         self.wanted: dict[int, int] = {}
@@ -229,7 +229,7 @@ class _Client:
         self.gone = False
 
     def take(self, text: str | bytes) -> None:
-        """What it asks for, up to MAX_SUBSCRIPTIONS; what else it says is nothing to us."""
+        """Apply a client's subscriptions, up to MAX_SUBSCRIPTIONS; ignore all other messages."""
         if isinstance(text, bytes):
             return
         try:
@@ -247,6 +247,6 @@ class _Client:
 
 
 def _hang_up(connected: socket.socket) -> None:
-    """From any thread: the one that reads or writes finds the connection closed."""
+    """Shut down a connection from any thread; the thread that reads or writes then finds it closed."""
     with suppress(OSError):
         connected.shutdown(socket.SHUT_RDWR)

@@ -30,7 +30,7 @@ _PART = re.compile(r"live_(\d+)\.mcap")
 
 
 class Source(AbstractContextManager["Source"]):
-    """A file, or a folder of the parts of one recording, that may still be written; it need not be there yet.
+    """Recording that may still be written: a file, or a folder of its parts, which may not exist yet.
 
     Attributes:
         path: of the file or the folder.
@@ -42,14 +42,14 @@ class Source(AbstractContextManager["Source"]):
 
     @property
     def parts(self) -> list[Path]:
-        """The files by now, but those that nothing is in, in their order. Raises InputError for several recordings."""
+        """Files of the recording so far, in order, without empty ones. Raises InputError for several recordings."""
         if not self.path.is_dir():
             return [self.path] if _size(self.path) else []
         return [p for p in parts_in(self.path) if _size(p)]
 
     @property
     def where(self) -> Where:
-        """Files or folder with which `open_recording` reads the source."""
+        """Files or folder to pass to `open_recording`."""
         return self.path if self.is_finished or not self.path.is_dir() else self.parts
 
     @property
@@ -59,7 +59,7 @@ class Source(AbstractContextManager["Source"]):
 
     @property
     def is_finished(self) -> bool:
-        """Whether the recording is closed: a file by its closing mark, a folder when its metadata.yaml is there too."""
+        """Whether the recording is closed: its last file has the closing mark, a folder also its metadata.yaml."""
         parts = self.parts
         try:
             closed = bool(parts) and is_closed(parts[-1])
@@ -68,11 +68,11 @@ class Source(AbstractContextManager["Source"]):
         return closed and (not self.path.is_dir() or (self.path / "metadata.yaml").is_file())
 
     def __exit__(self, *_: object) -> None:
-        """Nothing to end: another process writes."""
+        """Do nothing: another process writes the recording."""
 
 
 class Stream(Source):
-    """Messages that come by themselves, written down in a folder: a file a run, so that a later run can go on.
+    """Source of messages that arrive as a stream, stored in a folder: a file for each run, so that later runs go on.
 
     Args:
         name: what it is called.
@@ -105,7 +105,7 @@ class Stream(Source):
 
     @property
     def where(self) -> Where:
-        """The parts that the stream was written to."""
+        """Files that the stream has been written to."""
         return self.parts
 
     def __enter__(self) -> Stream:
@@ -128,7 +128,7 @@ class Stream(Source):
             self._ended.set()
 
     def _write(self, out: Spool) -> None:
-        """Write down what comes until it ends, or `_over`."""
+        """Write arriving messages to a spool until the stream ends or `_over` is set."""
         raise NotImplementedError
 
 
@@ -150,7 +150,7 @@ class StandardInput(Stream):
 
 
 class Replay(Stream):
-    """A finished MCAP file, written anew as fast as it was recorded, so that it grows as a live one does.
+    """Source that copies a finished MCAP file as fast as it was recorded, so that the copy grows as a live one does.
 
     Args:
         path: of the file.
@@ -184,7 +184,7 @@ class Replay(Stream):
 
 
 def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] = print) -> Source:
-    """The source that is called so: a path, `-` for standard input, ws:// of a Foxglove WebSocket bridge.
+    """Return the source of a name: a path, `-` for standard input, ws:// of a Foxglove WebSocket bridge.
 
     Args:
         what: its name.
@@ -207,7 +207,7 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
 
 
 def _size(path: Path) -> int:
-    """In bytes; 0 when there is no such file yet, or not even the mark it begins with."""
+    """Return the size of a file, bytes; 0 if there is none yet, or one shorter than its opening mark."""
     try:
         size = path.stat().st_size
     except OSError:

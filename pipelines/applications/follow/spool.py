@@ -22,7 +22,7 @@ RETRY_PERIOD_S = 0.5
 
 
 class Spool:
-    """Bytes appended to a file, which is made when the first are written and may not be there before.
+    """File that grows by bytes in memory whenever its disk has room; created with the first bytes.
 
     Args:
         path: of the file.
@@ -39,7 +39,7 @@ class Spool:
 
     @property
     def is_full(self) -> bool:
-        """Whether no more can wait."""
+        """Whether the buffer in memory is full."""
         return len(self._waiting) > MAX_WAITING_BYTES
 
     def write(self, data: bytes | memoryview) -> int:
@@ -48,7 +48,7 @@ class Spool:
         return len(data)
 
     def tell(self) -> int:
-        """Position: bytes written by now, on the disk or waiting."""
+        """Return the position: bytes written so far, on the disk or in the buffer."""
         return self._end + len(self._waiting)
 
     def drop(self) -> None:
@@ -56,7 +56,7 @@ class Spool:
         self.dropped += 1
 
     def flush(self, at_once: bool = False) -> None:
-        """Put what waits on the disk if there is room. It waits for whole records: call between them."""
+        """Write the buffer to the disk if there is room; call between records, to write whole ones alone."""
         if not self._waiting or (self._due is not None and time.monotonic() < self._due and not at_once):
             return
         try:
@@ -89,7 +89,7 @@ class Spool:
         self._waiting.clear()
 
     def _fail(self, error: OSError) -> None:
-        """What was written in part goes, so that the file ends with a whole record."""
+        """Remove what was written in part, so that the file ends with a whole record; try again later."""
         if self._file is not None:
             os.ftruncate(self._file, self._end)
         if self._due is None:
