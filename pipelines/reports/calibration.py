@@ -123,7 +123,7 @@ class SavedCalibration(_Record, SensorValues):
 
     @property
     def gaussian_prior(self) -> GaussianPrior:
-        """Distribution of its parameters; independent ones where their joint distribution is not known."""
+        """Gaussian distribution of the parameters, independent where their joint distribution is not known."""
         given = self.parameters.values()
         return self._joint_prior or independent(
             list(self.parameters), [p.value for p in given], [p.sigma for p in given], self._source
@@ -131,14 +131,14 @@ class SavedCalibration(_Record, SensorValues):
 
     @property
     def start_ns(self) -> int:
-        """Start of its recording, Unix ns, to the second; UTC where no zone is stated. Raises InputError."""
+        """Start of the calibration's recording, Unix ns, to the second; UTC without a zone. Raises InputError."""
         try:
             return round(as_date(self.recording.start).timestamp()) * 1_000_000_000
         except InputError as error:
             raise InputError(f"{self._source}: start of the recording: {error}") from error
 
     def of_method(self, name: str) -> SavedCalibration:
-        """Itself. Raises InputError when it is another method's calibration."""
+        """Return this calibration. Raises InputError when it is another method's."""
         if self.method != name:
             raise InputError(f"{self.gaussian_prior.source}: is a calibration of {self.method}, not of {name}")
         return self
@@ -187,13 +187,13 @@ class SavedCalibration(_Record, SensorValues):
 
 
 def calibration_yaml(calibration: Calibration) -> str:
-    """The text of calibration.yaml."""
+    """Return the text of calibration.yaml."""
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
     from ruamel.yaml.representer import RoundTripRepresenter
 
     class Representer(RoundTripRepresenter):
-        """With floats of our own."""
+        """YAML representer with floats as `yaml_float` writes them."""
 
     def one_line(entry: dict[str, object]) -> CommentedMap:
         flat = CommentedMap(entry)
@@ -221,7 +221,7 @@ def calibration_yaml(calibration: Calibration) -> str:
 
 
 def saved(calibration: Calibration) -> SavedCalibration:
-    """The calibration in the text of a calibration.yaml."""
+    """Return a calibration as the content of its calibration.yaml."""
     method = calibration.problem.method
     parameters = {
         p.name: SavedParameter(
@@ -320,7 +320,7 @@ def _of_result(path: Path, text: str) -> SavedCalibration:
 
 
 def as_saved(given: str | Path | Calibration | SavedCalibration, config: Config | None = None) -> SavedCalibration:
-    """A calibration as calibration.yaml has it; of a file with the config that its formulas are for.
+    """Return a calibration as the content of calibration.yaml; of a file, with the config that its formulas are for.
 
     Raises:
         InputError: the file cannot be used.
@@ -331,7 +331,7 @@ def as_saved(given: str | Path | Calibration | SavedCalibration, config: Config 
 
 
 def rotations_of(calibration: Calibration) -> dict[str, SavedRotation]:
-    """The parameters that are rotation vectors, as quaternions."""
+    """Return the parameters that are rotation vectors as quaternions w, x, y, z, by name."""
     values: Mapping[str, float] = {name: p.value for name, p in calibration.parameters.items()}
     found = {}
     for parameter in calibration.problem.parameters:
@@ -344,7 +344,7 @@ def rotations_of(calibration: Calibration) -> dict[str, SavedRotation]:
 
 
 def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
-    """The formulas that are rotations and need nothing measured, by the frames in their meaning: "a to b, ..."."""
+    """Return the rotations among the formulas that have no measured input, between the frames in their meaning."""
     estimate, covariance = calibration.estimate, calibration.covariance
     unknown = dict.fromkeys((q.name for q in calibration.problem.quantities), 0.0)
     given = calibration.method.report.fixed_rotations(calibration.config)
@@ -375,7 +375,7 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
 
 
 def _plain(row: Mapping[str, object]) -> dict[str, object]:
-    """A row of findings with rounded numbers."""
+    """Return a row of findings with its numbers rounded."""
 
     def rounded(value: object) -> object:
         if isinstance(value, list):

@@ -79,7 +79,7 @@ _LANGUAGES = {"Python": python_code, "C": c_code}
 
 
 def report_html(calibration: Calibration) -> str:
-    """The report as one HTML text."""
+    """Return the report of a calibration as one HTML text."""
     return render_html(calibration_report(calibration))
 
 
@@ -127,7 +127,7 @@ def _report(c: Calibration, more: Sequence[Section]) -> Report:
 
 
 def plotted(calibration: Calibration, name: str | None) -> Page:
-    """The figures of a report as a page of their own. Raises InputError when there is none of that name."""
+    """Return the figures of a report, all or the named one, as a page. Raises InputError for an unknown name."""
     uses = {found.use.name: found for found in calibration.uses}
     plots = {plot.title: plot for plot in _plots(calibration)}
     if name is not None and name not in uses and name not in plots:
@@ -148,7 +148,7 @@ def _plots(c: Calibration) -> list[Plot]:
 
 
 def summary_of(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
-    """The verdict in one sentence, what to do in another, and badges."""
+    """Return the summary of a calibration: the verdict and what to do, a sentence each, and badges."""
     rows = [(card, group, row) for card in cards for group, row in card.rows if row.require and row.sigma > 0.0]
     missed = [name for name, verdict in c.verdicts.items() if verdict in ("weak", "unobservable")]
     if missed and all(row.ratio <= 1.0 for _, _, row in rows):  # what is derived of parameters may miss nothing
@@ -163,7 +163,7 @@ def summary_of(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
 
 
 def _nearest(card: ResultCard, group: ResultGroup, row: ResultRow, missed: bool) -> str:
-    """Phrase on the number nearest to its requirement, or farthest beyond."""
+    """Return a phrase on the result that is closest to its requirement, or farthest beyond."""
     what = f"{group.title[:1].lower()}{group.title[1:]}"
     label = f" {row.label}" if len(group.rows) > 1 else ""
     name = f"{what}{label}, {card.title.lower()}" if len(row.names) > 1 else f"{row.names[0]} ({what})"
@@ -177,7 +177,7 @@ def _nearest(card: ResultCard, group: ResultGroup, row: ResultRow, missed: bool)
 
 
 def _badges(c: Calibration) -> tuple[Badge, ...]:
-    """What matters beside the verdict: inflation, rejections, noise, priors, change, misfit, error if simulated."""
+    """Return badges: inflation, rejections, noise, priors, change, misfit, error if simulated."""
     if has_no_solution(c.findings):
         return ()
     found = []
@@ -224,7 +224,7 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
 
 
 def _misfit(fit: Fit) -> str:
-    """By what residuals differ from the noise used."""
+    """Return a phrase with the ratio of the residuals to the noise used."""
     return f"residuals {fit.noise_factor:.2g} × the noise"
 
 
@@ -247,7 +247,7 @@ def _tile(found: UseBands) -> Tile:
 
 
 def _results(c: Calibration, cards: Sequence[ResultCard]) -> tuple[Block, ...]:
-    """The result cards; cards of nuisance parameters alone are collapsed where all of them are determined."""
+    """Return the result cards; cards of nuisance parameters alone are collapsed if all of these are determined."""
     known = "; ▾ simulated truth" if truth_errors(c) else ""
     beside = [card for card in cards if card is not cards[0] and _is_beside(c, card)]
     shown = tuple(result_table(card) for card in cards if card not in beside)
@@ -267,7 +267,7 @@ def _is_beside(c: Calibration, card: ResultCard) -> bool:
 
 
 def _use_card(found: UseBands) -> Card:
-    """Error before and after calibration over the operating points, with a sentence and the formula."""
+    """Return a card with the error before and after calibration over the operating points, and the formula."""
     use = found.use
     sign = "± " if use.signed else ""
     before, after = rounded(found.before, 3), rounded(found.after)
@@ -319,7 +319,7 @@ def _use_card(found: UseBands) -> Card:
 
 
 def _coefficients(found: UseBands) -> tuple[Block, ...]:
-    """The coefficients of each curve with their sigmas, before and after calibration."""
+    """Return a table of the coefficients of each curve with their sigmas, before and after calibration."""
     use = found.use
     if use.coefficients is None:
         return ()
@@ -335,7 +335,7 @@ def _coefficients(found: UseBands) -> tuple[Block, ...]:
 
 
 def _diagnostics(c: Calibration) -> tuple[Block, ...]:
-    """Fit, noise, stability, the error budget of what is nearest to its requirement, and what the method found."""
+    """Return the diagnostics: fit, noise, stability, error budget, and the method's own tables."""
     own = tuple(each for each in (c.plots(c) if c.plots else ()) if isinstance(each, Table))
     fit, *more = _goodness_of_fit(c) or (None,)
     beside = tuple(table for table in (fit, _noise(c)) if isinstance(table, Table))
@@ -353,7 +353,7 @@ def _titled(title: str, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
 
 
 def _details(c: Calibration) -> tuple[Block, ...]:
-    """Further details, collapsed."""
+    """Return further details, which the page collapses."""
     matrices = tuple(Code(text, copied=True) for text in matrix_texts(c))
     plots = tuple(_plots(c))
     parts: list[tuple[str, tuple[Block, ...]]] = [
@@ -378,7 +378,7 @@ def _details(c: Calibration) -> tuple[Block, ...]:
 
 
 def direction_blocks(findings: Sequence[Finding]) -> tuple[Block, ...]:
-    """Weak directions: those with the same advice in one row, and the weights of each."""
+    """Return a table of weak directions, those with the same advice in one row, and the weights of each."""
     directions = [finding.evidence for finding in findings if finding.kind == "direction"]
     if not directions:
         return ()
@@ -402,7 +402,7 @@ def direction_blocks(findings: Sequence[Finding]) -> tuple[Block, ...]:
 
 
 def _frames(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
-    """The method's sketch with the estimated mounts drawn in."""
+    """Return the method's sketch with the estimated mounts drawn in."""
     if c.method.frames is None:
         return ()
     svg = c.method.frames.read_text(encoding="utf-8")
@@ -448,13 +448,13 @@ def _nuisance_parameters(c: Calibration) -> tuple[Block, ...]:
 
 
 def _rows(c: Calibration, nuisance: bool = False) -> list[tuple[Quantity, ParameterResult]]:
-    """The calibrated or the nuisance parameters of the estimate."""
+    """Return the calibrated or the nuisance parameters of the estimate, each with its quantity."""
     pairs = zip(quantities_of(c.problem, c.estimate), c.parameters.values(), strict=True)
     return [(q, p) for q, p in pairs if (p.group is not None) == nuisance]
 
 
 def _estimate_cells(c: Calibration, q: Quantity) -> tuple[Cell | str, ...]:
-    """Name, value, sigma, unit and prior."""
+    """Return the cells of a parameter: name, value, sigma, unit and prior."""
     p, (unit, factor) = c.parameters[q.name], human_unit(q)
     numbers = (p.value, p.sigma) if _is_known(q, p) else ()
     value, sigma = (to_digits_of(factor * x, factor * p.sigma) for x in numbers) if numbers else ("unknown", "unknown")
@@ -471,7 +471,7 @@ def _error_column(c: Calibration) -> tuple[Column, ...]:
 
 
 def _error_cells(c: Calibration, q: Quantity) -> tuple[str, ...]:
-    """The error where the truth is known; no cell without a truth."""
+    """Return a cell with a parameter's error where its truth is known; no cell without any truth."""
     if c.truth is None:
         return ()
     p, error, factor = c.parameters[q.name], truth_errors(c).get(q.name), human_unit(q)[1]
@@ -482,7 +482,7 @@ def _error_cells(c: Calibration, q: Quantity) -> tuple[str, ...]:
 
 
 def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
-    """The formulas, and code with the numbers in it; none of a result that is not to be applied."""
+    """Return the formulas, and code with the numbers in it; nothing for a result that is not to be applied."""
     needed = " ".join(formula.expression for formula in c.formulas)
     constants = [f"{name} = {value:.6g}" for name, value in c.problem.constants.items() if name in needed]
     formulas = tuple(f"`{line}`" for line in (*(formula.text for formula in c.formulas), *constants))
@@ -511,12 +511,12 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
 
 
 def _call(c: Calibration) -> str:
-    """What the formulas measure, as arguments."""
+    """Return the measured inputs of the formulas as keyword arguments of a call."""
     return ", ".join(f"{name}={name}" for name in dict.fromkeys(n for formula in c.formulas for n in formula.inputs))
 
 
 def _noise(c: Calibration) -> Table | None:
-    """Every noise but those that are zero."""
+    """Return a table of all noises except those that are zero."""
     inflated = any(n.inflation > 1.0 for n in c.noises)
     columns: Columns = (
         "noise",
@@ -576,7 +576,7 @@ def _error_budget(c: Calibration) -> tuple[Block, ...]:
 
 
 def _fixed_inputs(c: Calibration) -> tuple[Block, ...]:
-    """The effect of a typical error of each fixed input, the largest first."""
+    """Return a table of the effects of a typical error of each fixed input, the largest first."""
     quantities = {q.name: q for q in c.problem.quantities if not q.assumed}
     rows: list[Row] = []
     for name, sensitivity in (c.sensitivity or {}).items():
@@ -668,7 +668,7 @@ def _fit_row(family: str, fit: Fit) -> tuple[str, ...]:
 
 
 def _stability(c: Calibration) -> tuple[Block, ...]:
-    """The result of the change test, where it was made."""
+    """Return a card with the result of the change test; nothing if there was no test."""
     if c.stability is None:
         return ()
     changes = [sentences.sentence(f, c.quantities) for f in c.findings if f.kind in ("change", "jump")]

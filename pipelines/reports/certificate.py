@@ -103,7 +103,7 @@ class Row:
 
 
 def _recordings(result: Result) -> list[dict[str, Any]]:
-    """The recordings that the result is from; the name of a single one is not in it."""
+    """Return the recordings that a result is from, as mappings; a single recording has no name there."""
     keys = ("recording", "sha256", "start", "duration_s", "dof")
     each: Sequence[object] = result.recordings or [result.session]
     return [{key: getattr(one, key, "" if key == "recording" else None) for key in keys} for one in each]
@@ -182,7 +182,7 @@ def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[
 
 
 def _effective(result: Result, shares: Mapping[str, float]) -> float | None:
-    """Welch and Satterthwaite: the share of a family of measurements has the degrees of freedom of its residuals.
+    """Return effective degrees of freedom (Welch, Satterthwaite) of a variance with these shares; None: very many.
 
     Noise that was stated and not asked of the recording, and priors, count as known.
     """
@@ -198,7 +198,7 @@ def _effective(result: Result, shares: Mapping[str, float]) -> float | None:
 
 
 def _conformity(value: float, expanded: float, limits: Limits) -> Conformity:
-    """With a guard band of U on either side of the limits: less than 2.5 % of either statement is wrong."""
+    """Return the statement of conformity, with a guard band of U: less than 2.5 % of either statement is wrong."""
     off = abs(value - limits.nominal)
     if off + expanded <= limits.tolerance:
         return "conforms"
@@ -222,7 +222,7 @@ def _content(result: Result, stated: Fields, rows: Sequence[Row], missing: Seque
 def certificate_report(
     result: Result, stated: Fields, rows: Sequence[Row], missing: Sequence[str], before: Path | None
 ) -> Report:
-    """The certificate as a report."""
+    """Return the certificate as a report."""
     text = {name: "not stated" if value is None else str(value) for name, value in stated.model_dump().items()}
     readable = [_readable(row, result) for row in rows]
     shares = ((row.name, [f"{each} {100.0 * x:.1f} %" for each, x in row.budget.items() if x >= 5e-4]) for row in rows)
@@ -254,7 +254,7 @@ _RESERVATION = (
 
 
 def _identity(result: Result, text: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
-    """What was calibrated, by whom, when and from which recordings."""
+    """Return rows on what was calibrated, by whom, when and from which recordings."""
     recordings = _recordings(result)
     first = "recordings" if len(recordings) > 1 else "recording"
     return (
@@ -321,7 +321,7 @@ def _found_table(rows: Sequence[Row], readable: Sequence[_Readable], before: Pat
 
 
 def _summary(result: Result, rows: Sequence[Row], missing: Sequence[str]) -> Summary:
-    """What is not stated; else whether the item is within its limits, or the status where it has none."""
+    """Return a summary: fields that are not stated; else conformity with limits, or the status without limits."""
     if missing:
         text = f"{len(missing)} fields are not stated: {', '.join(missing)}."
         steps = ("State them in the file given with `--fields`.",)
@@ -338,7 +338,7 @@ def _summary(result: Result, rows: Sequence[Row], missing: Sequence[str]) -> Sum
 
 
 def _readable(row: Row, result: Result) -> _Readable:
-    """The unit people read a row in, and what formats its SI values with as many digits as U warrants."""
+    """Return the unit people read a row in, and a formatter of SI values with as many digits as U warrants."""
     require = next((p.require for p in result.parameters if p.name == row.name), None)
     unit, factor = shown_unit(row.unit, require)
     return unit, lambda value: to_digits_of(factor * value, factor * row.expanded)
@@ -352,7 +352,7 @@ def _meaning(result: Result, name: str) -> str:
 
 
 def _printed(page: str) -> bytes:
-    """The page as PDF."""
+    """Return an HTML page as PDF."""
     try:
         from weasyprint import HTML
     except (ImportError, OSError) as error:  # OSError: the system has no Pango

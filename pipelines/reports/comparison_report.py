@@ -55,7 +55,7 @@ def comparison_report(comparison: Comparison) -> Report:
 def _solvers(
     calibrations: Sequence[Calibration], quantities: Sequence[Quantity], z: Sequence[Mapping[str, float]]
 ) -> tuple[Block, ...]:
-    """Verdict of each solver, the required parameters by all of them, and collapsed the nuisance parameters."""
+    """Return the verdict of each solver, a table of required parameters, and a collapsed one of nuisance parameters."""
     verdicts = [(c, summary_of(c, result_cards(c))) for c in calibrations]
     required = [q for q in quantities if q.judged]
     others = [q for q in quantities if not q.judged]
@@ -80,7 +80,7 @@ def _solver_table(
     z: Sequence[Mapping[str, float]],
     caption: str = "",
 ) -> Table:
-    """The truth where known, value and sigma of each solver, and z."""
+    """Return a table with the truth, where known, and value, sigma and z of each solver."""
     errors = [truth_errors(c) for c in calibrations]
     columns: list[Column | str] = ["parameter", Column("unit", "text"), *(["truth"] if any(errors) else [])]
     for c in calibrations:
@@ -100,7 +100,7 @@ def _solver_table(
 
 
 def _z_scores(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[dict[str, float]]:
-    """Error over sigma by parameter where the truth is known, else the difference from batch; one a solver."""
+    """Return for each solver parameter -> z: error over sigma where the truth is known, else difference from batch."""
     errors = [truth_errors(c) for c in calibrations]
     if any(errors):
         return [{name: e.error_sigmas for name, e in each.items() if e.error_sigmas is not None} for each in errors]
@@ -109,7 +109,7 @@ def _z_scores(calibrations: Sequence[Calibration], quantities: Sequence[Quantity
 
 
 def _estimate(c: Calibration, q: Quantity) -> str:
-    """Value and sigma; a dash of a parameter that the solver does not know."""
+    """Return value and sigma of a parameter as text; a dash if the solver does not estimate it."""
     found, (_, factor) = c.parameters.get(q.name), human_unit(q)
     if found is None:
         return "-"
@@ -117,7 +117,7 @@ def _estimate(c: Calibration, q: Quantity) -> str:
 
 
 def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], name: str) -> float | None:
-    """The difference of a solver's value from batch's, in batch's sigmas."""
+    """Return the difference of a solver's value from batch's, in batch's sigmas; None where not comparable."""
     batch = next((c for c in calibrations if c.estimate.solver == "batch"), None)
     if batch is None or batch is calibration:
         return None
@@ -128,7 +128,7 @@ def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], n
 
 
 def comparison_summary(comparison: Comparison) -> Summary:
-    """Whether batch and incremental agree, and both halves of the recording."""
+    """Return a summary of whether batch and incremental agree, and both halves of the recording."""
     tone: Tone = {"yes": "good", "no": "bad", "cannot say": "fixed"}[comparison.answer]  # type: ignore[assignment]
     text = " ".join(filter(None, [_solvers_agree(comparison), *_halves_agree(comparison)]))
     steps = {
@@ -215,7 +215,7 @@ def _halves(c: Calibration, quantities: Sequence[Quantity], halves: Mapping[str,
 
 
 def _differences(z: Mapping[str, Mapping[str, float]], quantities: Sequence[Quantity]) -> Plot:
-    """z of each parameter by each solver, and of the halves."""
+    """Plot z of each parameter by each solver, and of the halves."""
     out = Figure("z", "", 420, x_labels=tuple(q.name for q in quantities))
     shown = {name: scores for name, scores in z.items() if scores}
     for k, (name, scores) in enumerate(shown.items()):

@@ -23,7 +23,7 @@ _CONFORMITY = {"conforms": "pass", "does not conform": "fail"}
 
 
 def digital_certificate(content: Mapping[str, Any], order: Sequence[str], covariance: Sequence[Sequence[float]]) -> str:
-    """The text of the XML file.
+    """Return the Digital Calibration Certificate as XML text.
 
     Args:
         content: of certificate.json.
@@ -49,7 +49,7 @@ def digital_certificate(content: Mapping[str, Any], order: Sequence[str], covari
 
 
 def d_si_unit(*units: str) -> str:
-    """The product of units such as rad/s/(m/s^2) in the notation of D-SI; counts and pixels are 1."""
+    """Return the product of units such as rad/s/(m/s^2) in the notation of D-SI; counts and pixels are 1."""
     powers: dict[str, int] = {}
     for unit in units:
         sign = group = 1
@@ -63,7 +63,7 @@ def d_si_unit(*units: str) -> str:
 
 
 def _tag(name: str, *children: ET.Element | str | None, **attributes: str) -> ET.Element:
-    """An element of `dcc`, or of the prefix that its name has; None among its children is left out."""
+    """Make an XML element of `dcc`, or of the prefix in its name, without children that are None."""
     prefix, _, local = name.rpartition(":")
     element = ET.Element(f"{{{_SPACES[prefix or 'dcc']}}}{local}", attributes)
     element.text = next((child for child in children if isinstance(child, str)), None)
@@ -76,7 +76,7 @@ def _text(name: str, text: str | None) -> ET.Element | None:
 
 
 def _date(name: str, text: str | None) -> ET.Element | None:
-    """A date; other text has no place."""
+    """Make an element with an ISO 8601 date; None for any other text."""
     return _tag(name, text) if text and re.fullmatch(r"\d{4}-\d\d-\d\d", text) else None
 
 
@@ -85,7 +85,7 @@ def _software(software: Mapping[str, str]) -> Iterator[ET.Element]:
 
 
 def _contact(name: str, text: str, country: str | None = None) -> ET.Element:
-    """A name and, in the lines after it, its address."""
+    """Make the element of a contact from a text: name in the first line, address in the lines after it."""
     first, *rest = text.strip().splitlines()
     address = _text("further", " ".join(rest) or first)
     return _tag(name, _text("name", first), _tag("location", country and _tag("countryCode", country), address))
@@ -154,7 +154,7 @@ def _measurement(content: Mapping[str, Any], order: Sequence[str], covariance: S
 
 
 def _quantity(row: Mapping[str, Any], fields: Mapping[str, Any]) -> ET.Element:
-    """A parameter with its expanded uncertainty and the statement of conformity, if there is one."""
+    """Make the element of a parameter with its expanded uncertainty and, if there is one, statement of conformity."""
     numbers = zip(
         ("valueExpandedMU", "coverageFactor", "coverageProbability"),
         (row["expanded"], row["coverage"], fields["coverage_probability"]),
@@ -180,7 +180,7 @@ def _real(value: float, unit: str, uncertainty: ET.Element | None = None) -> ET.
 def _covariance(
     rows: Sequence[Mapping[str, Any]], order: Sequence[str], covariance: Sequence[Sequence[float]]
 ) -> Iterator[ET.Element]:
-    """Rows of the joint covariance of the results, in their order."""
+    """Yield the rows of the results' joint covariance as elements, in the order of the results."""
     for row in rows:
         numbers = " ".join(repr(covariance[order.index(row["name"])][order.index(each["name"])]) for each in rows)
         units = _tag("si:unitXMLList", " ".join(d_si_unit(row["unit"], each["unit"]) for each in rows))

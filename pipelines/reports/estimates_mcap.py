@@ -86,7 +86,7 @@ def write_estimates(path: Path, calibration: Calibration, history: History) -> N
 
 
 def _plots(calibration: Calibration, history: History) -> Iterator[tuple[str, str, tuple[str, ...], Array]]:
-    """Topic, unit, names and numbers over time (n, names) of what is plotted together."""
+    """Yield topic, unit, names and values over time (n, names) of what one panel plots."""
     column = {name: i for i, name in enumerate(calibration.estimate.names)}
     for title, unit, members in variables(calibration):
         variable = re.sub(r"\W+", "_", title)
@@ -103,7 +103,7 @@ def _stamps(epoch_ns: int, over_time: History) -> NDArray[np.int64]:
 
 
 def _encode(stamps: NDArray[np.int64], value: Array, sigma: Array) -> NDArray[np.void]:
-    """CDR of all messages of a topic."""
+    """Encode all messages of a topic as CDR: value, sigma and the edges of the one-sigma band."""
     out = np.zeros(len(stamps), _LAYOUT)
     out["head"] = _CDR_HEAD
     out["sec"], out["nanosec"] = np.divmod(stamps, 1_000_000_000)
@@ -124,7 +124,7 @@ _PLOT = {
 
 
 def foxglove_layout(calibration: Calibration) -> str:
-    """The layout as JSON: a plot a variable, with the values of its numbers and the edges of their one-sigma bands."""
+    """Return Foxglove's layout as JSON: a plot of each variable, with values and one-sigma bands of its numbers."""
     panels = {}
     for title, unit, members in variables(calibration):
         paths = [
@@ -151,7 +151,7 @@ def foxglove_layout(calibration: Calibration) -> str:
 
 
 def _split(panels: Sequence[str], direction: str) -> Any:
-    """Panels side by side and one above the other, in turns, as evenly as it goes."""
+    """Arrange panels in rows and columns, alternately split into halves."""
     if len(panels) == 1:
         return panels[0]
     half = (len(panels) + 1) // 2

@@ -39,7 +39,7 @@ def export(calibration: str | Path | Calibration | SavedCalibration, form: str) 
 
 
 def _tf(saved: SavedCalibration) -> str:
-    """A command of tf2_ros for each transform."""
+    """Return a command of tf2_ros, static_transform_publisher, for each transform."""
     lines = [f"# {_PLACE}."]
     for name, each in saved.transforms.items():
         quaternion = " ".join(f"--q{axis} {value!r}" for axis, value in zip("wxyz", each.wxyz, strict=True))
@@ -52,7 +52,7 @@ def _tf(saved: SavedCalibration) -> str:
 
 
 def _urdf(saved: SavedCalibration) -> str:
-    """A fixed joint for each transform; rpy turns about fixed x, then y, then z."""
+    """Return a fixed URDF joint for each transform; rpy turns about fixed x, then y, then z."""
     lines = [f"<!-- {_PLACE}. -->"]
     for name, each in saved.transforms.items():
         angles = " ".join(f"{angle:.12g}" for angle in roll_pitch_yaw(each))
@@ -85,7 +85,7 @@ MOUNT_FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {"tf": _tf, "ur
 
 
 def ros_parameters(saved: SavedCalibration, names: Collection[str]) -> str:
-    """Values that formulas use, SI, three of them name_x, name_y, name_z as one list, and the transforms."""
+    """Return a ROS 2 parameter file of the values in formulas, SI, x, y, z as one list, and of the transforms."""
     content: dict[str, Any] = {"method": saved.method, "sha256": saved.recording.sha256}
     for name in names:
         stem, _, axis = name.rpartition("_")

@@ -39,14 +39,14 @@ _SHORT = 26
 
 
 def render_html(report: Report) -> str:
-    """The page as one HTML text."""
+    """Return a report as one HTML text."""
     plots = plots_of([block for section in report.sections for block in section.blocks])
     return environment().get_template("page.html").render(report=report, plots=plots, packed=_packed(plots))
 
 
 @dataclass(frozen=True)
 class Page:
-    """Page in a frame, for a notebook."""
+    """HTML page that a notebook shows in a frame."""
 
     html: str
     height_px: int = 640
@@ -59,7 +59,7 @@ class Page:
         return f'<iframe {frame} height="{self.height_px}" srcdoc="{escape(self.html, quote=True)}"></iframe>'
 
     def write(self, path: str | Path) -> Path:
-        """Write it. Raises InputError when it cannot be written."""
+        """Write the page to a file. Raises InputError when the file cannot be written."""
         from alidade.pipelines.reports.whole import write_file
 
         write_file(Path(path), self.html)
@@ -68,7 +68,7 @@ class Page:
 
 @cache
 def environment() -> Environment:
-    """The templates: every text escaped, a name that is not given is an error."""
+    """Return the environment of the templates: every text is escaped, an undefined name is an error."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     made = Environment(
@@ -92,14 +92,14 @@ def environment() -> Environment:
 
 
 def _coded(text: str) -> str:
-    """A text as HTML, what stands between backquotes as code."""
+    """Return a text as HTML, with text between backquotes as code."""
     from markupsafe import Markup, escape
 
     return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
 
 
 def _classes(cell: Cell, column: Column, table: Table) -> str:
-    """The attribute class of a cell."""
+    """Return the attribute `class` of a cell in HTML."""
     from markupsafe import Markup
 
     short = column.kind == "number" and len(cell.text) < _SHORT and table.style in ("", "lines", "lines many")
@@ -109,7 +109,7 @@ def _classes(cell: Cell, column: Column, table: Table) -> str:
 
 
 def _packed(plots: Sequence[Plot]) -> dict[str, str]:
-    """The library and the figures, compressed, by the ids that figures.js knows."""
+    """Return BokehJS and the figures, compressed, by the ids that figures.js uses."""
     if not plots:
         return {}
     figures = [[_described(figure) for figure in plot.figures] for plot in plots]
@@ -129,7 +129,7 @@ def _mark(mark: Mark, dates: bool) -> dict[str, Any]:
 
 
 def _numbers(column: Array, dates: bool) -> list[float | None]:
-    """A column rounded for a figure; null where it is not finite."""
+    """Return a column's numbers rounded for a figure; None where not finite."""
     finite = np.isfinite(column) & (column != 0.0)
     size = np.floor(np.log10(np.abs(column, where=finite, out=np.ones_like(column))))
     scale = np.ones_like(column) if dates else 10.0 ** (_DIGITS - 1 - size)
@@ -139,7 +139,7 @@ def _numbers(column: Array, dates: bool) -> list[float | None]:
 
 @cache
 def _bokeh() -> str:
-    """BokehJS from the installed package, which takes long to import and is not needed for it."""
+    """Return BokehJS, compressed, from the files of the package bokeh, which takes long to import."""
     folder = Path(str(distribution("bokeh").locate_file("bokeh/server/static/js")))
     return _compressed(b"\n".join((folder / name).read_bytes() for name in _BOKEH))
 

@@ -25,7 +25,7 @@ _RECORDINGS = ("recording", "start", "length", "by itself")
 
 
 def forecasts(calibration: Calibration) -> list[tuple[str, str]]:
-    """Kind of parameters -> when it is to be calibrated again, in words."""
+    """Return for each kind of parameters when it has to be calibrated again, in words."""
     changes = calibration.changes
     if changes is None:
         return []
@@ -44,7 +44,7 @@ def forecasts(calibration: Calibration) -> list[tuple[str, str]]:
 
 
 def _days(require: float, sigma: float, rate: float) -> float:
-    """Until a sigma that grows by a walk is more than required."""
+    """Return the days until a sigma that grows by a random walk exceeds the required one."""
     return max(require**2 - sigma**2, 0.0) / rate**2 if rate > 0.0 else math.inf
 
 
@@ -57,7 +57,7 @@ def _when(likely: float, soonest: float) -> str:
 
 
 def recording_blocks(calibration: Calibration) -> list[Plot | Table]:
-    """Tables and figures for the report."""
+    """Return tables and figures of the recordings of a joint calibration, for the report."""
     parts, known = calibration.recordings, {q.name: q for q in calibration.problem.quantities}
     rows = tuple((p.recording, minute(p.start), f"{p.duration_s:.0f} s", p.status) for p in parts)
     own = []
@@ -88,7 +88,7 @@ _INTERVAL = (
 
 
 def _figures(calibration: Calibration) -> list[Plot]:
-    """What each recording says by itself of a kind of parameters, with the joint estimate as a band."""
+    """Plot each kind of parameters by each recording alone, with the joint estimate as a band."""
     parts, names = calibration.recordings, [p.name for p in calibration.recordings[-1].alone]
     known = {q.name: q for q in calibration.problem.quantities if q.judged and q.name in names}
     plots = []
@@ -123,7 +123,7 @@ def _add(out: Figure, calibration: Calibration, q: Quantity, factor: float, colo
 
 
 def _band(out: Figure, calibration: Calibration, q: Quantity, factor: float, color: str) -> None:
-    """Two sigmas of the joint estimate at each recording, and after the last one as its walk lets them grow."""
+    """Draw two sigmas of the joint estimate at each recording, and their growth by the walk after the last one."""
     parts, joint = calibration.recordings, calibration.parameters[q.name]
     own = [next((n for n in p.parameters if n.name == q.name), None) for p in parts]
     values = [0.0 if n is None else n.value - joint.value for n in own]
@@ -142,12 +142,12 @@ def _band(out: Figure, calibration: Calibration, q: Quantity, factor: float, col
 
 
 def what(step: Change) -> str:
-    """Words for what moved: a turn about an axis, or a number."""
+    """Return words for a change: a mount that moved about an axis, or a parameter that changed."""
     which, _, axis = step.name.rpartition("_")
     return f"{which} about {axis} moved" if which.endswith("mount") and axis in "xyz" else f"{step.name} changed"
 
 
 def _between(after: int, parts: Sequence[PartResult]) -> str:
-    """The dates, or names, of a recording and the next."""
+    """Return a phrase with the dates, or names, of a recording and the next one."""
     both = parts[after : after + 2]
     return between([part.recording for part in both], [part.start for part in both])

@@ -52,12 +52,12 @@ _UNITS: dict[str, dict[str, tuple[str, str, float]]] = {
 
 
 def title(sensor: SensorNoise) -> str:
-    """Topic and kind of a sensor."""
+    """Return the topic and the kind of a sensor as a title."""
     return f"{sensor.topic} {_TITLES[sensor.kind]}"
 
 
 def _at_rest(sensor: SensorNoise) -> str:
-    """Rate and time at rest of a sensor, in a line."""
+    """Return the rate and the time at rest of a sensor as a line."""
     count = len(sensor.rests)
     longest = float(np.ptp(sensor.rests, axis=1).max())
     rests = (
@@ -102,7 +102,7 @@ def remarks(sensor: SensorNoise) -> list[str]:
 
 
 def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
-    """The config's keys with their values, and the `noise:` section to paste, with comments.
+    """Return the config's noise keys with their values, and the `noise:` section to paste, with comments.
 
     A value is the root mean square over the axes. The first topic of a kind gives the keys, that of the platform its
     own; what has no key, or is not determined, stands as a comment.
@@ -120,7 +120,7 @@ def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
 
 
 def noise_json(study: NoiseStudy) -> str:
-    """noise.json: everything, SI; null where a number is not determined or has no bound."""
+    """Return the text of noise.json: all results, SI; null where a number is not determined or has no bound."""
     values, text = section(study)
     content = {
         "recording": study.recording,
@@ -154,7 +154,7 @@ def noise_report(study: NoiseStudy) -> Report:
 
 
 def _sensor_table(sensor: SensorNoise) -> Table:
-    """The coefficients of each axis, with SI in small print; quantisation only where it shows."""
+    """Return a table of the coefficients of each axis, SI in small print; quantisation only where it shows."""
     rows: list[Row] = []
     for name, words in _COEFFICIENTS.items():
         found = [_of(sensor, axis, name) for axis in sensor.axes]
@@ -172,7 +172,7 @@ def _sensor_table(sensor: SensorNoise) -> Table:
 
 
 def _summary(study: NoiseStudy) -> Summary:
-    """Which coefficients the time at rest determines."""
+    """Return a summary of which coefficients the time at rest determines."""
     silent = sum(
         _of(sensor, axis, name).value is None for sensor in study.sensors for axis in sensor.axes for name in "NBK"
     )
@@ -191,7 +191,7 @@ def _summary(study: NoiseStudy) -> Summary:
 
 
 def length(seconds: float) -> str:
-    """A time as people say it."""
+    """Return a time, given in s, as text with two digits in s, min, h or days."""
     for unit, size, most in (("s", 1.0, 120.0), ("min", 60.0, 120.0), ("h", 3600.0, 48.0)):
         if seconds < size * most:
             return f"{seconds / size:.2g} {unit}" if seconds / size < 9.95 else f"{seconds / size:.0f} {unit}"
@@ -213,7 +213,7 @@ def _scientific(c: Coefficient) -> str:
 
 
 def _needed(silent: Sequence[Coefficient]) -> str:
-    """After 'do not determine': of what, and what would."""
+    """Return the end of a sentence on undetermined coefficients: their bound, and the time that determines them."""
     times = [c.needed_s for c in silent if c.needed_s is not None]
     bound = "it is below the numbers given (95 %)"
     if not times:
@@ -223,7 +223,7 @@ def _needed(silent: Sequence[Coefficient]) -> str:
 
 
 def _line(sensor: SensorNoise, name: str, key: str, values: dict[str, float] | None) -> str:
-    """A line of the section; the value goes into `values`, None: it stands as a comment."""
+    """Return a line of the `noise:` section and enter its value in `values`; a comment if `values` is None."""
     found = {axis: _of(sensor, axis, name) for axis in sensor.axes}
     known = [c.value for c in found.values() if c.value is not None]
     each = ", ".join(f"{axis} {_scientific(c)}" for axis, c in found.items())
@@ -275,7 +275,7 @@ def _sensor_json(sensor: SensorNoise) -> dict[str, Any]:
 
 
 def _plot(sensor: SensorNoise) -> Plot:
-    """Allan deviation of each axis with its interval, and the model that was fitted, dotted."""
+    """Plot the Allan deviation of each axis with its interval, and the fitted model, dotted."""
     _, unit, factor = _UNITS[sensor.kind]["B"]
     out = Figure(f"Allan deviation, {unit}", "averaging time, s", 420, x_scale="log", y_scale="log")
     for (axis, noise), color in zip(sensor.axes.items(), cycle(AXES)):

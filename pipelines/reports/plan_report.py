@@ -78,7 +78,7 @@ def _summary(plan: Plan) -> Summary:
 
 
 def _plot(plan: Plan) -> Plot:
-    """Predicted over required sigmas."""
+    """Plot predicted over required sigmas, as planned and with the proposed changes."""
     shown = [q for q in plan.now.quantities if q.judged and q.prior_sigma != 0.0]
     out = Figure("sigma / required", "", x_labels=tuple(q.name for q in shown))
     sides = [("planned", plan.now, BEFORE), *([("with changes", plan.best, COLORS[0])] if plan.steps else [])]

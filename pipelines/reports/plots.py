@@ -33,7 +33,7 @@ _APART = 4.0
 
 
 def common_plots(calibration: Calibration) -> list[Plot]:
-    """Estimates over time, residuals or innovations, correlations."""
+    """Return the plots of any method: estimates over time, residuals or innovations, correlations."""
     estimate = calibration.estimate
     history = estimate.history
     plots = histories(calibration)
@@ -55,7 +55,7 @@ def common_plots(calibration: Calibration) -> list[Plot]:
 
 
 def _error_map(found: FoundMap) -> Plot:
-    """The errors found over each number of where measurements were made."""
+    """Plot an error map: the errors over each coordinate of where measurements were made."""
     places, figures = list(found.map.places.items()), list[Figure]()
     unit, factor = noise_unit(found.map.name, UNIT)
     for i, (place, x) in enumerate(places):
@@ -73,7 +73,7 @@ def _error_map(found: FoundMap) -> Plot:
 
 
 def components(names: Sequence[str] | None, residuals: Residuals) -> list[str]:
-    """Names of a residual's numbers; where the method has none, three are x, y, z, eight a tag's corners."""
+    """Return the names of a residual's components; x, y, z for three and tag corners for eight without own names."""
     width = residuals.whitened.shape[1]
     if names is not None:
         return list(names[:width])
@@ -104,19 +104,19 @@ def _residuals(family: str, residuals: Residuals, names: Sequence[str], innovati
 
 
 def _colors(names: Sequence[str]) -> Iterable[str]:
-    """Those of the axes where names end in x, y, z, else the palette's in turn."""
+    """Return the colours of the axes for names that end in x, y, z, else the palette's in turn."""
     axes = [name.rpartition("_")[2] for name in names]
     return axes if set(axes) <= set(AXES) and len(set(axes)) == len(axes) else cycle(COLORS)
 
 
 def _view(used: Array) -> tuple[float, float]:
-    """Range of an axis that shows what was used, and above it what was rejected; the farthest stand at its edge."""
+    """Return the range of an axis that shows all used residuals, with room for rejected ones above them."""
     reach = max(5.0, 1.2 * float(np.abs(used).max(initial=0.0)))
     return -reach, 2.0 * reach
 
 
 def _squares(family: str, residuals: Residuals) -> Plot:
-    """Normalised innovation squared with its running mean."""
+    """Plot the normalised innovation squared (NIS) with its running mean."""
     time, rows = residuals.time[residuals.used], residuals.whitened[residuals.used]
     square = (rows**2).sum(axis=1)
     width = max(1, min(100, len(square) // 10))
@@ -134,7 +134,7 @@ def _squares(family: str, residuals: Residuals) -> Plot:
 
 
 def _spectrum(family: str, innovations: Residuals, names: Sequence[str]) -> Plot:
-    """Power spectrum of innovations over the model's, with the band of chance."""
+    """Plot the power spectrum of innovations over the model's, with the 99 % band of white noise."""
     time, rows = innovations.time[innovations.used], innovations.whitened[innovations.used]
     frequency, power, dof = power_spectrum(float(np.median(np.diff(time))), rows)
     out = Figure("power over the model's", "frequency, Hz", x_scale="log", y_scale="log")
@@ -153,7 +153,7 @@ def _spectrum(family: str, innovations: Residuals, names: Sequence[str]) -> Plot
 
 
 def power_spectrum(period: float, rows: Array) -> tuple[Array, Array, Array]:
-    """Frequency (k,) Hz, power (k, m) of rows (n, m), 1 for white noise of unit variance, and degrees of freedom (k,).
+    """Return frequencies (k,), Hz, power (k, m) of rows (n, m), 1 for unit white noise, and degrees of freedom (k,).
 
     Mean of half-overlapping pieces under a Hann window (Welch, IEEE Trans. Audio Electroacoust. 1967), over half
     octaves.
@@ -173,7 +173,7 @@ def power_spectrum(period: float, rows: Array) -> tuple[Array, Array, Array]:
 
 
 def variables(calibration: Calibration) -> list[tuple[str, str, list[Quantity]]]:
-    """Title, SI unit and quantities of each variable that was estimated; numbers of unlike units stand apart."""
+    """Return title, SI unit and quantities of each estimated variable; numbers of unlike units are apart."""
     found = []
     for parameter in calibration.problem.parameters:
         free = [q for q in parameter.quantities if q.name in calibration.estimate.names and q.prior_sigma != 0.0]
@@ -232,7 +232,7 @@ _OTHERS = (
 
 
 def _others(out: Figure, calibration: Calibration, name: str, factor: float, color: str, less: float) -> set[str]:
-    """Draw what else is known of a parameter over time, less a number; return which of _OTHERS that was."""
+    """Draw a parameter's published, smoothed and true values over time, less an offset; return which were drawn."""
     estimate, beside = calibration.estimate, calibration.beside
     published, smooth, truth = _OTHERS
     shown = set()
@@ -252,7 +252,7 @@ def _others(out: Figure, calibration: Calibration, name: str, factor: float, col
 
 
 def _learning(calibration: Calibration, history: History) -> Plot:
-    """Sigmas over what is required, as they fell."""
+    """Plot sigmas over the required ones as they decrease over time."""
     column = {name: i for i, name in enumerate(calibration.estimate.names)}
     out = Figure("sigma / required", y_scale="log")
     require = {q.name: q.require for q in calibration.problem.quantities}
@@ -271,7 +271,7 @@ def _learning(calibration: Calibration, history: History) -> Plot:
 
 
 def _common_name(names: Sequence[str]) -> str:
-    """What the names of one variable have in common, for a title."""
+    """Return the common part of the names of one variable, for a title."""
     stems = list(dict.fromkeys(_AXIS.sub("", name) for name in names)) if len(names) > 1 else list(names)
     more = len(stems) - _MOST_NAMED
     return ", ".join(stems[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
@@ -299,7 +299,7 @@ def _correlation(calibration: Calibration) -> Plot | None:
 
 
 def _ellipses(calibration: Calibration) -> Plot | None:
-    """One-sigma ellipses of the pairs with the strongest correlation, each in units of its own two sigmas."""
+    """Plot one-sigma ellipses of the pairs with the strongest correlation, each in units of its own two sigmas."""
     quantities = quantities_of(calibration.problem, calibration.estimate)
     covariance, sigmas = calibration.covariance, calibration.estimate.sigmas
     pairs = [

@@ -196,7 +196,7 @@ class Report:
 
 
 def plots_of(blocks: Sequence[Block]) -> list[Plot]:
-    """All plots in the order of the page."""
+    """Return all plots in some blocks, nested ones included, in the order of the page."""
     found: list[Plot] = []
     for block in blocks:
         match block:

@@ -219,7 +219,7 @@ class Calibration(SensorValues):
 
     @property
     def _calibrated(self) -> list[str]:
-        """The parameters without assumptions."""
+        """Names of the calibrated parameters, nuisance parameters left out."""
         return [q.name for q in quantities_of(self.problem, self.estimate) if q.group is None]
 
     @property
@@ -338,7 +338,7 @@ class Calibration(SensorValues):
 
     @staticmethod
     def _says(q: Quantity, found: ParameterResult | None) -> bool:
-        """Whether a nuisance parameter is known to be something else than 0: by recording, conflict or prior."""
+        """Whether a nuisance parameter is known to differ from 0: by the recording, a prior conflict or its prior."""
         if found is None:
             return False
         return q.prior_mean != 0.0 or q.determined(found.sigma) or abs(found.pull or 0.0) > LIMITS.prior_z
@@ -400,7 +400,7 @@ class Calibration(SensorValues):
 
 
 def quantities_of(problem: Problem, estimate: Estimate) -> tuple[Quantity, ...]:
-    """The quantities of an estimate, in its order; a published solver may know fewer than the problem has."""
+    """Return the quantities of an estimate, in its order; a published solver may have fewer than the problem."""
     known = {q.name: q for q in problem.quantities}
     return tuple(known[name] for name in estimate.names)
 

@@ -66,7 +66,7 @@ class ParameterResult(_Record):
 
     @model_serializer(mode="wrap")
     def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
-        """Content without empty keys: without a group there is no z-score; a prior about 0 has no mean."""
+        """Serialise without keys that do not apply: z-score without a group, prior_mean where it is 0."""
         content: dict[str, object] = handler(self)
         left_out = {*(() if self.group else ("group", "pull")), *(() if self.prior_mean else ("prior_mean",))}
         return {k: v for k, v in content.items() if k not in left_out}
@@ -317,7 +317,7 @@ _UNREAD: dict[str, object] = {
 
 
 def read_result(path: Path, text: str | bytes | None = None) -> Result:
-    """Read result.json without the keys of _UNREAD; `text`: its content, where it was read before.
+    """Read result.json without the keys in _UNREAD; `text` is the file's content if that has been read before.
 
     Raises:
         InputError: the file cannot be read or is no result.json.
@@ -331,7 +331,7 @@ def read_result(path: Path, text: str | bytes | None = None) -> Result:
 
 
 def invalid(path: Path, what: str, error: ValidationError) -> InputError:
-    """The first thing that pydantic rejected of a file, as bad input."""
+    """Return an InputError with the first error that pydantic found in a file."""
     first: Any = error.errors()[0]
     where = ".".join(map(str, first["loc"])) or "the whole"
     return InputError(f"{path}: not {what}: {where}: {first['msg']}")
@@ -342,7 +342,7 @@ _ITS_OWN = ("status", "software", "headline", "notes", "innovations", "learning"
 
 
 def result(calibration: Calibration) -> Result:
-    """result.json as a model. Raises pydantic's ValidationError if a number is not finite."""
+    """Return the content of result.json as a model. Raises pydantic's ValidationError for a non-finite number."""
     c, second = calibration, calibration.estimate.second
     return Result.model_validate(
         {
@@ -399,7 +399,7 @@ def result(calibration: Calibration) -> Result:
 
 
 def finding_json(finding: Finding) -> dict[str, object]:
-    """A finding as result.json has it: kind, severity (note, weak, inconsistent, unobservable) and its evidence."""
+    """Return a finding as in result.json: kind, severity (note, weak, inconsistent, unobservable) and evidence."""
     return {
         "kind": finding.kind,
         "severity": Severity(finding.severity).name.lower(),
@@ -408,7 +408,7 @@ def finding_json(finding: Finding) -> dict[str, object]:
 
 
 def _json(value: Any) -> object:
-    """Findings within evidence as objects, pairs as lists; null in place of what is no finite number."""
+    """Convert evidence to JSON: findings become objects, tuples lists, numbers that are not finite null."""
     if isinstance(value, Finding):
         return finding_json(value)
     if isinstance(value, Mapping):
@@ -419,7 +419,7 @@ def _json(value: Any) -> object:
 
 
 def result_json(calibration: Calibration) -> str:
-    """The text of result.json; keys that only some calibrations have are left out of the others."""
+    """Return the text of result.json without the keys that apply to some calibrations only, where they are empty."""
     model = result(calibration)
     seldom = ("truth", "second_best", "constants", "recordings", "changes")
     left_out = {name for name in seldom if getattr(model, name) is None}
@@ -427,13 +427,13 @@ def result_json(calibration: Calibration) -> str:
 
 
 def results_json(calibrations: Sequence[Calibration]) -> str:
-    """result.json of one calibration; of several a list of them."""
+    """Return the text of one calibration's result.json, or of a list of several."""
     texts = [result_json(calibration).rstrip() for calibration in calibrations]
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
 
 
 def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
-    """Parameter -> truth and error, for those whose truth is known."""
+    """Return parameter -> truth and error, for parameters whose truth is known."""
     known = calibration.truth or {}
     found = {}
     for p in calibration.parameters.values():
@@ -447,7 +447,7 @@ def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
 
 
 def _steps(c: Calibration) -> list[ChangeResult]:
-    """Every step as it is with nothing else changed; those found as they are with all found."""
+    """Return all tested steps of the device's parameters; those found are estimated with all found, others alone."""
     if c.changes is None:
         return []
     names = [part.recording for part in c.recordings]

@@ -52,7 +52,7 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class ResultRow:
-    """A number in the unit of its group; `names`: parameters that it is made of; `known`: better than ten priors."""
+    """Result in the unit of its group; `names`: parameters in it; `known`: sigma below ten prior sigmas."""
 
     label: str
     value: float
@@ -65,7 +65,7 @@ class ResultRow:
     known: bool = True
 
     def times(self, factor: float) -> ResultRow:
-        """The row in another unit, its numbers multiplied by a factor."""
+        """Return the row in another unit: its numbers multiplied by a factor."""
         scaled = {
             name: None if number is None else factor * number
             for name, number in vars(self).items()
@@ -75,7 +75,7 @@ class ResultRow:
 
     @property
     def ratio(self) -> float:
-        """Sigma over the requirement; 0 where there is none."""
+        """Ratio of the sigma to the required one; 0 if none is required."""
         return self.sigma / self.require if self.require else 0.0
 
 
@@ -91,7 +91,7 @@ class ResultGroup:
 
 @dataclass(frozen=True)
 class ResultCard:
-    """The numbers of a sensor or a mount."""
+    """Results of one sensor or mount, in groups."""
 
     title: str
     groups: tuple[ResultGroup, ...]
@@ -103,7 +103,7 @@ class ResultCard:
 
 
 def result_cards(c: Calibration) -> list[ResultCard]:
-    """The sensors, then what the method declares, then what is left, nuisance parameters only where declared."""
+    """Return cards of the sensors, of the method, and of what is left; nuisance parameters only where declared."""
     triads = [name for name in TRIADS if f"{name}_k11" in c.values]
     cards = [_triad_card(c, name) for name in triads]
     shown = {name for card in cards for _, row in card.rows for name in row.names}
@@ -125,7 +125,7 @@ def result_cards(c: Calibration) -> list[ResultCard]:
 
 
 def result_table(card: ResultCard) -> Table:
-    """A card as a table."""
+    """Return a card as a table."""
     columns = (
         Column(card.title),
         *("value", "σ", "required"),
@@ -136,7 +136,7 @@ def result_table(card: ResultCard) -> Table:
 
 
 def matrix_texts(c: Calibration) -> list[str]:
-    """K and b of each sensor of three axes, as text."""
+    """Return K and b of each sensor of three axes as text."""
     found = []
     for name in TRIADS:
         if f"{name}_k11" in c.values:
@@ -166,7 +166,7 @@ def _rows(card: ResultCard) -> Iterator[Row]:
 
 
 def group_of(c: Calibration, title: str, unit: str, names: Sequence[str]) -> ResultGroup:
-    """Parameters of one kind, in the unit that is named or else in their usual one."""
+    """Return parameters of one kind as a group, in the given unit or else in their usual one."""
     quantities = {q.name: q for q in quantities_of(c.problem, c.estimate)}
     known = (unit, _CARD_UNITS[unit]) if unit in _CARD_UNITS else None
     human, factor = known or human_unit(quantities[names[0]])
@@ -226,7 +226,7 @@ def _triad_card(c: Calibration, sensor: str) -> ResultCard:
 
 
 def _overall(row: ResultRow, common: DerivedNumber, in_counts: bool) -> ResultGroup:
-    """The mean scale, whose error all axes have in common; of counts per µT."""
+    """Return the mean scale, whose error all axes share, as a group; counts per µT for a magnetometer in counts."""
     require = None if common.require is None else common.require * row.value
     by_strength = common.verdict != "observable" or row.sigma <= (require or np.inf)
     row = replace(row, require=require, verdict=common.verdict if by_strength else row.verdict)
@@ -240,7 +240,7 @@ _LABELS = (*"xyz", "xy", "xz", "yz", *"xyz", *"xyz", "xyz")
 
 
 def _derived(c: Calibration, names: Sequence[str], function: Callable[[Array], Array]) -> list[ResultRow]:
-    """Functions of parameters, SI. Raises ValueError where they are not defined."""
+    """Return rows of functions of parameters, SI, with propagated sigmas. Raises ValueError where not defined."""
     quantities = [c.quantities[name] for name in names]
     x, P = np.array([c.values[name] for name in names]), c.covariance_of(names)
     step = np.where(np.diag(P) > 0.0, _STEP * np.sqrt(np.diag(P)), 0.0)

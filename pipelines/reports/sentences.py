@@ -61,7 +61,7 @@ _FAR = {
 
 
 def headline(findings: Sequence[Finding], quantities: Quantities, verdicts: Mapping[str, str]) -> str:
-    """The status with all its reasons: the findings that make it, the most severe first.
+    """Return the status with all its reasons: the findings that cause it, the most severe first.
 
     Args:
         findings: of a result, the most severe first.
@@ -81,13 +81,13 @@ def headline(findings: Sequence[Finding], quantities: Quantities, verdicts: Mapp
 
 
 def _warning(findings: Sequence[Finding]) -> str:
-    """That sigmas are mostly those of slow errors, after a sentence; empty where they are not."""
+    """Return a warning, to follow a sentence, if slow errors dominate the sigmas; else empty."""
     worst = slow_error(findings)
     return f" Warning: sigmas × {worst:.2g} for slow errors of a sensor." if worst > SLOW_ERROR_WARNING else ""
 
 
 def slow_error(findings: Sequence[Finding]) -> float:
-    """Ratio of sandwich to nominal sigma, the largest of a required parameter; 1 where there is no finding on it."""
+    """Return the largest ratio of sandwich to nominal sigma of a required parameter; 1 without such a finding."""
     return max((float(f.evidence["ratio"]) for f in findings if f.kind == "slow_error"), default=1.0)
 
 
@@ -145,25 +145,25 @@ def notes(findings: Sequence[Finding], quantities: Quantities) -> tuple[str, ...
 
 
 def sentence(finding: Finding, quantities: Quantities) -> str:
-    """One finding in words."""
+    """Return one finding in words."""
     return _WORDS[finding.kind](finding.evidence, finding.severity, quantities)
 
 
 def cause(finding: Finding, quantities: Quantities) -> tuple[str, str] | None:
-    """Label and evidence of a finding that may explain the others; None of one that does not."""
+    """Return label and evidence of a finding that may explain others; None for any other finding."""
     if finding.kind not in _CAUSES or finding.severity == Severity.NOTE:
         return None
     return _CAUSES[finding.kind](finding.evidence, finding.severity, quantities)
 
 
 def label(weights: Mapping[str, float]) -> str:
-    """The parameters of a direction, which trade against each other."""
+    """Return the parameters of a direction, which trade against each other, as a phrase."""
     first, *others = weights
     return f"{first} against {', '.join(others)}" if others else first
 
 
 def by_advice(findings: Sequence[Finding], *severities: Severity) -> list[tuple[str, str]]:
-    """Labels and advice of directions of these severities (none: of all), those with the same advice together."""
+    """Return (labels, advice) of directions of these severities (none: all), one pair for each advice."""
     labels: dict[str, list[str]] = {}
     for finding in findings:
         if finding.kind == "direction" and (not severities or finding.severity in severities):
@@ -172,13 +172,13 @@ def by_advice(findings: Sequence[Finding], *severities: Severity) -> list[tuple[
 
 
 def capital(text: str) -> str:
-    """The text as the beginning of a sentence; names of parameters and topics stay as they are."""
+    """Return a text with a capital letter, unless it begins with the name of a parameter or topic."""
     first = text.split(" ", 1)[0]
     return text if "_" in first or "/" in first else text[:1].upper() + text[1:]
 
 
 def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[str]:
-    """In their order: directions by advice, of other kinds the first ones."""
+    """Yield sentences on findings in their order: directions grouped by advice, of other kinds the first ones."""
     for (kind, severity), group in groupby(findings, key=lambda finding: (finding.kind, finding.severity)):
         each = list(group)
         if kind == "direction":
@@ -194,7 +194,7 @@ def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[
 
 
 def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
-    """The config's keys that allow for what contradicts its data sheet or prior; empty where nothing does."""
+    """Return the config's keys that would allow for conflicts with data sheets or priors; empty without conflicts."""
     stated: dict[str, dict[str, float]] = {}  # sensor, or none for `priors` -> figure or parameter -> size
     for e in (finding.evidence for finding in findings if finding.kind == "prior_conflict"):
         q = quantities[e["parameter"]]
@@ -242,7 +242,7 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
 
 
 def _shift(effect: Mapping[str, float], name: str, quantities: Quantities, what: str) -> str:
-    """The largest effect of a parameter on another one, in units of the requirement; empty where there is none."""
+    """Return a phrase on the largest effect of a parameter on another, in requirements; empty without effects."""
     shifts = {other: effect[other] / quantities[other].require for other in effect if other != name}
     moved = max(shifts, key=lambda other: abs(shifts[other]), default="")
     if not moved:
@@ -277,7 +277,7 @@ def _jump(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
 
 
 def _when(e: Mapping[str, Any]) -> str:
-    """Where measurements are more than a second apart, between which."""
+    """Return the time of a change as a phrase, s: an interval where measurements are more than a second apart."""
     since, until = e["since_s"], e["time_s"]
     return f"between {since:.0f} and {until:.0f} s" if until - since > 1.0 else f"at {until:.0f} s"
 
@@ -399,7 +399,7 @@ _CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict, "contradiction
 
 
 def between(recordings: Sequence[str], dates: Sequence[str]) -> str:
-    """Two dates (ISO 8601) in words, or two recordings where these are of one day."""
+    """Return two dates (ISO 8601) in words, or the names of two recordings of one day."""
     first, second = (datetime.datetime.fromisoformat(date).date() for date in dates)
     if first == second:
         return f"between {recordings[0]} and {recordings[1]}"
@@ -451,7 +451,7 @@ def _limit(name: str, shares: Mapping[str, float], assumed: set[str]) -> Limit:
 
 
 def _described(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
-    """A source in words, and what would make it smaller."""
+    """Return an error source in words, and what would reduce it."""
     if source.startswith(RECORDING):
         return source, "record longer, or more often"
     if source == WALK:

@@ -32,7 +32,7 @@ _PLACE = re.compile(r'<g class="found" data-turn="(\w+)" data-x="(\d+)" data-y="
 
 
 def sketch_with(svg: str, transforms: Mapping[str, SavedTransform]) -> str:
-    """The sketch with the rotations found, by their names; places of others stay as they are."""
+    """Return the sketch with the rotations drawn in their places, by name; places without a rotation are unchanged."""
 
     def drawn(match: re.Match[str]) -> str:
         found = transforms.get(match[1])
@@ -42,12 +42,12 @@ def sketch_with(svg: str, transforms: Mapping[str, SavedTransform]) -> str:
 
 
 def angle(transform: SavedTransform) -> float:
-    """Angle of a rotation, rad."""
+    """Return the angle of a rotation, rad."""
     return float(np.linalg.norm(so3.log(np.array(transform.wxyz))))
 
 
 def rotation_text(transform: SavedTransform) -> str:
-    """A rotation as people read it: the angle, and its rotation vector."""
+    """Return a rotation as text: the angle, and the rotation vector."""
     if angle(transform) < _NOTHING:
         return "not turned"
     vector = np.rad2deg(so3.log(np.array(transform.wxyz)))
@@ -56,7 +56,7 @@ def rotation_text(transform: SavedTransform) -> str:
 
 
 def enlarged(transform: SavedTransform) -> bool:
-    """Whether it is drawn larger than it is."""
+    """Whether a rotation is drawn larger than it is."""
     return _NOTHING < angle(transform) < _SMALL
 
 

@@ -33,7 +33,7 @@ _RANKS: tuple[Kind, ...] = ("scalar", "vector", "matrix")
 
 @dataclass(frozen=True)
 class _Node:
-    """A part of an expression: its kind, and its value where it is a constant, else an operation on others.
+    """Part of an expression: a constant with its value, or an operation on other parts.
 
     Operations: the name of an input, "name"; a call of an earlier formula, "call"; those of `operate`.
     """
@@ -47,14 +47,14 @@ class _Node:
 
     @property
     def array(self) -> Array | None:
-        """The constant; a rotation as a matrix."""
+        """Return the constant as an array, a rotation as a matrix; None for an operation."""
         if self.value is None:
             return None
         return so3.matrix(self.value.array) if self.value.kind == "rotation" else self.value.array
 
 
 class _Reader:
-    """Expressions of formulas, one after the other."""
+    """Parser of formulas, which may refer to earlier formulas."""
 
     def __init__(self, values: Mapping[str, float]) -> None:
         self._known = with_vectors(values) | AXES
@@ -84,7 +84,7 @@ class _Reader:
         raise ValueError(f"not an expression of a formula: {ast.unparse(tree)}")
 
     def name(self, name: str) -> _Node:
-        """An earlier formula, an input or a parameter."""
+        """Return the node of a name: an earlier formula, an input or a parameter."""
         if name in self._earlier:
             node, arguments = self._earlier[name]
             return node if node.value is not None else _Node(node.kind, None, "call", (), name, arguments)
@@ -94,7 +94,7 @@ class _Reader:
 
 
 def _printed(kind: Kind) -> Kind:
-    """Rotations are matrices in the code."""
+    """Return the kind that a value has in generated code, where rotations are matrices."""
     return "matrix" if kind == "rotation" else kind
 
 
@@ -109,7 +109,7 @@ def _value(node: _Node) -> Value:
 
 
 def _made(op: str, *parts: _Node) -> _Node:
-    """The operation, computed where its parts are constants; what is times 0, or added to 0, is left out."""
+    """Make an operation: computed if its parts are constants, simplified if one of them is 0."""
     kind = _printed(result_kind(op, [part.kind for part in parts]))
     if op in ("add", "sub", "mul"):
         a, b = parts
@@ -187,7 +187,7 @@ def _bracketed(node: _Node, text: str, right: bool = False) -> str:
 
 
 def _axis_turn(node: _Node) -> tuple[str, _Node] | None:
-    """Exp(angle ez) as Rz(-angle)."""
+    """Return Exp(angle ez) as Rz and -angle, likewise about x and y; None for any other node."""
     if node.op == "Exp" and node.parts[0].op == "mul":
         angle, axis = node.parts[0].parts
         for name, unit in AXES.items():

@@ -78,7 +78,7 @@ def print_report(report: Report, everything: bool = False) -> None:
 
 
 def _paragraph(text: str, marked: str = "", style: str = "") -> None:
-    """Print a sentence, broken at words where a person reads it; the words that are marked are in a style."""
+    """Print a sentence, broken between words for people, with marked words in a style."""
     text = printable(text.replace("`", ""), _MAX_LINE)
     indent = " " * (len(text) - len(text.lstrip()) + 2)
     width = min(console.width, _SENTENCE) if console.is_terminal else _MAX_LINE
@@ -91,7 +91,7 @@ def _paragraph(text: str, marked: str = "", style: str = "") -> None:
 
 
 def _print_blocks(title: str, blocks: Sequence[Block], everything: bool) -> None:
-    """Print those that a terminal can show, under their heading; what a page collapses only if everything is asked."""
+    """Print the blocks that a terminal can show under their heading; collapsed ones only if `everything`."""
     kinds = (Heading, Text, Table, Tables, Bullets, Tiles, *((Card, Details) if everything else ()))
     shown = [block for block in blocks if isinstance(block, kinds) and not (isinstance(block, Text) and block.soft)]
     if title and shown and not all(isinstance(block, Tables) for block in shown):
@@ -118,7 +118,7 @@ def _print_blocks(title: str, blocks: Sequence[Block], everything: bool) -> None
 
 
 def print_table(table: Table) -> None:
-    """Print a table; groups of columns that the terminal is too narrow for follow below, the other columns repeated."""
+    """Print a table; groups of columns beyond the terminal's width follow below, with the shared columns repeated."""
     if table.title and table.style != "results":  # those have it above their first column
         say(table.title)
     shown = [i for i, head in enumerate(table.heads) if head.kind != "drawing"]
@@ -142,7 +142,7 @@ def print_table(table: Table) -> None:
 
 
 def rich_table(table: Table, columns: Sequence[int] | None = None) -> RichTable:
-    """The table with some of its columns (None: all), the names of the rows to the left."""
+    """Return a table, or some of its columns, for rich, the names of the rows to the left."""
     columns = range(len(table.heads)) if columns is None else columns
     named = any(head.head for head in table.heads)
     out = RichTable(box=SIMPLE_HEAD, header_style="bold", pad_edge=False, show_edge=False, show_header=named)
@@ -161,13 +161,13 @@ def rich_table(table: Table, columns: Sequence[int] | None = None) -> RichTable:
 
 
 def _under(heading: str, name: str) -> str:
-    """The name of a row with the heading above it: "x" under "Bias, mg" is "Bias x, mg"."""
+    """Return the name of a row with the heading above it: "x" under "Bias, mg" is "Bias x, mg"."""
     what, comma, unit = heading.rpartition(", ")
     return f"{what if comma else unit} {name}{comma}{unit if comma else ''}".strip()
 
 
 def _with_verdict(cell: Cell) -> str:
-    """The text of a cell; with its verdict, where that is a mark."""
+    """Return the text of a cell, followed by its verdict where a page shows that as a mark."""
     return f"{cell.text} {cell.tone}" if cell.tone and cell.hint else cell.text
 
 

@@ -24,14 +24,14 @@ _AXES = "XYZ"
 
 
 def _triads(saved: SavedCalibration, names: Collection[str] = TRIADS) -> dict[str, tuple[Array, Array]]:
-    """K and b of the sensors there are."""
+    """Return K (3, 3) and b (3,) of the calibrated sensors among `names`."""
     return {name: _triad(saved, name) for name in names if f"{name}_k11" in saved.parameters}
 
 
 def _in_si(
     saved: SavedCalibration, names: Collection[str] = TRIADS
 ) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
-    """K and b of sensors that are recorded in SI, and notes about them.
+    """Return K and b of the calibrated sensors, which have to be recorded in SI, and notes about them.
 
     A magnetometer in T, calibrated in a field of unknown strength, keeps its scale on average: its K has the
     determinant 1. Raises InputError when a sensor is recorded in counts.
@@ -53,17 +53,17 @@ def _in_si(
 
 
 def _triad(saved: SavedCalibration, name: str) -> tuple[Array, Array]:
-    """K (3, 3) and b (3,) with nominal = K raw + b."""
+    """Return K (3, 3) and b (3,) of a sensor: nominal = K raw + b."""
     return triad_of(name, {key: parameter.value for key, parameter in saved.parameters.items()})
 
 
 def zero_offset(K: Array, b: Array) -> Array:
-    """Offset: the reading where the nominal is zero, nominal = K (raw - offset)."""
+    """Return the offset, the reading at nominal zero: nominal = K (raw - offset)."""
     return np.asarray(-np.linalg.solve(K, b))
 
 
 def symmetric_part(K: Array) -> tuple[Array, float]:
-    """S of K = R S, S symmetric and R a rotation, and the angle of R, rad (polar decomposition)."""
+    """Return S of the polar decomposition K = R S, S symmetric and R a rotation, and the angle of R, rad."""
     u, s, vt = np.linalg.svd(K)
     angle = float(np.arccos(np.clip(0.5 * (np.trace(u @ vt) - 1.0), -1.0, 1.0)))
     return (vt.T * s) @ vt, angle
@@ -71,7 +71,7 @@ def symmetric_part(K: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True)
 class _Autopilot:
-    """An autopilot's names, X, Y, Z in place of {}: scale (raw - offset), raw - offset, and symmetric (raw - offset).
+    """Parameter names of an autopilot, {} for X, Y, Z: scale (raw - offset), raw - offset, symmetric (raw - offset).
 
     Attributes:
         accel, gyro, mag: of the accelerometer (offset, scale), the gyro (offset) and the magnetometer (offset, the
@@ -85,7 +85,7 @@ class _Autopilot:
     mag_offset: float
 
     def parameters(self, saved: SavedCalibration) -> tuple[list[tuple[str, float]], list[str]]:
-        """Names and values, and comments on what has no place. Raises InputError for sensors recorded in counts."""
+        """Return parameter names and values, and comments on what is lost. Raises InputError for sensors in counts."""
         rows: list[tuple[str, float]] = []
         triads, notes = _in_si(saved)
         if "accel" in triads:
@@ -120,14 +120,14 @@ _ARDUPILOT = _Autopilot(
 
 
 def _px4(saved: SavedCalibration) -> str:
-    """QGroundControl's parameter file: vehicle, component, name, value, type (9: float)."""
+    """Return QGroundControl's parameter file: vehicle, component, name, value, type (9: float)."""
     rows, notes = _PX4.parameters(saved)
     lines = [f"1\t1\t{name}\t{value:.9g}\t9" for name, value in rows]
     return "\n".join(["# Calibrated by alidade; give CAL_*0_ID the ids of the sensors.", *notes, *lines, ""])
 
 
 def _ardupilot(saved: SavedCalibration) -> str:
-    """A parameter file NAME,value."""
+    """Return ArduPilot's parameter file, a line NAME,value for each parameter."""
     rows, notes = _ARDUPILOT.parameters(saved)
     if "mag_k11" in saved.parameters:
         rows.append(("COMPASS_SCALE", 1.0))
@@ -135,14 +135,14 @@ def _ardupilot(saved: SavedCalibration) -> str:
 
 
 def _betaflight(saved: SavedCalibration) -> str:
-    """A command of the CLI: the offset in counts, which Betaflight subtracts after mag_align (sensors/compass.c)."""
+    """Return Betaflight's command: offset in counts, subtracted after mag_align (sensors/compass.c)."""
     S, offset, notes = _compass_in_counts(saved, "mag_calibration 0,0,0")
     lost = _lost("magnetometer", S / np.cbrt(np.linalg.det(S)) - np.eye(3))
     return "\n".join([f"# {lost}", *notes, f"set mag_calibration = {','.join(map(str, offset))}", ""])
 
 
 def _inav(saved: SavedCalibration) -> str:
-    """Commands of the CLI; INAV computes (raw - magzero) 1024 / maggain per axis, then aligns (sensors/compass.c)."""
+    """Return INAV's commands: (raw - magzero) 1024 / maggain per axis, then alignment (sensors/compass.c)."""
     S, offset, notes = _compass_in_counts(saved, "magzero 0, maggain 1024")
     diagonal = np.diag(S)
     size = float(np.cbrt(diagonal.prod()))
@@ -155,7 +155,7 @@ def _inav(saved: SavedCalibration) -> str:
 
 
 def _compass_in_counts(saved: SavedCalibration, neutral: str) -> tuple[Array, NDArray[np.int64], list[str]]:
-    """The symmetric part of the magnetometer's K, its offset in whole counts, and comments on mounting and logs.
+    """Return the symmetric part of the magnetometer's K, its offset in whole counts, and comments.
 
     Betaflight and INAV log a compass with its calibration applied, which is none with the settings `neutral`.
 
@@ -176,7 +176,7 @@ def _unit(saved: SavedCalibration) -> str:
 
 
 def _ros2(saved: SavedCalibration) -> str:
-    """Parameters of a node: rows of K and b of each sensor, in the units of sensor_msgs, whole.
+    """Return a ROS 2 node's parameters: rows of K, and b, of each sensor, in the units of sensor_msgs.
 
     Where noise was measured, the covariance that its messages may state: of one sample, calibrated, by rows.
     """
@@ -283,7 +283,7 @@ _IMU = {"accel": "accelerometer", "gyro": "gyroscope"}
 
 
 def _imu(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
-    """K and b of accelerometer and gyro, which are 1 and 0 where one of them is not calibrated.
+    """Return K and b of accelerometer and gyro; identity and zero for one that is not calibrated.
 
     Raises InputError when neither is, or one was recorded in counts.
     """

@@ -17,7 +17,7 @@ _ROUNDING = 1e-9
 
 
 class AppliedFormulas:
-    """Formulas with values in them; what is not among them counts as zero."""
+    """Formulas with values of parameters; parameters without a value count as zero."""
 
     def __init__(self, formulas: Sequence[Formula], values: Mapping[str, float], others: Mapping[str, float]) -> None:
         self.values = values
@@ -25,13 +25,13 @@ class AppliedFormulas:
         self._first = {"temperature": others["first_temperature"]} if "first_temperature" in others else {}
 
     def __call__(self, **measured: Array) -> Mapping[str, Array]:
-        """What follows from measurements, at the first temperature."""
+        """Compute the formulas from measured arrays, at the first temperature."""
         found = results(self._formulas, self._all, {**measured, **self._first})
         return {name: value.array for name, value in found.items()}
 
 
 def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
-    """The bands of all uses of the method; none of a result without a solution."""
+    """Return the error bands of all uses of the method; none without a solution."""
     c = calibration
     if not c.estimate.converged or not np.isfinite(c.covariance).all():
         return ()
@@ -46,7 +46,7 @@ def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
 
 
 def posterior_of(c: Calibration) -> Posterior:
-    """The estimate with what the formulas apply of it."""
+    """Return the posterior of the parameters that the formulas apply."""
     quantities, known = quantities_of(c.problem, c.estimate), c.application()
     gains = {q.name: q for q in quantities if len(q.name) > 4 and q.name[-4:-2] == "_k"}
     plain = all(q.unit in ("", "1") for q in gains.values())

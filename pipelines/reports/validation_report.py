@@ -60,7 +60,7 @@ def validation_report(validated: Validated) -> Report:
 
 
 def _changes(validated: Validated) -> tuple[Block, ...]:
-    """The change of each parameter that is compared, and the smallest one that would be significant."""
+    """Return a table of the change of each compared parameter, and the smallest change that would be significant."""
     if validated.held is None:
         return ()
     rows = []
@@ -82,7 +82,7 @@ def _changes(validated: Validated) -> tuple[Block, ...]:
 
 
 def _error_table(validated: Validated) -> Table:
-    """RMS and peak of each kind of error, before and after compensation."""
+    """Return a table with RMS and peak of each kind of error, before and after compensation."""
     others = [{v.name: rms(v.after) for v in each} for each in (validated.best, validated.validations)]
     rows = []
     for v in validated.applied:
@@ -112,7 +112,7 @@ def _plot(validation: Validation) -> Plot:
 
 
 def _unit(validation: Validation) -> tuple[str, float]:
-    """Unit to show and its factor from SI, the same before and after compensation."""
+    """Return the unit to show errors in, and its factor from SI, the same before and after compensation."""
     if validation.unit != "rad":
         return validation.unit, 1.0
     if validation.micro:

@@ -46,7 +46,7 @@ class Application:
 
 
 class SensorValues:
-    """Base of calibrations that have parameters by name: their values by sensor."""
+    """Base of calibrations that have parameters by name; derives matrices, biases and results from these."""
 
     @property
     @abstractmethod
@@ -55,7 +55,7 @@ class SensorValues:
 
     @abstractmethod
     def _joint(self) -> tuple[Sequence[str], Array]:
-        """Names and joint covariance (n, n). Raises InputError when there is none."""
+        """Return names and joint covariance (n, n) of the parameters, SI. Raises InputError when there is none."""
 
     @abstractmethod
     def application(self) -> Application:
@@ -136,7 +136,7 @@ class SensorValues:
     def _with_sigmas(
         self, known: Application, found: Mapping[str, Array], measured: Mapping[str, Any]
     ) -> dict[str, WithSigma]:
-        """With the deviation from what true parameters give, these distributed about all estimates."""
+        """Return results with sigmas: their spread about these values for parameters distributed as the posterior."""
         names, P = self._joint()
         scale = np.where(np.diag(P) > 0.0, np.sqrt(np.diag(P)), 1.0)
         shares, directions = np.linalg.eigh(P / np.outer(scale, scale))

@@ -63,7 +63,7 @@ def write_whole(out_dir: Path, contents: Mapping[str, Content]) -> tuple[Path, .
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """The folder, made if need be, to this process alone; the lock goes with the process. Raises InputError."""
+    """Lock a folder, made if need be, for this process, with which the lock ends. Raises InputError."""
     patience = time.monotonic() + _PATIENCE_S
     while True:
         try:
@@ -80,7 +80,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 
 def _locked(lock: int, patience: float, folder: Path) -> bool:
-    """Whether the lock is had, and of the folder that has this name still."""
+    """Whether the lock is acquired, and the locked folder is still the one with this name."""
     while True:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -95,7 +95,7 @@ def _locked(lock: int, patience: float, folder: Path) -> bool:
 
 
 def require_room(out_dir: Path | None) -> None:
-    """Claim a folder before the work, of which results are written after it. Raises InputError if they cannot be."""
+    """Claim a folder before the work whose results are written there. Raises InputError if it is not writable."""
     if out_dir is None:
         return
     _claimed[out_dir.absolute()] = time.time_ns()
@@ -107,7 +107,7 @@ def require_room(out_dir: Path | None) -> None:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """A file that belongs to nothing else, whole or not at all. Raises InputError when it cannot be written."""
+    """Write a single file, whole or not at all. Raises InputError when it cannot be written."""
     try:
         if path.exists() and not path.is_file():  # a pipe, a terminal
             _write(path, content)

@@ -53,7 +53,7 @@ def write_part(out_dir: Path, calibration: Calibration) -> None:
 
 
 def adopt_parts(out_dir: Path, written: Path) -> None:
-    """Put what `write_part` wrote into another folder under it. Raises InputError when it cannot be written to."""
+    """Copy what `write_part` wrote into another folder. Raises InputError when that folder cannot be written to."""
     try:
         shutil.copytree(written / PARTS, out_dir / PARTS, dirs_exist_ok=True)
     except (OSError, shutil.Error) as error:
@@ -61,7 +61,7 @@ def adopt_parts(out_dir: Path, written: Path) -> None:
 
 
 def tum(attitudes: Attitudes, epoch_ns: int) -> str:
-    """attitude.tum: lines `t tx ty tz qx qy qz qw` by time; t is Unix time in s to the ns, the position zero."""
+    """Return attitude.tum: lines `t tx ty tz qx qy qz qw` by time; t is Unix time in s to the ns, the position zero."""
     order = np.argsort(attitudes.time, kind="stable")
     stamps = epoch_ns + np.round(attitudes.time[order] * 1e9).astype(np.int64)
     lines = []
