@@ -41,7 +41,7 @@ Settings = Config | Mapping[str, Any] | str | Path | None
 
 
 def configured(recording: Recording, override: Settings = None) -> tuple[Recording, Config]:
-    """A recording with the topics and columns of its config, and this config, overridden as by `load_config`.
+    """Return a recording with the topics and columns of its config, and that config, overridden as by `load_config`.
 
     Raises InputError.
     """
@@ -50,7 +50,7 @@ def configured(recording: Recording, override: Settings = None) -> tuple[Recordi
 
 
 def load_config(attachment: bytes | None, override: Settings = None) -> Config:
-    """The config in a recording's attachment, overridden key by key by a file or another config. Raises InputError."""
+    """Load the config in a recording's attachment, overridden key by key by a file or a config. Raises InputError."""
     attached = f"attachment {ATTACHMENT}"
     base = _read(attachment, attached) if attachment is not None else {}
     source, more = _override(override)
@@ -69,7 +69,7 @@ def load_config(attachment: bytes | None, override: Settings = None) -> Config:
 
 
 def _override(given: object) -> tuple[str, Mapping[Any, Any]]:
-    """Source and content of what overrides a recording's config; empty where there is nothing."""
+    """Return source and content of what overrides a recording's config; both empty for None."""
     if given is None:
         return "", {}
     if isinstance(given, Mapping):
@@ -89,7 +89,7 @@ def _override(given: object) -> tuple[str, Mapping[Any, Any]]:
 
 @cache
 def model() -> type[Config]:
-    """The config with sections, noises and figures of data sheets of all methods there are."""
+    """Return the model of a config with the sections, noises and data-sheet figures of all methods."""
     names = methods.names()
     declared = [methods.method(name) for name in names]
     sections = [each.config_section for each in declared if each.config_section is not None]
@@ -109,7 +109,7 @@ def _with_default(section: type[Section]) -> tuple[type[Section], Section]:
 
 
 def _sensors(declared: Sequence[Method]) -> type[Sensors]:
-    """Data sheets with the figures of the methods that are not among the common ones."""
+    """Return the model of data sheets with those figures of the methods that are not common ones."""
     known, more = Sensors(), dict[str, Any]()
     for name in {name for each in declared for name in each.data_sheets}:
         sheet: Sheet = getattr(known, name, Sheet())
@@ -131,7 +131,7 @@ def _read(data: bytes, where: str) -> dict[Any, Any]:
 
 
 def _merge(base: Mapping[Any, Any], more: Mapping[Any, Any]) -> dict[Any, Any]:
-    """More over base, mapping by mapping."""
+    """Return `base` overridden by `more`, mapping by mapping."""
     merged = dict(base)
     for key, value in more.items():
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
@@ -141,7 +141,7 @@ def _merge(base: Mapping[Any, Any], more: Mapping[Any, Any]) -> dict[Any, Any]:
 
 
 def _has(content: Any, path: tuple[int | str, ...]) -> bool:
-    """Whether the content says something at the path, or something that has no keys on the way to it."""
+    """Whether content has a value at the path, or on the way to it a value without keys."""
     for i, key in enumerate(path):
         if not isinstance(content, Mapping):
             return i > 0
@@ -153,7 +153,7 @@ def _has(content: Any, path: tuple[int | str, ...]) -> bool:
 
 @cache
 def _sections() -> frozenset[str]:
-    """Keys that have keys under them, at any depth."""
+    """Return the keys, at any depth, that have keys under them."""
 
     def inside(section: type[BaseModel]) -> set[str]:
         found = set()

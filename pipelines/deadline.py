@@ -38,7 +38,7 @@ _deadline: ContextVar[_Deadline | None] = ContextVar("deadline", default=None)
 
 @contextmanager
 def _set(deadline: _Deadline | None) -> Iterator[None]:
-    """None leaves the deadline that is set."""
+    """Context manager that sets a deadline; None keeps the one that is set, if any."""
     token = _deadline.set(deadline or _deadline.get())
     try:
         yield
@@ -47,12 +47,12 @@ def _set(deadline: _Deadline | None) -> Iterator[None]:
 
 
 def within(limit: float | None) -> AbstractContextManager[None]:
-    """The block has so many seconds from now; None sets no deadline, and leaves one that is set."""
+    """Context manager that sets a deadline in `limit` s; None keeps the deadline that is set, if any."""
     return _set(None if limit is None else _Deadline(limit, time.monotonic() + limit, time.monotonic))
 
 
 def usual(duration: float, online: bool = False) -> AbstractContextManager[None]:
-    """The usual time for a recording of so many seconds, where no deadline is set."""
+    """Context manager that sets the usual deadline for a recording of so many seconds, unless one is set."""
     if _deadline.get() is not None:
         return _set(None)
     limit = max(LEAST_S, duration if online else SHARE * duration)
@@ -60,9 +60,9 @@ def usual(duration: float, online: bool = False) -> AbstractContextManager[None]
 
 
 def of_processor() -> AbstractContextManager[None]:
-    """The usual limit, in the block, is on what this thread computes: that a machine is busy ends no solution.
+    """Context manager that counts the usual limit as computing time of this thread: a busy machine ends no solution.
 
-    A limit that was set is one by the clock on the wall.
+    A limit that was set stays one of elapsed time.
     """
     deadline = _deadline.get()
     if deadline is None or not deadline.usual:
@@ -71,7 +71,7 @@ def of_processor() -> AbstractContextManager[None]:
 
 
 def passed(what: str = "") -> bool:
-    """Whether there is no time left; `what` names what ends for that."""
+    """Whether the deadline has passed; if so, note `what` as stopped for that."""
     deadline = _deadline.get()
     if deadline is None or deadline.clock() < deadline.until:
         return False
@@ -81,7 +81,7 @@ def passed(what: str = "") -> bool:
 
 
 def until_passed(items: Iterable[Item], name: Callable[[Item], str], least: int = 0) -> Iterator[Item]:
-    """The items for which there is time, and `least` of them in any case.
+    """Yield items until the deadline has passed, but at least the first `least`.
 
     `name` says where it stopped, from the first that is not taken.
     """
@@ -92,13 +92,13 @@ def until_passed(items: Iterable[Item], name: Callable[[Item], str], least: int 
 
 
 def sentence() -> str:
-    """Sentence that the time limit stopped an iteration; empty without a limit."""
+    """Return a phrase that the time limit stopped an iteration; empty without a limit."""
     deadline = _deadline.get()
     return "" if deadline is None else f"stopped by the time limit of {deadline.limit:.3g} s"
 
 
 def stopped() -> str:
-    """A sentence about all that ended for want of time; empty if nothing did."""
+    """Return a sentence about all that the time limit stopped; empty if nothing."""
     deadline = _deadline.get()
     if deadline is None or not deadline.stopped:
         return ""

@@ -21,7 +21,7 @@ class InputError(Exception):
     """
 
     def __str__(self) -> str:
-        """The one line, whatever the names in it are made of."""
+        """Return the message as one line of printable characters, whatever names are in it."""
         return printable(super().__str__(), _LONGEST)
 
 
@@ -30,7 +30,7 @@ class NotARecordingError(InputError):
 
     @classmethod
     def of(cls, path: Path, why: str = "") -> Self:
-        """The error of a file of no known format."""
+        """Make the error for a file of no known format."""
         return cls(
             f"{path}: not an MCAP file, ROS bag, PX4 or ArduPilot log, or table{why}; numbers of other files go in as "
             "arrays: alidade.open in Python"
@@ -38,14 +38,14 @@ class NotARecordingError(InputError):
 
 
 def printable(text: str, longest: int = 200) -> str:
-    """Text from a recording for a terminal: control characters as escapes, the middle of what is too long left out."""
+    """Return text for a terminal: control characters as escapes, the middle of a text that is too long left out."""
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A phrase that names the known name nearest to a wrong one."""
+    """Return a phrase that names the known name nearest to a wrong one."""
     names = list(known)
     meant = [other for word in _DENSITY if (other := name.replace(word, "density")) in names]
     found = meant or difflib.get_close_matches(name, names, n=1, cutoff=0.0)
@@ -53,5 +53,5 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def nearest_three(name: str, known: Iterable[str]) -> str:
-    """A phrase that names the known names nearest to a wrong one."""
+    """Return a phrase that names the three known names nearest to a wrong one."""
     return f"the nearest are {', '.join(difflib.get_close_matches(name, list(known), n=3, cutoff=0.0))}"

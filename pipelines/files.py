@@ -42,7 +42,7 @@ def require_regular(path: Path) -> None:
 
 
 def read_bytes(path: Path, most: int) -> bytes:
-    """The bytes of a regular file, or of standard input where it is named `-`; InputError for more than `most`."""
+    """Return the bytes of a regular file, or of standard input, named `-`; InputError for more than `most`."""
     try:
         if str(path) == "-":
             data = sys.stdin.buffer.read(most + 1)
@@ -59,7 +59,7 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 
 def open_binary(path: Path, named: Path | None = None) -> BinaryIO:
-    """A file, open for reading; the InputError where that fails names it as `named`."""
+    """Open a file for reading; an InputError names the file `named`."""
     try:
         return path.open("rb")
     except OSError as error:
@@ -78,13 +78,13 @@ def dump_yaml(content: object, width: int = 80, is_sorted: bool = True) -> str:
 
 
 def yaml_float(value: float) -> str:
-    """A float that YAML 1.1 takes for one too: 5e-05 is a string there, 5.0e-05 is not."""
+    """Return a float as YAML 1.1 reads it as one: 5.0e-05, since 5e-05 is a string there."""
     text = repr(value)
     return text if "." in text else text.replace("e", ".0e")
 
 
 def flow_yaml(value: object) -> str:
-    """A scalar, a list or a mapping in one line of YAML."""
+    """Return a scalar, a list or a mapping as one line of YAML."""
     if isinstance(value, dict):
         return f"{{{', '.join(f'{flow_yaml(str(key))}: {flow_yaml(one)}' for key, one in value.items())}}}"
     if isinstance(value, list | tuple):
@@ -96,7 +96,7 @@ def flow_yaml(value: object) -> str:
 
 
 def as_date(text: str) -> datetime.datetime:
-    """A date of ISO 8601, with or without time; UTC unless it says otherwise. Raises InputError when it is none."""
+    """Parse an ISO 8601 date, with or without time, in UTC unless a zone is stated. Raises InputError."""
     try:
         date = datetime.datetime.fromisoformat(text)
     except ValueError as error:
@@ -105,7 +105,7 @@ def as_date(text: str) -> datetime.datetime:
 
 
 def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:
-    """The one document of a YAML file.
+    """Parse the one document of a YAML file.
 
     Args:
         data: its content, UTF-8.
@@ -146,16 +146,16 @@ def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:
 
 
 class _TooLargeError(Exception):
-    """More values than any file has that people or programs write for this one."""
+    """Raised for YAML with more values, or deeper ones, than people or programs write."""
 
 
 def _bounded(kind: str) -> Any:
-    """A reader of YAML that stops at MAX_YAML_NODES and MAX_YAML_DEPTH."""
+    """Return a YAML reader that stops at MAX_YAML_NODES and MAX_YAML_DEPTH."""
     from ruamel.yaml import YAML
     from ruamel.yaml.composer import Composer
 
     class BoundedComposer(Composer):
-        """Counts the nodes that it makes."""
+        """Composer of YAML that limits number and depth of the nodes."""
 
         made = depth = 0
 
@@ -175,7 +175,7 @@ def _bounded(kind: str) -> Any:
 
 
 def _nodes(node: Any, known: dict[int, float]) -> float:
-    """Nodes of a tree with all aliases written out; infinite for one that holds itself."""
+    """Return the number of nodes of a tree with all aliases written out; infinite for one that contains itself."""
     if id(node) not in known:
         known[id(node)] = float("inf")
         children = node.value if isinstance(node.value, list) else []

@@ -15,7 +15,7 @@ _LEAST = 1e-14
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """A Gaussian over reported numbers, in place of the priors that these have otherwise.
+    """Gaussian prior of parameters by name, which replaces their default priors.
 
     Attributes:
         names: of the numbers.
@@ -30,14 +30,14 @@ class GaussianPrior:
     source: str = ""
 
     def of(self, names: Collection[str]) -> GaussianPrior:
-        """The prior of those numbers among some that it knows."""
+        """Return the marginal distribution of those of the named parameters that the prior has."""
         kept = [i for i, name in enumerate(self.names) if name in names]
         rows = np.array(kept, dtype=np.intp)
         known = tuple(self.names[i] for i in kept)
         return GaussianPrior(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source)
 
     def given(self, known: Mapping[str, float]) -> GaussianPrior:
-        """Conditional distribution of the other numbers, these being known exactly."""
+        """Return the conditional distribution of the other parameters, given exact values of some."""
         rest = self.of([name for name in self.names if name not in known])
         one, other = (np.array([(n in known) is among for n in self.names], dtype=bool) for among in (False, True))
         scale = np.where(self.sigmas > 0.0, self.sigmas, 1.0)
@@ -56,13 +56,13 @@ class GaussianPrior:
 def independent(
     names: Sequence[str], mean: Sequence[float], sigmas: Sequence[float], source: str = ""
 ) -> GaussianPrior:
-    """Gaussian prior of numbers without correlations."""
+    """Return a Gaussian prior without correlations."""
     return GaussianPrior(
         tuple(names), np.array(mean, dtype=float), np.diag(np.square(np.array(sigmas, dtype=float))), source
     )
 
 
 def root_of_information(correlation: Array, sigmas: Array) -> Array:
-    """Square root R (n, n) of the information, R'R, of numbers with these correlations and sigmas (n,)."""
+    """Return a square root R (n, n) of the information R'R of numbers with these correlations and sigmas (n,)."""
     eigenvalues, vectors = np.linalg.eigh(correlation)
     return np.asarray((vectors / np.sqrt(np.maximum(eigenvalues, _LEAST))).T / sigmas)

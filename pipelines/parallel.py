@@ -58,12 +58,12 @@ def _cores() -> int:
 
 
 def allowed() -> int:
-    """Number of processes that may be used."""
+    """Return the number of processes that the current block may use."""
     return _jobs
 
 
 def room() -> float:
-    """Free memory for processes, bytes: the machine's, or the container's where that is less.
+    """Return the free memory for processes, bytes: the machine's, or the container's where that is less.
 
     Infinite where there is one process alone, which is everywhere but on Linux.
     """
@@ -79,7 +79,7 @@ def room() -> float:
 
 
 def done(works: Sequence[Callable[[], Answer]], what: str, most: int) -> list[Answer]:
-    """Results of independent tasks, at most `most` at a time, with progress; see `WorkerPool.ask`."""
+    """Return the results of independent tasks, at most `most` at a time, with progress; see `WorkerPool.ask`."""
     return WorkerPool(works, min(most, len(works))).ask(operator.call, [()] * len(works), what)
 
 
@@ -93,7 +93,7 @@ class LostError(InputError):
         )
 
     def __reduce__(self) -> tuple[type[LostError], tuple[()]]:
-        """Pickle without a message, which the constructor does not take."""
+        """Pickle the error without a message, which the constructor does not take."""
         return LostError, ()
 
 
@@ -115,7 +115,7 @@ class WorkerPool(Generic[Thing]):
         self._workers = [_Worker(things[i::count], share) for i in range(count)] if count > 1 else []
 
     def ask(self, question: Callable[..., Answer], given: Sequence[tuple[Any, ...]], what: str) -> list[Answer]:
-        """Answers of all things to a question, in order, with progress.
+        """Return the answers of all objects to a question, in order, with progress.
 
         Args:
             question: a function at the top of a module, which can be pickled.
@@ -210,7 +210,7 @@ def _end_with(parent: int) -> None:
 
 
 def _answer(question: Callable[..., Any], thing: Any, args: tuple[Any, ...]) -> bytes:
-    """The answer to a question, or the exception that it raised, pickled."""
+    """Return the pickled answer to a question, or the exception that the question raised."""
     answer: tuple[Any, Exception | None]
     try:
         answer = question(thing, *args), None

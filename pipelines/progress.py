@@ -22,7 +22,7 @@ _bars: Progress | None = None
 
 @contextmanager
 def shown(quiet: bool = False) -> Iterator[None]:
-    """Within the block work is shown, unless quiet or stderr is no terminal."""
+    """Context manager that shows the progress of work, unless `quiet` or stderr is no terminal."""
     global _bars
     from rich import progress as rich
     from rich.console import Console
@@ -48,14 +48,14 @@ def shown(quiet: bool = False) -> Iterator[None]:
 
 
 def hide() -> None:
-    """Show nothing from now on, as in a process whose terminal is another one's."""
+    """Show no progress from now on, as in a process whose terminal belongs to another one."""
     global _bars
     _bars = None
 
 
 @contextmanager
 def doing(what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
-    """Shows work; the function it gives says how much of the total is done."""
+    """Context manager that shows work; yields a function that takes how much of the total is done."""
     bars = _bars
     if bars is None:
         yield lambda _: None

@@ -89,7 +89,7 @@ class Section(BaseModel):
     @field_validator("*")
     @classmethod
     def _bounded(cls, value: object) -> object:
-        """Every figure, however deep in a list or a mapping it stands."""
+        """Check the size of every number, however deep in a list or a mapping."""
         if isinstance(value, float | int) and abs(value) > _LARGEST:
             raise ValueError(f"must be between -{_LARGEST:g} and {_LARGEST:g}")
         if isinstance(value, list | tuple | dict):
@@ -258,7 +258,7 @@ class Sensors(Section):
 
 
 def _ideal(kind: type[Sensors], value: object) -> object:
-    """`ideal` written out: all figures 0, but for the field and how tags are turned, which are no sensors."""
+    """Expand `ideal` to data sheets of zeros, apart from the field and the rotation of tags, which are no sensors."""
     if value == "ideal":
         sheets = {name: type(sheet).model_fields.keys() for name, sheet in kind() if name != "field"}
         return {name: dict.fromkeys(figures - {"rotation"}, 0.0) for name, figures in sheets.items()}
@@ -268,7 +268,7 @@ def _ideal(kind: type[Sensors], value: object) -> object:
 
 
 def sensor_sheets(kind: type[Sensors]) -> Any:
-    """Type of a config's data sheets: by sensor, or `ideal`."""
+    """Return the type of a config's data sheets: by sensor, or `ideal`."""
     return Annotated[kind, BeforeValidator(partial(_ideal, kind))]
 
 
@@ -355,7 +355,7 @@ class Config(Section):
 
     @property
     def origin(self) -> str:
-        """The file that the keys are from, or its substitute; empty where unknown."""
+        """Name of the file that the config's keys are from, or of its substitute; empty where unknown."""
         return self._origin
 
     def of(self, origin: str) -> Config:
@@ -365,24 +365,24 @@ class Config(Section):
         return out
 
     def prior(self, name: str, default: float | None) -> float | None:
-        """Sigma of a parameter's prior where the config gives one, else the default."""
+        """Return the sigma of a parameter's prior: the config's if it states one, else the default."""
         given = self.priors.get(name, default)
         return given.sigma if isinstance(given, KnownPrior) else given
 
     @property
     def gaussian_prior(self) -> GaussianPrior | None:
-        """Prior means and covariance from elsewhere than the config, as an earlier calibration."""
+        """Prior means and covariance from outside the config, such as an earlier calibration; None without."""
         return self._gaussian_prior
 
     def with_prior(self, gaussian_prior: GaussianPrior) -> Config:
-        """The config with priors from elsewhere, over which those that it states itself take precedence."""
+        """Return the config with a prior from outside; priors that the config itself states take precedence."""
         out = self.model_copy()
         out._gaussian_prior = gaussian_prior
         return out
 
     @property
     def gaussian_priors(self) -> list[GaussianPrior]:
-        """Priors with means: those given by hand, and what is known from elsewhere of the other parameters."""
+        """Return the priors with means: those in the config, and for other parameters those from outside."""
         given = {name: prior for name, prior in self.priors.items() if isinstance(prior, KnownPrior)}
         by_hand = independent(list(given), [p.mean for p in given.values()], [p.sigma for p in given.values()])
         if self._gaussian_prior is None:
@@ -409,14 +409,14 @@ class Config(Section):
 
 
 def check_names(given: Iterable[str], known: Collection[str], where: str) -> None:
-    """Raise InputError, naming the nearest known name, if one given under the key `where` is not known."""
+    """Raise InputError, with the nearest known name, for the first given name that is not known under `where`."""
     for name in given:
         if name not in known:
             raise InputError(f"unknown key {where}.{name}{nearest(name, known)}")
 
 
 def first_given(*values: float | None) -> float:
-    """The first value that is not None: of config, message covariance and default, in this order.
+    """Return the first value that is not None: of config, message covariance and default, in this order.
 
     Raises ValueError if none does.
     """
@@ -427,7 +427,7 @@ def first_given(*values: float | None) -> float:
 
 
 def first_error(error: ValidationError, model: type[BaseModel]) -> tuple[tuple[int | str, ...], str]:
-    """Place where content that a model rejects is wrong first, and a sentence about it."""
+    """Return the path of the first error in content that a model rejects, and a sentence about it."""
     # An unknown key explains more than what follows from it.
     first: Any = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
     path = tuple(part for part in first["loc"] if not str(part).startswith("["))
@@ -443,7 +443,7 @@ def first_error(error: ValidationError, model: type[BaseModel]) -> tuple[tuple[i
 
 
 def _known_at(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """The keys of the section at the path."""
+    """Return the keys of the section at a path."""
     for key in path:
         field = model.model_fields.get(str(key))
         model = (section_in(field.annotation) if field else None) or model  # the id of a tag leads to none of its own
@@ -451,7 +451,7 @@ def _known_at(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
 
 
 def section_in(annotation: Any) -> type[BaseModel] | None:
-    """The section that a field of this type holds, alone or by key."""
+    """Return the section that a field of this type has, alone or by key; None without one."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     arguments = getattr(annotation, "__args__", ())
