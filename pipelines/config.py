@@ -1,4 +1,4 @@
-"""How the config of a session is read: an attachment of the recording, overridden key by key by a file.
+"""Reader of a session's config: an attachment of the recording, overridden key by key by a file.
 
     recording, config = configured(recording, Path("more.yaml"))
 

@@ -1,4 +1,4 @@
-"""How files that a user names are read: regular ones, no longer than they can be, YAML of any make refused in one line.
+"""Reader of files that a user names: regular ones, bounded in size, with any fault of their YAML in one line.
 
     data = read_bytes(path, MAX_YAML_BYTES)
     content = load_yaml(data, str(path))

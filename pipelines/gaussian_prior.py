@@ -1,4 +1,4 @@
-"""What is known of parameters before a recording is looked at, from elsewhere than from data sheets."""
+"""Gaussian priors of parameters from outside the data sheets, such as an earlier calibration."""
 
 from __future__ import annotations
 

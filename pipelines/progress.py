@@ -1,4 +1,4 @@
-"""How far long work has come: bars on stderr, if that is a terminal and a command has asked for them.
+"""Progress of long work: bars on stderr, if that is a terminal and a command has asked for them.
 
 with progress.shown(quiet):                       # the command
     ...

@@ -1,4 +1,4 @@
-"""What the config of a session may say. Reading and checking one is alidade.pipelines.config's work.
+"""Model of a session's config. Reading and checking one is alidade.pipelines.config's work.
 
 config.noise.gyro_density           # None where the config does not say
 config.topic(IMU)                   # the topic's name, renamed or default

@@ -1,4 +1,4 @@
-"""What people call: sessions, joint recordings, planning, validation, following, fleets, the command and Python.
+"""Entry points: sessions, joint recordings, planning, validation, following, fleets, the command line and Python.
 
 A `Session` (session.py) is a recording or arrays with a method and a config; it solves, tests and returns
 `Calibration`s. `cli.py` and `api.py` are thin: options in, sessions asked, reports written. `joint.py` joins recordings

@@ -1,4 +1,4 @@
-"""What `import alidade` gives: the functions behind the commands, with files or with arrays in memory."""
+"""Python interface, `import alidade`: the functions behind the commands, with files or with arrays in memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The solvers on one recording, side by side, and whether they and both halves of it agree."""
+"""Comparison of all solvers on one recording, and of both halves of the recording."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Comparison:
 
 
 def compared(session: Session, window: float | None = 1.0, halves: bool = True) -> Comparison:
-    """Solve a session and the halves of its recording by all solvers. Raises InputError, IndeterminateError."""
+    """Solve a session by all solvers, and each half by batch. Raises InputError, IndeterminateError."""
     calibrations = tuple(session.calibrations(SOLVERS, window))
     if not halves:
         return Comparison(calibrations)

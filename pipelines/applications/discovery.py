@@ -1,4 +1,4 @@
-"""Which of a recording's topics could serve what a method needs, found by type, content and name.
+"""Discovery of the topics in a recording that a method could use, by type, content and name.
 
 Nothing is taken silently: what is found is a suggestion, with its reasons, for people to put into the config.
 """
@@ -61,7 +61,7 @@ class Suggestion:
 
 
 def suggestions(recording: Recording, config: Config, only: Sequence[str] | None = None) -> tuple[Suggestion, ...]:
-    """Suggested topics for each method (of `only`) that lacks something and could have it from the recording."""
+    """Return suggested topics for each method (of `only`) that lacks something that the recording could provide."""
     found = []
     pairings: dict[tuple[str, str], Pairing | None] = {}
     for name in methods.names() if only is None else only:

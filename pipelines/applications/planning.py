@@ -1,4 +1,4 @@
-"""Before recording: what a planned motion would determine, what it would leave weak, and a motion that determines more.
+"""Planning before recording: predicted sigmas and weak directions of a motion, and a motion that determines more.
 
     found = plan("los", "my_sway.yaml", require={"delta_px": 1e-4})
     found.now.status, [step.change for step in found.steps]

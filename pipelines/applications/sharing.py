@@ -1,4 +1,4 @@
-"""What several recordings of one device have in common: which parameters are the same in all of them, which walk.
+"""Parameters that several recordings of one device share: those that are constant, and those that walk.
 
 The method says which parameters belong to a recording, as a gyro's turn-on bias does; the config's `share` goes before
 that, by names or patterns ("camera_mount_*").

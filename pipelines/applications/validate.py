@@ -1,4 +1,4 @@
-"""From a recording and a calibration to the errors without and with it."""
+"""Validation of a calibration on a recording: errors without and with the calibration."""
 
 from __future__ import annotations
 

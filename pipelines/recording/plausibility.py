@@ -1,4 +1,4 @@
-"""Whether readings can be what they seem: units, gravity removed, wrapped counts, and what drivers write instead.
+"""Plausibility of readings: units, removed gravity, wrapped counts, and placeholders that drivers write.
 
 A sensor that is not there reads zero, one value, or NaN, whatever its covariance states; one that reads something
 plausible is there, though a driver wrote -1 over it. A covariance that no sensor has states nothing: zero, -1, too

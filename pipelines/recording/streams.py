@@ -197,7 +197,7 @@ class StreamReader:
         return t, wxyz, plausibility.plausible_covariance(topic, "attitude", cov, least_variance, self.dropped)
 
     def temperature(self, topic: str, sensor_t: Array) -> Temperature:
-        """Temperature of a sensor that has samples at sensor_t (N,), s from the session's start.
+        """Read the temperature of a sensor that has samples at sensor_t (N,), s from the session's start.
 
         Raises InputError also when a temperature is none of a sensor in degrees Celsius, and when there is none for
         MAX_TEMPERATURE_GAP_S while the sensor has samples.

@@ -50,7 +50,7 @@ class _Record(BaseModel):
 
 
 class SavedParameter(_Record):
-    """A parameter; SI. `applied`: value in formulas, which leave out what was estimated with it; None: `value`."""
+    """Parameter, SI; `applied`: its value in formulas that leave out nuisance parameters, None: `value`."""
 
     value: float
     sigma: float

@@ -1,4 +1,4 @@
-"""What commands print with --json: SI, and null where a number is not finite."""
+"""Output of the commands with --json: SI, and null where a number is not finite."""
 
 from __future__ import annotations
 

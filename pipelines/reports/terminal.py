@@ -225,7 +225,7 @@ def _print_columns(columns: Columns | None) -> None:
 
 
 def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
-    """Print the methods that are served, those that could be with other topics, and what the others lack."""
+    """Print the methods that a recording serves, those it could with other topics, and what the others lack."""
     for method, missing in facts.missing.items():
         if not missing:
             console.print(f"[green]{method}: yes[/]")

@@ -296,7 +296,7 @@ def _imu(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
 
 
 def lower_triangular_part(K: Array) -> tuple[Array, Array]:
-    """R orthogonal and D lower triangular, positive on its diagonal, with K = R D."""
+    """Return R, orthogonal, and D, lower triangular and positive on its diagonal, with K = R D."""
     q, r = np.linalg.qr(K[::-1, ::-1])
     signs = np.sign(np.diag(r))
     return (q * signs)[::-1, ::-1], (signs[:, None] * r)[::-1, ::-1]

@@ -1,4 +1,4 @@
-"""What a calibration says of single sensors: matrices, biases, joint covariances.
+"""Values of a calibration by sensor: matrices, biases, joint covariances.
 
 K, bias = calibration.matrix("mag"), calibration.bias("mag")      # nominal = K (raw - bias)
 P = calibration.covariance_of(["time_offset", "gyro_bias_x"])
@@ -59,7 +59,7 @@ class SensorValues:
 
     @abstractmethod
     def application(self) -> Application:
-        """How it is applied. Raises InputError when that is not known."""
+        """Return formulas, values and config to apply the calibration with. Raises InputError if unknown."""
 
     @overload
     def apply(self, *, sigma: Literal[False] = False, **measured: Any) -> dict[str, Array]: ...

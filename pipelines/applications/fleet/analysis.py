@@ -1,4 +1,4 @@
-"""What the calibrations of a fleet say together: each parameter across units and dates, and what stands out.
+"""Joint analysis of the calibrations of a fleet: each parameter across units and dates, and what stands out.
 
 A recording counts when it is calibrated or weak, a parameter when the recording rather than the prior determined it:
 the others' sigmas mean nothing here. Values scatter by what units differ (population), by what recordings of one unit

@@ -1,4 +1,4 @@
-"""Which units of a fleet need attention, and for what, in words."""
+"""Units of a fleet that need attention, with the reasons in words."""
 
 from __future__ import annotations
 

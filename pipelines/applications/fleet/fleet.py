@@ -1,4 +1,4 @@
-"""Many recordings calibrated, and what they say together.
+"""Calibration of many recordings, each of which is finished once and kept.
 
     outcome = calibrate_fleet(find(["recordings/*.mcap"]), Settings(), out, scheduler=None, jobs=2)
 

@@ -1,4 +1,4 @@
-"""Units that were recorded several times: whether they changed, as several recordings of one device are judged.
+"""Histories of units that were recorded several times, tested for changes as recordings of one device are.
 
 The recordings of a unit are joined as `calibrate` joins them, linear about each one's own estimate. What belongs to a
 recording is its own; priors and assumptions count once. Significance is counted over all units of the fleet.

@@ -1,4 +1,4 @@
-"""The recordings of a fleet: where they are, which unit each shows, and when.
+"""Recordings of a fleet: location, unit and date of each.
 
 Each is a file or a bag folder. Paths are fsspec's: a folder of this machine or of a network file system, or
 s3://bucket/... with the package of that file system. A worker opens its recording by itself; what is not on a local

@@ -1,4 +1,4 @@
-"""Statistics of many calibrations: are the sigmas true, which units stand out, which have changed.
+"""Statistics of many calibrations: consistency of the sigmas, outlying units, changed units.
 
 Values x_i come with their own sigmas s_i. A fleet has a spread t of its own beside them, so that x_i scatters about the
 centre with variance t^2 + s_i^2; centre and t are estimated from medians, which up to half of the units cannot spoil.
@@ -217,7 +217,7 @@ def _component(values: Array, sigmas: Array, groups: NDArray[np.intp]) -> Compon
 
 
 def varies(z: Array) -> bool:
-    """Whether most units change beyond two sigmas: then sessions differ by nature, as a turn-on bias does."""
+    """Whether most changes z (n,) exceed two sigmas: recordings then differ by nature, as turn-on biases do."""
     return len(z) >= ENOUGH and float((np.abs(z) > 2.0).mean()) > 0.5
 
 

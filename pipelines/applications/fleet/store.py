@@ -1,4 +1,4 @@
-"""Results of many calibrations, kept as they come, and a calibration whose failure is a result.
+"""Store of the results of many calibrations, written as they come; a failed calibration is a result as well.
 
 A line of JSON is a result: an interrupted run continues where it stopped. A line that is no result, whatever it holds,
 is passed over, and that result is made again.

@@ -1,4 +1,4 @@
-"""Which connections a server of `follow` keeps: so many in all and from one address, whether they may read or not.
+"""Limits on the connections of a server of `follow`: in all and per address, trusted or not.
 
     gate.admit(connection, address, close)    # may close another one
     gate.trust(connection)                    # it has shown that it may read

@@ -1,4 +1,4 @@
-"""Guidance for the person recording: what is known by now, what has been collected, and what is still missing."""
+"""Guidance for the person recording: current estimate, data collected, and data still missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page for the person who holds the device: what to do now, what there is by now, and when it is enough.
+"""Page for the person who holds the device: the motion to make now, the progress, and when to stop.
 
     with LivePage(say) as page:      # http://127.0.0.1:8766
         page.show(view)

@@ -1,4 +1,4 @@
-"""What of Foxglove's WebSocket protocol is spoken here, as a client and as a server (foxglove-websocket v1)."""
+"""The part of Foxglove's WebSocket protocol that client and server use here (foxglove-websocket v1)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LARGEST_ID = (1 << 32) - 1
 
 
 class RefusedError(Exception):
-    """Message from the other side that breaks the protocol; the text says why."""
+    """Raised at a message from the other side that breaks the protocol, with the reason as text."""
 
 
 def read_message(text: str) -> dict[str, Any]:

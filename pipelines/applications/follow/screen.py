@@ -1,4 +1,4 @@
-"""What `alidade follow` shows: a page that changes in place, or plain lines where there is no terminal."""
+"""Terminal output of `alidade follow`: a page that changes in place, or plain lines without a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a recording comes from while it is being made: a file or a folder that another process writes, or a stream.
+"""Sources of a recording that is being made: a file or folder that another process writes, or a stream.
 
 Streams are written down as they come, so that all sources look alike: files that grow.
 """

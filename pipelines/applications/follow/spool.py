@@ -1,4 +1,4 @@
-"""A file that a stream is written down in, whatever room there is on its disk.
+"""File for a stream, buffered in memory while the disk is full.
 
     spool = Spool(path, say)
     spool.write(record)        # kept in memory
