@@ -120,8 +120,8 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     if name is None:
         raise InputError("arrays do not say which method they are for: open(..., method=...)")
     chosen = methods.method(name)
-    data = _placed(_checked(chosen, _data(chosen, source)), settings)
-    with _of_arrays():
+    data = _at_config_place(_checked(chosen, _data(chosen, source)), settings)
+    with _naming_arrays():
         chosen.check(data)
     return Session(chosen, data, settings)
 
@@ -336,7 +336,7 @@ def _checked(method: Method, data: Any) -> Any:
         for name in names:
             # Those of a method that takes counts are looked at with their conversion.
             if "gyro" in name and "raw" not in getattr(method.config_section, "model_fields", {}):
-                with _of_arrays():
+                with _naming_arrays():
                     check_gyro(name, arrays[stamps], arrays[name])
     if dropped:
         data = replace(data, dropped={**data.dropped, **dropped})
@@ -344,7 +344,7 @@ def _checked(method: Method, data: Any) -> Any:
 
 
 @contextmanager
-def _of_arrays() -> Iterator[None]:
+def _naming_arrays() -> Iterator[None]:
     """Context manager that makes of an InputError about a topic one about an array."""
     try:
         yield
@@ -357,7 +357,7 @@ def _in_order(name: str, t: Array, carried: Sequence[Array], dropped: dict[str, 
     if (np.diff(t) > 0.0).all():
         return None
     values = np.hstack([t[:, None] * 0.0, *(np.nan_to_num(one).reshape(len(t), -1) for one in carried)])
-    with _of_arrays():
+    with _naming_arrays():
         return clean(name, nanoseconds(t, 0), 0, values, dropped)[1]
 
 
@@ -375,7 +375,7 @@ def _check_stamps(name: str, given: Any, t: Array) -> None:
         raise InputError(f"arrays: {name} spans {np.ptp(t):.3g} s; times have to be in s, not in us or ns")
 
 
-def _placed(data: Any, config: _BaseConfig) -> Any:
+def _at_config_place(data: Any, config: _BaseConfig) -> Any:
     """Return the data with the place that the config states. Raises InputError where the data state another."""
     given = {
         "latitude": None if config.latitude_deg is None else np.deg2rad(config.latitude_deg),

@@ -215,13 +215,13 @@ def calibrate(
         session = open_session(where, method, config, strict, **how)
         return replace(session, engine=engine, attitude_rate=attitude_rate)
 
-    recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver)
+    recordings, folder = group_recordings(sessions), out or _default_folder(sessions[0], solver)
     if len(recordings) > 1:
         if solver != "batch":
             raise InputError(f"--solver {solver}: several recordings are calibrated together by batch alone")
         if engine != "auto":
             raise InputError(f"--engine {engine}: with several recordings each uses the engine that fits it")
-        folder = out or _beside(sessions[0], "device")
+        folder = out or _default_folder(sessions[0], "device")
         if not as_json:
             _say(f"{len(recordings)} recordings of one device: {describe_recordings(recordings)}")
     require_room(folder)
@@ -242,7 +242,7 @@ def calibrate(
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
             written = write_results(folder, calibration)
-    _tell(calibration, folder, written, as_json, everything)
+    _show_result(calibration, folder, written, as_json, everything)
 
 
 @app.command()
@@ -333,7 +333,7 @@ def follow(
     if (source is None) == (replay is None):
         raise InputError("follow: give a SOURCE, or a finished recording with --replay")
     source = source or str(replay)
-    folder = out or _beside(Path(_file_name(source)), "incremental")
+    folder = out or _default_folder(Path(_file_name(source)), "incremental")
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
@@ -341,7 +341,7 @@ def follow(
     pace = None if replay is None else speed
     calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or (), pace)
     written = write_results(folder, calibration)
-    _tell(calibration, folder, written, as_json)
+    _show_result(calibration, folder, written, as_json)
 
 
 @app.command()
@@ -367,7 +367,7 @@ def validate(
     from alidade.pipelines.reports.validation_report import validation_report
     from alidade.pipelines.reports.whole import require_room, write_whole
 
-    folder = out or _beside(session, "validation")
+    folder = out or _default_folder(session, "validation")
     require_room(folder)
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
         with progress.doing("validating"):
@@ -765,7 +765,7 @@ def cube_print(
     _say(f"Wrote {config}: ids and sizes for cube-layout --config; of a cube as drawn all tags")
 
 
-def _beside(session: Path, what: str) -> Path:
+def _default_folder(session: Path, what: str) -> Path:
     """Return the default folder of results: beside the recording, named after the recording."""
     session = session if session.name else session.resolve()
     name = "".join(letter for letter in session.stem if letter not in "*?[]").rstrip("_-.") or "recording"
@@ -779,7 +779,7 @@ def _file_name(source: str) -> str:
     return re.sub(r"\W+", "-", source.partition("://")[2]).strip("-") if "://" in source else source
 
 
-def _tell(
+def _show_result(
     calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool, everything: bool = False
 ) -> NoReturn:
     """Show a calibration and the place of its files; exit with the code of its status."""
@@ -836,11 +836,11 @@ def main() -> None:
         code = next((_TROUBLE[name] for name in names if name in _TROUBLE), None)
         if code is None and not isinstance(error, OSError):
             raise
-        print(f"alidade: {_of_system(error) if isinstance(error, OSError) else error}", file=sys.stderr)
+        print(f"alidade: {_os_error_line(error) if isinstance(error, OSError) else error}", file=sys.stderr)
         sys.exit(exit_codes.BAD_INPUT if code is None else code)
 
 
-def _of_system(error: OSError) -> str:
+def _os_error_line(error: OSError) -> str:
     """Describe in one line a file or folder that the system refuses, such as a full TMPDIR."""
     where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
     return f"{printable(where)}: {error.strerror or printable(str(error))}"

@@ -490,7 +490,7 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
         duration_s=by_itself.facts.duration_s,
         status=by_itself.status,
         headline=by_itself.headline,
-        dof=_freedoms(by_itself),
+        dof=_noise_dof(by_itself),
         parameters=[
             number(*each) for each in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True)
         ],
@@ -498,7 +498,7 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
     )
 
 
-def _freedoms(by_itself: Calibration) -> float | None:
+def _noise_dof(by_itself: Calibration) -> float | None:
     """Return the degrees of freedom of a recording's noise estimate; None if stated, or without chi-square."""
     chi_square, levels = by_itself.estimate.chi_square, by_itself.estimate.levels
     return chi_square.dof if chi_square and any(level.noise.estimated for level in levels) else None

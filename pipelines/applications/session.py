@@ -460,7 +460,7 @@ class Session:
         if solver == "incremental":
             from alidade.pipelines.solvers.incremental import solve_incremental
 
-            shown = replace(problem, steps=partial(_shown, problem, self.facts.duration_s))
+            shown = replace(problem, steps=partial(_steps_with_progress, problem, self.facts.duration_s))
             with deadline.of_processor():
                 return solve_incremental(shown, window), problem
         from alidade.pipelines.solvers.batch import solve_batch
@@ -667,7 +667,7 @@ def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference 
         yield Finding("remark", Severity.NOTE, {"text": premise})
 
 
-def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
+def _steps_with_progress(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
     """Yield the problem's steps; if one by one, with progress by recording time, until the deadline."""
     if chunk > 1:
         return problem.steps(chunk)

@@ -137,7 +137,7 @@ def validate(
         return Validated(known, path.name, validations, True, opened.notes)
     session = Session(chosen, data, settings, opened)
     with session.usual_time():
-        found = _held(session, known)
+        found = _check(session, known)
         lost = (*opened.notes, *filter(None, [deadline.stopped()]))
     if found is None:
         return Validated(known, path.name, validations, False, lost)
@@ -159,7 +159,7 @@ def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float
     return dict(zip(estimate.names, (estimate.values + scale * (correlation @ weights)).tolist(), strict=True)) | fixed
 
 
-def _held(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Estimate, dict[str, float]] | None:
+def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Estimate, dict[str, float]] | None:
     """Test the calibration against the recording's own estimate; return both, and its values; None if not solved."""
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError

@@ -43,11 +43,11 @@ def read_cameras(path: Path, data: Path) -> CameraFile:
         cameras = {f"/{name}/camera_info": camera(each, name) for name, each in (chain or {"camera": content}).items()}
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         why = f"no camera calibration of ROS, OpenCV, Kalibr or mrcal ({type(error).__name__}: {error})"
-        raise InputError(f"{path}: {_own(content) or why}") from error
+        raise InputError(f"{path}: {_why_own_file(content) or why}") from error
     return CameraFile(path, cameras, data)
 
 
-def _own(content: object) -> str:
+def _why_own_file(content: object) -> str:
     """Return why a result or a config of alidade is no camera calibration, as a phrase; empty for other content."""
     keys = set(content) if isinstance(content, dict) else set()
     if isinstance(content, dict) and str(content.get("schema", "")).startswith("alidade."):

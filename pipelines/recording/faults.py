@@ -57,7 +57,7 @@ def drop_faults(
     smallest = _SMALLEST_RANGE.get(unit, 0.0)
     clipped = np.stack([_clipped(t, column, smallest) for column in rest.T], axis=1)
     frozen = np.stack([_frozen(t, column) for column in rest.T], axis=1)
-    return _without(topic, t, values, {"spike": spikes, CLIPPED: clipped, _STUCK: frozen}, dropped, unit)
+    return _sound_rows(topic, t, values, {"spike": spikes, CLIPPED: clipped, _STUCK: frozen}, dropped, unit)
 
 
 def drop_frozen(topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str, axes: str) -> NDArray[np.intp]:
@@ -66,10 +66,10 @@ def drop_frozen(topic: str, t: Array, values: Array, dropped: dict[str, int], un
     Such a sensor is nowhere at rest: readings frozen for most of the time are faults as well.
     """
     frozen = np.stack([_frozen(t, column, most=1.0) for column in values.T], axis=1)
-    return _without(topic, t, values, {_STUCK: frozen}, dropped, unit, axes)
+    return _sound_rows(topic, t, values, {_STUCK: frozen}, dropped, unit, axes)
 
 
-def _without(
+def _sound_rows(
     topic: str, t: Array, values: Array, reasons: dict[str, Mask], dropped: dict[str, int], unit: str, axes: str = "xyz"
 ) -> NDArray[np.intp]:
     """Return the rows that no mask (N, k) of a fault marks; count the others by fault, raise InputError if too many."""

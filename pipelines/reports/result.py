@@ -334,10 +334,10 @@ class Calibration(SensorValues):
     def applied(self) -> list[str]:
         """The parameters, without nuisance parameters of which the recording says no more than their prior mean, 0."""
         given = self.parameters
-        return [q.name for q in self.problem.quantities if q.group is None or self._says(q, given.get(q.name))]
+        return [q.name for q in self.problem.quantities if q.group is None or self._is_nonzero(q, given.get(q.name))]
 
     @staticmethod
-    def _says(q: Quantity, found: ParameterResult | None) -> bool:
+    def _is_nonzero(q: Quantity, found: ParameterResult | None) -> bool:
         """Whether a nuisance parameter is known to differ from 0: by the recording, a prior conflict or its prior."""
         if found is None:
             return False

@@ -76,11 +76,11 @@ class _Reader:
             case ast.List(elts=rows):
                 return _constant(Value.constant(np.array([_value(self._node(row)).array for row in rows])))
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                return _made("minus", self._node(operand))
+                return _operation("minus", self._node(operand))
             case ast.BinOp(left=left, op=op, right=right):
-                return _made(OPERATORS[type(op)], self._node(left), self._node(right))
+                return _operation(OPERATORS[type(op)], self._node(left), self._node(right))
             case ast.Call(func=ast.Name(id=name), args=[argument]):
-                return _made(name, self._node(argument))
+                return _operation(name, self._node(argument))
         raise ValueError(f"not an expression of a formula: {ast.unparse(tree)}")
 
     def name(self, name: str) -> _Node:
@@ -89,17 +89,17 @@ class _Reader:
             node, arguments = self._earlier[name]
             return node if node.value is not None else _Node(node.kind, None, "call", (), name, arguments)
         if name in self._inputs:
-            return _Node(_printed(input_kind(name)), None, "name", (), name)
+            return _Node(_kind_in_code(input_kind(name)), None, "name", (), name)
         return _constant(Value.constant(self._known.get(name, np.array(0.0))))
 
 
-def _printed(kind: Kind) -> Kind:
+def _kind_in_code(kind: Kind) -> Kind:
     """Return the kind that a value has in generated code, where rotations are matrices."""
     return "matrix" if kind == "rotation" else kind
 
 
 def _constant(value: Value) -> _Node:
-    return _Node(_printed(value.kind), value)
+    return _Node(_kind_in_code(value.kind), value)
 
 
 def _value(node: _Node) -> Value:
@@ -108,9 +108,9 @@ def _value(node: _Node) -> Value:
     return node.value
 
 
-def _made(op: str, *parts: _Node) -> _Node:
+def _operation(op: str, *parts: _Node) -> _Node:
     """Make an operation: computed if its parts are constants, simplified if one of them is 0."""
-    kind = _printed(result_kind(op, [part.kind for part in parts]))
+    kind = _kind_in_code(result_kind(op, [part.kind for part in parts]))
     if op in ("add", "sub", "mul"):
         a, b = parts
         zero_a, zero_b = (part.value is not None and not part.value.array.any() for part in parts)
@@ -192,7 +192,7 @@ def _axis_turn(node: _Node) -> tuple[str, _Node] | None:
         angle, axis = node.parts[0].parts
         for name, unit in AXES.items():
             if axis.array is not None and np.array_equal(axis.array, unit):
-                return f"R{name[1]}", _made("minus", angle)
+                return f"R{name[1]}", _operation("minus", angle)
     return None
 
 

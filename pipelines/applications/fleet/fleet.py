@@ -244,7 +244,7 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
         "duration_s": calibration.facts.duration_s,
         "method": calibration.problem.method,
         "device": walks(calibration.method, calibration.config, names),
-        "told": packed(_says(calibration)),
+        "told": packed(_sqrt_information(calibration)),
         "parameters": {
             p.name: {
                 "value": p.value,
@@ -259,7 +259,7 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _says(calibration: Calibration) -> SqrtInformation:
+def _sqrt_information(calibration: Calibration) -> SqrtInformation:
     """Return a calibration's square-root information on its parameters; if the solver has none, from the covariance."""
     from alidade.pipelines.solvers.posterior import sqrt_information_of
 

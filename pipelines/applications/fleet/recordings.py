@@ -54,7 +54,7 @@ def find(patterns: Sequence[str]) -> dict[str, Recording]:
 
     found: dict[str, Recording] = {}
     for pattern in patterns:
-        with _told(pattern, "looked up"):
+        with _one_line_error(pattern, "looked up"):
             fs, path = url_to_fs(pattern)
             fs.invalidate_cache()  # what was listed before may have changed
             bags, files = _bags_and_files(fs, fs.glob(path, detail=True))
@@ -108,13 +108,13 @@ def local(file: OpenFile, is_folder: bool = False) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="alidade.") as folder:
         path = Path(folder) / Path(file.path).name
-        with _told(file.full_name, "read"):
+        with _one_line_error(file.full_name, "read"):
             file.fs.get(file.path, str(path), recursive=True) if is_folder else file.fs.get_file(file.path, str(path))
         yield path
 
 
 @contextmanager
-def _told(what: str, done: str) -> Iterator[None]:
+def _one_line_error(what: str, done: str) -> Iterator[None]:
     """Context manager that makes an InputError in one line of any error that a file system raises."""
     try:
         yield

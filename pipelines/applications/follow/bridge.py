@@ -87,19 +87,19 @@ class Bridge(Stream):
                     open_timeout=_PATIENCE,
                     close_timeout=_PAUSE,
                 ) as connection:
-                    self._tell(f"{self._url}: connected")
+                    self._say_once(f"{self._url}: connected")
                     self._listen(connection, record)
             except InvalidURI as error:
-                self._tell(f"{self._url}: no address of a bridge ({error})")
+                self._say_once(f"{self._url}: no address of a bridge ({error})")
                 break
             except (OSError, WebSocketException) as error:
-                self._tell(f"{self._url}: no connection ({' '.join(str(error).split())}); trying again")
+                self._say_once(f"{self._url}: no connection ({' '.join(str(error).split())}); trying again")
             self._over.wait(_PAUSE)
         record.close()
         if self.refused > 1:
             self._say(f"{self._url}: {self.refused} messages refused")
 
-    def _tell(self, sentence: str) -> None:
+    def _say_once(self, sentence: str) -> None:
         """Pass a sentence to `say` unless the sentence before was the same."""
         if sentence != self._sentence:
             self._sentence = sentence

@@ -182,7 +182,7 @@ class Follower:
         """Return the graph of all data so far, and its steps that the run has not processed."""
         recording = Recording(self._growing.refresh(self.source.parts, None))
         session = self._read(recording)
-        problem = self._guessed_before(session) or _that_grows(session.problem(), session)
+        problem = self._guessed_before(session) or _continuable(session.problem(), session)
         steps = self._new_steps(session, problem)
         self._session, self._checklist = session, {}
         self._delay_ns, self._attachments = _min_delay_ns(session), len(self._growing.attachments)
@@ -326,7 +326,7 @@ class Follower:
         self._collect(session)
         # What was never followed is solved as any finished recording.
         followed = self._run is not None or self.settings.checkpoint is not None
-        growing = _that_grows(problem, session) if followed else problem
+        growing = _continuable(problem, session) if followed else problem
         steps = self._new_steps(session, growing)
         assert self._run is not None
         kept, taken = growing.keyframes, problem.keyframes
@@ -363,6 +363,6 @@ def _names(problem: Problem) -> list[str]:
     return [quantity.name for quantity in problem.quantities]
 
 
-def _that_grows(problem: Problem, session: Session) -> Problem:
+def _continuable(problem: Problem, session: Session) -> Problem:
     """Return the graph of all data in the form that can be continued while the recording grows, if it has one."""
     return (problem.continuation and problem.continuation(session.data, -np.inf)) or problem

@@ -136,7 +136,7 @@ class LivePage:
 
     def __enter__(self) -> LivePage:
         self._thread.start()
-        self._tell()
+        self._publish()
         return self
 
     def __exit__(self, _: object, error: object, __: object) -> None:
@@ -152,7 +152,7 @@ class LivePage:
         if view.covariance is not None:
             self._noted = [note for note in self._noted if not note[1].startswith(WAITING)]
         motion = view.motion
-        self._tell(
+        self._publish(
             view.summary,
             notes=self._notes(),
             done=view.done,
@@ -167,7 +167,7 @@ class LivePage:
     def say(self, sentence: str) -> None:
         """Show a sentence on the page for a while."""
         self._noted = [*self._noted, (time.monotonic(), printable(sentence, _MAX_NOTE))][-_NOTES:]
-        self._tell(notes=self._notes())
+        self._publish(notes=self._notes())
 
     def end(self, calibration: Calibration) -> None:
         """Show the result on the page."""
@@ -176,9 +176,9 @@ class LivePage:
     # -- the state
 
     def _end(self, status: str, headline: str) -> None:
-        self._tell(over={"status": status, "headline": headline})
+        self._publish(over={"status": status, "headline": headline})
 
-    def _tell(self, *new: dict[str, Any], **more: Any) -> None:
+    def _publish(self, *new: dict[str, Any], **more: Any) -> None:
         """Send the state, with what changed in it, to all clients."""
         with self._lock:
             for changed in (*new, more):
@@ -227,7 +227,7 @@ class LivePage:
 
     # -- answers
 
-    def _may(self, request: Request) -> bool:
+    def _is_authorised(self, request: Request) -> bool:
         """Whether a request may be answered; if so, mark its connection as trusted."""
         known = self._asks_for_this_machine(request) and (
             not self.is_open or _equal(request.cookies.get(self._cookie, ""), self._key)
@@ -258,7 +258,7 @@ class LivePage:
     async def _document(self, request: Request) -> Response:
         from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
 
-        if self._may(request):
+        if self._is_authorised(request):
             return HTMLResponse(_PAGE.read_text(encoding="utf-8"), headers=_HEADERS)
         token, client = request.query_params.get("token"), request.client.host if request.client else "?"
         if not self.is_open or token is None or not self._asks_for_this_machine(request):
@@ -277,7 +277,7 @@ class LivePage:
     async def _events(self, request: Request) -> Response:
         from starlette.responses import PlainTextResponse, StreamingResponse
 
-        if not self._may(request):
+        if not self._is_authorised(request):
             return PlainTextResponse(_REFUSED, 403, _HEADERS)
         return StreamingResponse(self._stream(), media_type="text/event-stream", headers=_HEADERS)
 
