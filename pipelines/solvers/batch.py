@@ -66,7 +66,7 @@ _DIFFERENT = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Solution with what is computed from it later.
+    """A solution of a problem, with its posterior and diagnostics computed on demand.
 
     Attributes:
         compiled: the problem.
@@ -86,7 +86,7 @@ class Solved:
 
     @property
     def converged(self) -> bool:
-        """Whether the values are a minimum, over all directions or over all but weak ones, which are at their priors.
+        """Whether the values are a minimum over all directions, or over all strong ones, the weak at their priors.
 
         Along weak directions the cost varies by chance: where it is least there says nothing.
         """
@@ -95,13 +95,13 @@ class Solved:
 
     @property
     def message(self) -> str:
-        """How the solution converged, or why not."""
+        """Why the minimisation converged, or why it did not."""
         at_priors = self.converged and not self.solution.converged
         return "converged with weak directions at their priors" if at_priors else self.solution.message
 
     @property
     def engine(self) -> Linearization:
-        """The engine of the graph, with the weights of the solution, without what is rejected."""
+        """Linearisation of the graph with the solution's noise weights, rejected measurements left out."""
         return self.posterior.at.engine
 
     @property
@@ -111,7 +111,7 @@ class Solved:
 
 
 def minimum(compiled: Compiled, levels: Sequence[Level]) -> Solution:
-    """The solution with noise levels that are known, rejected measurements left out."""
+    """Return the robust minimum at known noise levels, the rejected measurements removed from the system."""
     engine = apply_levels(compiled.engine, levels)
     return solve_robust(engine, compiled.initial, compiled.problem.loss).at_inliers()
 
@@ -193,7 +193,7 @@ def solve_batch(
 
 
 def _best(compiled: Compiled, solution: Solution, config: LevenbergConfig) -> tuple[Solution, Minimum | None]:
-    """The solution or, if another minimum is deeper, that one; and the second best if it is close."""
+    """Return the deepest minimum among the solution and the alternatives, and the next one if its cost is close."""
     problem, layout = compiled.problem, compiled.layout
     if problem.elsewhere is None or not solution.converged:
         return solution, None
@@ -277,7 +277,7 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
 
 
 def residuals_by_family(engine: Linearization, values: Values) -> dict[str, Residuals]:
-    """Family -> whitened residuals of its measurements at some values, in the order of the problem's factors."""
+    """Return each family's whitened residuals at some values, in the order of the problem's factors."""
     out = {}
     for family, groups in engine.measured.items():
         order = np.argsort(np.concatenate([g.factors for g in groups]), kind="stable")
@@ -287,7 +287,7 @@ def residuals_by_family(engine: Linearization, values: Values) -> dict[str, Resi
 
 
 def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, float]:
-    """Changes of the reported numbers in a slightly changed graph; empty where its variables differ.
+    """Return each reported number's change under a slightly changed graph; empty if the variables differ.
 
     Noise levels, and which measurements are rejected, are those of the solution.
     """
@@ -304,7 +304,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
 def _information_of(
     solved: Solved, device: Collection[str], elsewhere: Callable[[SqrtInformation], Mapping[str, float]] | None
 ) -> SqrtInformation:
-    """Square-root information of a graph about its numbers, linearised at its solution or at `elsewhere`."""
+    """Return square-root information about the reported numbers, linearised at the solution or `elsewhere`."""
     compiled, engine, values = solved.compiled, solved.engine, solved.values
     own = sqrt_information(compiled, engine, values, device)
     wanted = {} if elsewhere is None else elsewhere(own)

@@ -48,7 +48,7 @@ UNDETERMINED = "a state is not determined: no measurement and no process constra
 
 
 class IndeterminateError(Exception):
-    """The recording does not determine what it has to, for anything to be estimated."""
+    """The recording does not determine the unknowns that an estimate needs."""
 
 
 class IndeterminateStateError(IndeterminateError):
@@ -56,7 +56,7 @@ class IndeterminateStateError(IndeterminateError):
 
 
 class Chain(ABC):
-    """Whitened rows A x = b of a chain, b as their last column, of some consecutive states at a time.
+    """Linear least squares A x = b over a chain of states, in whitened rows [A | b], read in parts.
 
     Attributes:
         d: numbers of a state.
@@ -77,27 +77,27 @@ class Chain(ABC):
 
     @abstractmethod
     def part(self, begin: int, end: int) -> ChainSystem:
-        """The part of the linear system about states `begin` to `end` - 1, the rows that join the first backward too.
+        """Return the rows about states `begin` to `end` - 1, with those that join state `begin` to its predecessor.
 
         Rows about shared unknowns or nodes alone are all there.
         """
 
     @property
     def c(self) -> int:
-        """Numbers of a node; 0 without nodes."""
+        """Size of a node; 0 without nodes."""
         return 0 if self.walk is None else int(self.walk.shape[2]) // 2
 
     @property
     def border(self) -> int:
-        """Columns beside the states', right side included: c + s + 1."""
+        """Number of columns beside those of the states: node, shared unknowns and right side, c + s + 1."""
         return self.c + int(self.shared.shape[1])
 
     def eliminate(self, damping: float = 0.0) -> ChainFactorization:
-        """R of the system, damped as `damped` has it. Raises IndeterminateStateError."""
+        """Factorize the system, with Marquardt `damping` where positive. Raises IndeterminateStateError."""
         return ChainFactorization.of(self.damped(damping) if damping > 0.0 else self)
 
     def damped(self, damping: float) -> Chain:
-        """The system with so many times the information of every unknown by itself added, at zero (Marquardt)."""
+        """Return the system with each unknown's own information, `damping` times, added at zero (Marquardt)."""
         d, c, root = self.d, self.c, np.sqrt(damping)
         states, shared = np.zeros((len(self), d)), np.square(self.shared[:, :-1]).sum(axis=0)
         for begin in range(0, len(self), PART_STATES):
@@ -130,7 +130,7 @@ class Chain(ABC):
 
 @dataclass(frozen=True, eq=False)
 class ChainSystem(Chain):
-    """Rows of a chain that are all at hand.
+    """Rows of a whole chain in memory.
 
     Attributes:
         measured: (N, m, d + c + s + 1) rows about state k; rows that a state has no need of are zero.
@@ -158,12 +158,12 @@ class ChainSystem(Chain):
 
     @property
     def squares(self) -> float:
-        """Sum of squares of the right side: what no step at all leaves."""
+        """Sum of squares of the right side: twice the cost at a zero step."""
         parts = [self.measured, self.between, self.beside, self.shared, *([] if self.walk is None else [self.walk])]
         return sum(float(np.square(rows[..., -1]).sum()) for rows in parts)
 
     def with_nodes_as_states(self) -> ChainSystem:
-        """The system with every piece as one state: states (x_j, z_j) and no nodes."""
+        """Return the system in which each piece is one state (x_j, z_j), without nodes."""
         assert self.walk is not None
         d, c, (n, b, _), beside = self.d, self.c, self.between.shape, _triangle(self.beside)
         x, z, rest = np.arange(d), np.arange(d, d + c), np.arange(2 * (d + c), 2 * (d + c) + self.border - c)
@@ -176,7 +176,7 @@ class ChainSystem(Chain):
 
 @dataclass(frozen=True, eq=False)
 class _Damped(Chain):
-    """A chain with rows about every number by itself; `diagonal` (N, d) are those of the states."""
+    """A chain with Marquardt's damping rows; `diagonal` (N, d) is that of the states."""
 
     chain: Chain
     diagonal: Array
@@ -189,7 +189,7 @@ class _Damped(Chain):
         return len(self.chain)
 
     def part(self, begin: int, end: int) -> ChainSystem:
-        """Rows about some consecutive states, those of the damping below the others."""
+        """Return the rows about some consecutive states, the damping rows below the others."""
         own, d = self.chain.part(begin, end), self.d
         measured = np.concatenate([own.measured, np.zeros((len(own), d, own.measured.shape[2]))], axis=1)
         measured[:, np.arange(-d, 0), np.arange(d)] = self.diagonal[begin:end]
@@ -198,7 +198,7 @@ class _Damped(Chain):
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Segments whose inner states are eliminated, the longest first.
+    """One level of the elimination: R of the inner states of all segments, the longest segment first.
 
     Attributes:
         ends, order: (B,) the segments' last states, and which of the segments in time order these are.
@@ -215,7 +215,7 @@ class _Level:
 
     @classmethod
     def eliminate(cls, chain: Chain) -> tuple[_Level, ChainSystem, Index]:
-        """The level, the chain of the segments' last states that it leaves, and which these are."""
+        """Eliminate each segment's inner states; return the level, the chain of last states, their indices."""
         lasts, d = chain.segments(), chain.d
         rows, begin, left = np.zeros((len(chain), d, 3 * d + chain.border)), 0, list[tuple[Array, Array, Array]]()
         for some in _together(lasts):
@@ -229,12 +229,12 @@ class _Level:
 
     @classmethod
     def of(cls, lasts: Index, rows: Array, piece: Index | None) -> _Level:
-        """The level of segments with these last states (B,), rows R of their inner states and pieces (B,)."""
+        """Build a level from its segments' last states (B,), rows R of the inner states and pieces (B,)."""
         order, active = _longest_first(lasts)
         return cls(lasts[order], order, active, rows, None if piece is None else piece[order])
 
     def parts(self) -> Iterator[tuple[slice, slice, _Level]]:
-        """Some consecutive segments each time: which of the states and of the segments they are, and their level."""
+        """Yield consecutive segments in parts: slice of the states, slice of the segments, level of the part."""
         in_time, begin = np.argsort(self.order), 0
         lasts = self.ends[in_time]
         for some in _together(lasts):
@@ -246,7 +246,7 @@ class _Level:
     def back(
         self, last: Array, border: Array, generator: np.random.Generator | None = None, before: Array | float = 0.0
     ) -> Array:
-        """States (N, d, n) given the segments' last ones (B, d, n) and the border (B or 1, c + s + 1, n).
+        """Back-substitute states (N, d, n) from the segments' last ones (B, d, n), border (B or 1, c + s + 1, n).
 
         `before` (d, n) is the state before the first, where there is one.
         """
@@ -262,7 +262,7 @@ class _Level:
         return x[:-1]
 
     def covariances(self, ends: Array) -> Array:
-        """Covariances (N, 2 d + c, .) of (state, state before, node), from those (B, 2 d + c, .) of segment ends."""
+        """Covariances (N, 2 d + c, .) of (state, previous state, node), from those at segment ends (B, 2 d + c, .)."""
         d, c = self.rows.shape[1], ends.shape[1] - 2 * self.rows.shape[1]
         swap, out = np.r_[d : 2 * d, :d, 2 * d : 2 * d + c], np.zeros((len(self.rows), *ends.shape[1:]))
         before, node = slice(d), slice(2 * d, None)
@@ -285,7 +285,7 @@ class _Level:
 
 
 class Factorization(ABC):
-    """R of a linear system and what follows from it: states are (N, d, n), nodes (J, c, n), for n columns.
+    """R of a chain's linear system: solution, covariances and draws by back-substitution.
 
     Attributes:
         c: numbers of the last node.
@@ -301,32 +301,32 @@ class Factorization(ABC):
         return float(self.root[-1, -1] ** 2)
 
     def solve(self) -> tuple[Array, Array, Array]:
-        """States (N, d), nodes (J, c) and shared unknowns (s,) of the least squares."""
+        """Return the least-squares solution: states (N, d), nodes (J, c), shared unknowns (s,)."""
         last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)
         states, nodes = self.given(last[:, None])
         return states[..., 0], nodes[..., 0], last[self.c :]
 
     def given(self, last: Array) -> tuple[Array, Array]:
-        """States and nodes of the least squares for given last node and shared unknowns (c + s, n)."""
+        """Return the optimal states and nodes for a given last node and shared unknowns (c + s, n)."""
         return self._back(last, 1.0)
 
     def propagate(self, last: Array) -> tuple[Array, Array]:
-        """Moves of states and nodes that go with moves of the last node and the shared unknowns (c + s, n)."""
+        """Return how the optimal states and nodes move with the last node and shared unknowns (c + s, n)."""
         return self._back(last, 0.0)
 
     def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
-        """Draws from the posterior, as deviations from its mean: states, nodes, shared unknowns (s, n)."""
+        """Draw deviations from the posterior mean: states (N, d, n), nodes (J, c, n), shared unknowns (s, n)."""
         last = _solved(self.root[:-1, :-1], np.zeros((len(self.root) - 1, count)), generator)
         return *self._back(last, 0.0, generator), last[self.c :]
 
     @abstractmethod
     def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
-        """States and nodes for the last node and the shared unknowns (c + s, n), and so many times the right side."""
+        """Back-substitute from last node and shared unknowns (c + s, n), with the right side `right` times."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChainFactorization(Factorization):
-    """R of a chain's system, all but the last node and the shared unknowns eliminated."""
+    """R of a chain in numpy: eliminates everything but the last node and the shared unknowns."""
 
     d: int
     c: int
@@ -350,7 +350,7 @@ class ChainFactorization(Factorization):
         return cls(own, tail, root, levels, ends)
 
     def nodes(self, last: Array) -> tuple[Array, Array]:
-        """What rows about nodes alone predict.
+        """Return covariances and moves of the node pairs (z_j, z_j-1), for rows about nodes alone.
 
         Returns covariances (J, 2 c, 2 c) of (z_j, z_j-1) where the shared unknowns are known, zero for what is before
         the first, and how these move (J, 2 c, q) with the last node and the shared unknowns (c + s, q).
@@ -359,7 +359,7 @@ class ChainFactorization(Factorization):
         return covariances, np.concatenate([z, np.concatenate([np.zeros_like(z[:1]), z[:-1]])], axis=1)
 
     def parts(self, last: Array, piece: Index | None) -> Iterator[tuple[slice, Array, Array]]:
-        """What the rows about some consecutive states at a time predict.
+        """Yield covariances and moves of (x_k, x_k-1, z_j) for some consecutive states at a time.
 
         Args:
             last: (c + s, q) moves of the last node and the shared unknowns.
@@ -383,7 +383,7 @@ class ChainFactorization(Factorization):
             before = own[-1:]
 
     def _coarse(self, last: Array) -> tuple[Array, Array, Array, Array]:
-        """Of the chain that the finest segments leave: covariances of pairs and of nodes; moves of states and nodes."""
+        """Covariances of state pairs and of nodes, moves of states and nodes, on the finest level's last states."""
         d, c = self.d, self.c
         levels = self._levels[int(bool(self._levels) and self._levels[0] is not None) :]
         pairs, nodes = self._ends.covariances(_inverse_gram(self.root[:c, :c]), c)
@@ -403,7 +403,7 @@ class ChainFactorization(Factorization):
         return np.asarray(np.linalg.inv(self.root[:-1, :-1])[:, self.c :])
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
-        """Keyframes (M,), and R of (node, shared, right side) given all until each; few rows at first."""
+        """Keyframes (M,) and, of each, R of (node, shared, right side) given all rows until then."""
         ends, roots, known = self._ends, list[Array](), np.zeros((0, 1))
         for k, (head, pile) in enumerate(zip(ends.heads, ends.piles, strict=True)):
             known = _root([known, pile] if k and ends.piece[k] == ends.piece[k - 1] else [pile], pile.shape[1])
@@ -416,7 +416,7 @@ class ChainFactorization(Factorization):
     def _states(
         self, levels: list[_Level | None], last: Array, right: float, generator: np.random.Generator | None = None
     ) -> tuple[Array, Array]:
-        """States that some levels begin with, and nodes."""
+        """Back-substitute through some levels: states at the start of the finest of these, and nodes."""
         last = np.pad(last, ((0, 1), (0, 0)), constant_values=-right)
         x, nodes = self._ends.back(last, self.c, generator)
         shared = last[self.c :]
@@ -430,13 +430,13 @@ class ChainFactorization(Factorization):
 
 
 def _with_nodes(nodes: Array, shared: Array) -> Array:
-    """Border (B, c + s + 1, n) of segments from the nodes (B, c, n) in force there and the shared unknowns."""
+    """Stack the node in force (B, c, n) on the shared unknowns: each segment's border (B, c + s + 1, n)."""
     return np.concatenate([nodes, np.repeat(shared[None], len(nodes), axis=0)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class _TimeOrder:
-    """The last few dozen states, eliminated in time order.
+    """Elimination in time order of the few dozen states that remain after all levels.
 
     Attributes:
         d, c: numbers of a state, and of a node where these are no part of the states.
@@ -483,7 +483,7 @@ class _TimeOrder:
         return cls(d, c, keyframes, rows, piece, heads, piles), R[own:, own:]
 
     def back(self, last: Array, tail: int, generator: np.random.Generator | None) -> tuple[Array, Array]:
-        """States (M, d, n) and nodes (J, c, n), given the last node (`tail` numbers) and the shared unknowns."""
+        """Back-substitute states (M, d, n), nodes (J, c, n) from last node (`tail` numbers), shared unknowns."""
         d, c, n, count = self.d, self.c, last.shape[1], len(self.rows)
         x, nodes, shared = np.zeros((count, d, n)), np.zeros((int(self.piece[-1]) + 1, c, n)), last[tail:]
         own = len(self.rows[-1])
@@ -521,8 +521,8 @@ class _TimeOrder:
 
 
 def _before(R: Array, following: Array, same: Array) -> tuple[Array, Array]:
-    """Covariance of what rows R [it | following | .] are about and, with it, of what follows by `same` rows; the part
-    with what follows."""
+    """Return the covariance of (x, parts of y) for rows R [x | y | .], and its cross term to y; `following` is that of
+    y and `same` selects the parts."""
     own = len(R)
     T = np.vstack([-np.linalg.solve(R[:, :own], R[:, own : own + len(following)]), same])
     cross = T @ following
@@ -567,7 +567,7 @@ def _last_of_piece(
 
 
 def _about_node(walk: Array, columns: int) -> Array:
-    """Rows about the first node, [z | previous node | right side], among those of node and shared unknowns."""
+    """Place rows about the first node, [z | previous node | right side], in columns [node | shared | right side]."""
     c = walk.shape[1] // 2
     out = np.zeros((len(walk), columns))
     out[:, :c], out[:, -1] = walk[:, :c], walk[:, -1]
@@ -575,20 +575,20 @@ def _about_node(walk: Array, columns: int) -> Array:
 
 
 def _longest_first(lasts: Index) -> tuple[Index, Index]:
-    """Segments with these last states (B,), the longest first, and the number (L + 1,) of those longer than k."""
+    """Order of the segments with last states (B,), the longest first, and how many are longer than k, (L + 1,)."""
     lengths = np.diff(lasts, prepend=-1)
     active = np.array([np.count_nonzero(lengths > k) for k in range(lengths.max() + 1)])
     return np.argsort(-lengths, kind="stable"), active
 
 
 def _together(lasts: Index) -> list[slice]:
-    """Consecutive segments with these last states that are looked at together: of `PART_STATES` or one."""
+    """Group consecutive segments into parts of about `PART_STATES` states, or one longer segment."""
     cuts = np.flatnonzero(np.diff(lasts // PART_STATES)) + 1
     return [slice(int(a), int(b)) for a, b in zip([0, *cuts], [*cuts, len(lasts)], strict=True)]
 
 
 def _inner(chain: ChainSystem, lasts: Index, rows: Array) -> tuple[Array, Array, Array]:
-    """Eliminate all states of some segments of a chain but the last of each, (B,).
+    """Eliminate the inner states of some segments of a chain; the last state of each segment, (B,), remains.
 
     `rows` (N, d, 3 d + border) get R of the states that are eliminated.
 
@@ -616,7 +616,7 @@ def _swapped(rows: Array, d: int) -> Array:
 
 
 def _step(carried: Array, measured: Array, between: Array, d: int, gap: int) -> tuple[Array, Array, Array]:
-    """Eliminate a state of each of B segments: its rows of R, d rows carried to the next one, the rows about neither.
+    """Eliminate one state in each of B segments: rows of R, rows (B, d, .) on the next state, rows about neither.
 
     `carried` (B, ., d + gap + border) are rows from before, `gap` columns of them of the segments' first states.
     """
@@ -631,7 +631,7 @@ def _step(carried: Array, measured: Array, between: Array, d: int, gap: int) -> 
 
 
 def _reduced(piles: list[Array], columns: int) -> Array:
-    """R (B, columns, columns) of rows of the first so many segments each, about the last columns."""
+    """Triangle R (B, columns, columns) of piles of rows, right-aligned; a pile may cover the first segments only."""
     ends = np.cumsum([0, *(each.shape[1] for each in piles)])
     whole = np.zeros((len(piles[0]), max(int(ends[-1]), columns), columns))
     for each, begin, end in zip(piles, ends, ends[1:], strict=False):
@@ -655,12 +655,12 @@ def _triangle(rows: Array) -> Array:
 
 
 def _root(rows: list[Array], columns: int) -> Array:
-    """R of several rows, of which those with fewer columns are about the last ones."""
+    """Triangle R of stacked rows, narrower blocks aligned to the right."""
     return _triangle(_below(rows, columns))
 
 
 def _below(rows: list[Array], columns: int) -> Array:
-    """Rows one below the other, those with fewer columns about the last ones."""
+    """Stack blocks of rows, narrower ones aligned to the right."""
     out, begin = np.zeros((sum(map(len, rows)), columns)), 0
     for each in rows:
         out[begin : begin + len(each), columns - each.shape[1] :] = each
@@ -675,13 +675,13 @@ def _upper(rows: int, columns: int) -> Array:
 
 
 def _solved(R: Array, right: Array, generator: np.random.Generator | None) -> Array:
-    """x with R x + right = noise, white if there is a generator, else zero."""
+    """Solve R x + right = noise for x; the noise is white with a generator, else zero."""
     noise = 0.0 if generator is None else generator.standard_normal(right.shape)
     return np.asarray(-np.linalg.solve(R, right + noise), dtype=float)
 
 
 def _determined(R: Array) -> Array:
-    """Rows R (B, d, .) of states. Raises IndeterminateStateError unless the triangles (B, d, d) are of full rank."""
+    """Return rows R (B, d, .) whose triangles (B, d, d) have full rank. Raises IndeterminateStateError."""
     triangle = R[..., : R.shape[1]]
     pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
     if not (pivots > RANK_TOLERANCE * np.linalg.norm(triangle, axis=1)).all():

@@ -58,7 +58,7 @@ class MarginalState:
         keys: Sequence[int],
         stamps: Mapping[int, float],
     ) -> MarginalState:
-        """The marginal of a linear system about the values.
+        """Marginalise a linear system about the values down to a MarginalState.
 
         Raises:
             IndeterminateStateError: a variable that is marginalised out is not determined.
@@ -117,7 +117,7 @@ def require_finite(factors: Sequence[Factor], values: gtsam.Values, time: float)
 
 
 def without_infinite(steps: Sequence[Step], values: gtsam.Values) -> tuple[list[Step], dict[str, int]]:
-    """Steps without the measurements that give no finite numbers at the values, and their number by family."""
+    """Remove measurements with residuals that are not finite; return the steps and each family's count removed."""
     kept, left_out = list[Step](), Counter[str]()
     for step in steps:
         used = []
@@ -215,7 +215,7 @@ def save_checkpoint(path: Path, run: RunState, identity: Mapping[str, str]) -> N
 
 
 def load_checkpoint(path: Path, identity: Mapping[str, str]) -> RunState:
-    """The run as it was saved; it continues with the steps later than its marginal's time.
+    """Load a saved run, which continues with the steps later than its marginal's time.
 
     Raises:
         InputError: the file is no checkpoint, is damaged, or belongs to something else.
@@ -240,7 +240,7 @@ def load_checkpoint(path: Path, identity: Mapping[str, str]) -> RunState:
 
 
 def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> RunState:
-    """A run from the parts of its file."""
+    """Build a run from the parts of its file."""
     values, linear = gtsam.Values(), gtsam.JacobianFactor()
     values.deserialize(head["values"])
     linear.deserialize(head["linear"])
@@ -266,7 +266,7 @@ def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> RunState
 
 
 def _level_of(noise: Mapping[str, Any], **level: Any) -> Level:
-    """A noise level from its fields; JSON keeps tuples as lists."""
+    """Build a noise level from its JSON fields, whose lists become tuples."""
     stated, found = (_with_tuples(each) for each in (noise, level))
     return Level(Noise(**stated), **found)
 

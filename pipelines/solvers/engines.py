@@ -62,7 +62,7 @@ class Compiled:
 
     @property
     def keys(self) -> list[int]:
-        """Variables that hold the parameters' values in the end."""
+        """Keys of the variables that hold the parameters' final values."""
         return [self.current_keys.get(p.key, p.key) for p in self.problem.parameters]
 
 

@@ -88,7 +88,7 @@ class Influence:
 
     @classmethod
     def of(cls, posterior: Posterior) -> Influence:
-        """The influence at an estimate.
+        """Compute the influence at an estimate.
 
         Raises:
             LinAlgError: the shared unknowns are not determined.
@@ -111,11 +111,11 @@ class Influence:
         return tuple(self.reported.names[i] for i in self.reported.free)
 
     def rows(self, group: Group) -> tuple[Array, Array]:
-        """L (n, rows, m) of a group, and minus its weighted residuals (n, rows)."""
+        """Influence L (n, rows, m) of a group's residuals and the negative weighted residuals (n, rows)."""
         return self.at.engine.products(group, self.at.values, self.step)
 
     def moves(self, changed: Linearization) -> Array:
-        """Changes (m,) of the numbers, to first order, under other factors of the same layout."""
+        """First-order changes (m,) of the numbers if other factors of the same layout replace the graph's."""
         return self._moved(changed) - self._unchanged
 
     @cached_property
@@ -123,7 +123,7 @@ class Influence:
         return self._moved(self.at.engine)
 
     def _moved(self, engine: Linearization) -> Array:
-        """Sum (m,) of what the residuals of an engine's factors move the numbers by; nothing at a minimum."""
+        """First-order step (m,) of the numbers from all residuals of a linearisation; zero at its minimum."""
         moved = np.zeros(len(self.names))
         for group in engine.divided():
             moved += np.einsum("nrm,nr->m", *engine.products(group, self.at.values, self.step))
@@ -170,7 +170,7 @@ def error_budget(influence: Influence, added: Mapping[str, Array], covariance: A
 
 
 def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[str, Array]]:
-    """The sources of a group and the variance (m,) of each, from squares (n, rows, m) of its influence."""
+    """Sources of error of a group, and each one's variance (m,), from squared influences (n, rows, m)."""
     if group.family != "prior" or group.target != "shared":
         return [(group.family, squares.sum(axis=(0, 1)))]
     layout, reported = influence.at.engine.layout, influence.reported
@@ -186,7 +186,7 @@ def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[s
 def most_influential(
     influence: Influence, sigmas: Mapping[str, float], count: int
 ) -> tuple[InfluentialMeasurement, ...]:
-    """The measurements that move a number most, in its sigmas, each with that number.
+    """The measurements with the largest influence on a number, in sigmas, each with the number's name.
 
     A measurement with the right side b, minus its whitened residuals, moves the numbers by its columns of L times b; at
     the minimum all of these and the priors' are in balance. Rejected measurements have no influence.
@@ -216,7 +216,7 @@ def most_influential(
 
 
 def autocorrelation(whitened: Array, shown: float = CORRELATED) -> Array:
-    """Autocorrelation (K,) of residuals (n, r) at the lags 1 ... K, until it has died out; empty if they are white.
+    """Autocorrelation (K,) of residuals (n, r) at lags 1 ... K, up to where it vanishes; empty if white.
 
     Its means over the lags 1, 2 to 3, 4 to 7 and so on: what is faint and long shows in no lag alone, and widens most.
     One of them is `shown` sigmas above zero.
@@ -245,7 +245,7 @@ def autocorrelation(whitened: Array, shown: float = CORRELATED) -> Array:
 
 @dataclass(frozen=True)
 class ColouredNoise:
-    """Noise of n measurements in a row, of which a share is correlated by exp(-lag / length).
+    """Noise of n consecutive measurements: a white share, and one with correlation exp(-lag / length).
 
     Attributes:
         share: of the variance that is correlated.
@@ -261,7 +261,7 @@ class ColouredNoise:
 
     @classmethod
     def fitted(cls, whitened: Array, basis: Array, redundancy: float, together: float) -> ColouredNoise:
-        """The noise of largest restricted likelihood.
+        """Fit coloured noise to residuals (n, r) by restricted maximum likelihood.
 
         Args:
             whitened: residuals (n, r), in time order; each column is a noise of its own.
@@ -290,7 +290,7 @@ class ColouredNoise:
 
     @property
     def correlation(self) -> Array:
-        """Autocorrelation (K,) at the lags 1 ... K, until it is gone."""
+        """Autocorrelation (K,) of the noise at lags 1 ... K, up to where it vanishes."""
         return np.asarray(self.share * np.exp(-np.arange(1.0, _LONGEST_LAG * self.length + 2.0) / self.length))
 
     @property
@@ -301,7 +301,7 @@ class ColouredNoise:
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Residuals, and what a fit absorbs of them, by frequency: V is diagonal there, but for its ends.
+    """Banded cosine spectrum of residuals and of the basis a fit absorbs, where V is nearly diagonal.
 
     Attributes:
         cosine: (b,) of the frequency, of bands in which the spectrum is even.
@@ -317,7 +317,7 @@ class _Spectrum:
 
     @classmethod
     def of(cls, whitened: Array, basis: Array) -> _Spectrum:
-        """Cosine transforms of residuals (n, r) and of a basis (n, r, m)."""
+        """Sum the cosine transforms of residuals (n, r) and of a basis (n, r, m) over frequency bands."""
         from scipy.fft import dct
 
         rows = dct(np.concatenate([whitened[..., None], basis], axis=2), axis=0, norm="ortho")
@@ -330,7 +330,7 @@ class _Spectrum:
         return cls(np.cos(np.pi * middle / n), np.diff(edges).astype(float), products, whitened.shape)
 
     def likelihood(self, share: float, length: float) -> tuple[float, float]:
-        """-2 log L and q of coloured noise, see the module."""
+        """Restricted -2 log L and weighted square q of coloured noise, by share and correlation length."""
         a, (n, r) = float(np.exp(-1.0 / length)), self.size
         power = 1.0 - share + share * (1.0 - a**2) / (1.0 + a**2 - 2.0 * a * self.cosine)
         sums = np.tensordot(1.0 / power, self.products, axes=1)
@@ -342,7 +342,7 @@ class _Spectrum:
 
 
 def autocorrelations(engine: Linearization, values: Values, fitted: int) -> dict[str, Array]:
-    """Family of measurements -> autocorrelation of its residuals where their noise may be coloured.
+    """Autocorrelation of each family's residuals, for families whose noise may be coloured.
 
     It may where they are so few that what `fitted` numbers absorb of them hides it.
     """
@@ -360,7 +360,7 @@ def autocorrelations(engine: Linearization, values: Values, fitted: int) -> dict
 def coloured_noises(
     influence: Influence, correlations: Mapping[str, Array], squares: Mapping[str, tuple[float, float]]
 ) -> dict[str, ColouredNoise]:
-    """Family of measurements -> its noise where that is coloured.
+    """Fitted coloured noise of each family of measurements whose residuals are not white.
 
     Args:
         influence: of the residuals.
@@ -378,7 +378,7 @@ def coloured_noises(
 
 
 def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) -> dict[str, Array]:
-    """Family -> covariance (m, m) that its coloured noise adds to the numbers, negative in no direction.
+    """Positive semidefinite covariance (m, m) that each family's coloured noise adds to the numbers.
 
     Residuals of variance v and correlation I + T leave the covariance v L'(I + T) L instead of the L'L of white ones.
 
@@ -405,17 +405,17 @@ def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) 
 
 
 def _residuals(groups: Sequence[Group], values: Values) -> Array:
-    """Weighted residuals (n, r) of the measurements of several groups that count, in time order."""
+    """Weighted residuals (n, r) of the inliers of several groups, in time order."""
     return np.concatenate([g.weighted(g.evaluate(values)[0]) for g in groups])[_used_in_time(groups, values)]
 
 
 def _influences(influence: Influence, family: str, noise: bool = True) -> tuple[Array, Array]:
-    """L (n, r, m) of a family's measurements that count, in time order, and minus their weighted residuals (n, r).
+    """Influences L (n, r, m) and negative weighted residuals (n, r) of a family's inliers, in time order.
 
     Args:
         influence: of the residuals.
         family: of measurements.
-        noise: at the measurements; False: at those without their noise.
+        noise: whether L is linearised at the measurements as they are; False: at noise-free ones.
     """
     groups, values = influence.at.engine.measured[family], influence.at.values
     found = [influence.rows(group if noise else group.without_noise(values)) for group in groups]
@@ -424,7 +424,7 @@ def _influences(influence: Influence, family: str, noise: bool = True) -> tuple[
 
 
 def _basis(influence: Influence, family: str) -> Array:
-    """Orthonormal basis (n, r, k) of what the numbers move the residuals of a family by, if measured without noise."""
+    """Orthonormal basis (n, r, k) of the changes of noise-free residuals of a family that the numbers cause."""
     L, _ = _influences(influence, family, noise=False)
     flat = (L / influence.reported.scale).reshape(-1, L.shape[2])
     squares, axes = np.linalg.eigh(flat.T @ flat)
@@ -433,7 +433,7 @@ def _basis(influence: Influence, family: str) -> Array:
 
 
 def variance_shares(posterior: Posterior) -> dict[str, Array]:
-    """Family of measurements -> its share (m, m) of the covariance of the free numbers.
+    """Share (m, m) of the covariance of the free numbers that white noise of each family causes.
 
     With C the covariance of the strong directions and L'L the part of it that white noise of a family causes, both in
     units of the priors, and symmetric roots, it is C^-1/2 L'L C^-1/2.
@@ -476,7 +476,7 @@ def _correlated(L: Array, correlation: Array) -> Array:
 
 
 def ratio_by_blocks(time: Array, moves: Array, expected: Array) -> Array:
-    """Ratio (m,) of sigmas of numbers by blocks of a recording to those expected; ones where none is certainly above.
+    """Ratio (m,) of block-wise to expected sigmas of the numbers; ones if none is significantly above 1.
 
     Args:
         time: (n,) s, in order.
@@ -501,14 +501,14 @@ def _used_in_time(groups: Sequence[Group], values: Values) -> NDArray[np.intp]:
 
 
 def _lagged(whitened: Array, lags: int) -> Array:
-    """Sums (lags,) over residuals (n, r) times themselves, 0 ... lags - 1 measurements later."""
+    """Sums (lags,) of products of residuals (n, r) at lags 0 ... lags - 1, by FFT."""
     size = 1 << (2 * len(whitened) - 1).bit_length()
     power = (np.abs(np.fft.rfft(whitened, size, axis=0)) ** 2).sum(axis=1)
     return np.asarray(np.fft.irfft(power, size)[: min(lags, len(whitened))])
 
 
 def certain_ratio(blocks: int) -> float:
-    """Ratio of sigmas by blocks of a recording beyond which it is certainly above 1: by three of its own sigmas.
+    """Ratio of block-wise to expected sigmas that is significantly above 1: by three of its own sigmas.
 
     These are 1 / sqrt(2 n) for n blocks.
     """
@@ -516,5 +516,5 @@ def certain_ratio(blocks: int) -> float:
 
 
 def sigma_ratio(variance: Array, grown: Array) -> Array:
-    """Ratio of the sigmas of grown variances to those of variances, (n,); 1 for fixed numbers."""
+    """Ratio (n,) of inflated to nominal sigmas, from the variances; 1 for fixed numbers."""
     return np.sqrt(np.divide(grown, variance, out=np.ones_like(variance), where=variance > 0.0))

@@ -42,7 +42,7 @@ _SIGMAS = np.append(0.0, np.geomspace(1e-2, 1e3, 500))
 
 
 def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -> Estimate:
-    """The estimate with the errors that measurements have by where they are made, if they have any.
+    """Test for systematic errors by position and, if significant, re-estimate with their map.
 
     Args:
         problem: as it was solved, without a map.
@@ -67,7 +67,7 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
 
 
 def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float) -> Estimate:
-    """The solution with the map free, its prior as wide as the map.
+    """Re-estimate with the error map as free parameters, its prior at least as wide as the map's rms.
 
     Directions that are weak `without` the map keep their values.
     """
@@ -109,7 +109,7 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
 
 
 def _along_strong(gain: Array, names: Sequence[str], posterior: Posterior) -> Array:
-    """Moves (n, k) of numbers without their part along weak directions, which stay at their priors."""
+    """Project moves (n, k) of the numbers on the strong directions; weak ones stay at their priors."""
     reported, weak = posterior.reported, posterior.directions.weak
     if not weak.shape[1]:
         return gain
@@ -120,7 +120,7 @@ def _along_strong(gain: Array, names: Sequence[str], posterior: Posterior) -> Ar
 
 
 def _solved(problem: Problem, error_map: ErrorMap, estimate: Estimate) -> tuple[Compiled, Solution, SqrtInformation]:
-    """The minimum with the map free, and what it says without the map's prior.
+    """Minimise with the error map free; return the minimum and its information without the map's prior.
 
     Noise levels that contain the map would make it smaller, and are found anew.
     """
@@ -134,7 +134,7 @@ def _own(information: SqrtInformation, error_map: ErrorMap) -> NDArray[np.bool_]
 
 
 def _rows(information: SqrtInformation, error_map: ErrorMap) -> tuple[Array, Array]:
-    """R and right side about the map's numbers from 0 on, these last, and the rows about them alone."""
+    """Triangle [others | map | right side], the map's right side about zero, and its block about the map alone."""
     own = _own(information, error_map)
     right = information.d + information.R[:, own] @ information.at[own]
     rows = np.column_stack([information.R[:, ~own], information.R[:, own], right])
@@ -163,7 +163,7 @@ def _with_history(estimate: Estimate, compiled: Compiled, posterior: Posterior, 
 
 
 def _tested(root: Array, error_map: ErrorMap, ratio: float) -> tuple[float, int, float]:
-    """Chi-square, its degrees of freedom, and the most likely rms of a map with R, d (k + 1, k + 1)."""
+    """Chi-square, degrees of freedom and most likely rms of an error map with rows [R | d] (k + 1, k + 1)."""
     U, sizes, _ = np.linalg.svd(root[:-1, :-1] * error_map.prior)
     squares, seen = np.square(U.T @ root[:-1, -1] / ratio), sizes > 1.0
     variances = 1.0 + np.square(_SIGMAS[:, None] * sizes / ratio)
@@ -173,7 +173,7 @@ def _tested(root: Array, error_map: ErrorMap, ratio: float) -> tuple[float, int,
 
 
 def _mapped(engine: Linearization, values: Values, error_map: ErrorMap) -> tuple[Linearization, Values]:
-    """The linearisation with the numbers of a map as its last shared unknowns, without a prior, and these 0."""
+    """Add an error map to a linearisation as its last shared unknowns, at 0 and without a prior."""
     (_, d, _, c, s), k = engine.layout.sizes, len(error_map.names)
     layout, values, at = engine.layout.with_shared(values, k, np.zeros(k))
     begin = {"state": d + c + s, "pair": 2 * d + c + s, "walk": 2 * c + s, "shared": s}

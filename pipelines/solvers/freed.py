@@ -21,7 +21,7 @@ _STEPS = 3
 
 
 def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | None:
-    """Square-root information of a graph about the solution of another one, in which some numbers were fixed.
+    """Square-root information of a graph about the solution of another one that had some numbers fixed.
 
     Arguments as of `at_solution`; None where the graph does not determine its states.
     """
@@ -32,7 +32,7 @@ def freed_information(freed: Problem, estimate: Estimate) -> SqrtInformation | N
 
 
 def at_solution(freed: Problem, estimate: Estimate) -> tuple[Compiled, Linearization, Values]:
-    """A graph at the solution of another one, in which some numbers were fixed: compiled, its engine, all values.
+    """Compile a graph and linearise it at the solution of another one that had some numbers fixed.
 
     Noise levels and rejected measurements are the solution's. Levels that a misfit has raised hide its cause: where
     they maximise the likelihood they are found anew.
@@ -59,7 +59,7 @@ def at_solution(freed: Problem, estimate: Estimate) -> tuple[Compiled, Lineariza
 
 
 def _used(groups: Sequence[Group], estimate: Estimate) -> list[Mask]:
-    """Inlier mask (n,) of each group in the solution; all where it has other measurements of the family."""
+    """Inlier mask (n,) of each group in an estimate; all True where the family's measurements differ."""
     used = [np.ones(len(group.model.time), dtype=bool) for group in groups]
     for family, known in estimate.residuals.items():
         own = [i for i, group in enumerate(groups) if group.family == family and group.is_measurement]

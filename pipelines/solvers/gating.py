@@ -46,7 +46,7 @@ class RowBuffer:
 
     @property
     def array(self) -> Array:
-        """The rows (n, width), a view that the next row may make stale."""
+        """The rows (n, width) as a view, valid until the next row is added."""
         return self._array[: self._count]
 
     def add(self, rows: Array) -> None:
@@ -76,7 +76,7 @@ def binomial_tail(rejected: int, count: int, share: float) -> float:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The new variables of a step as its processes predict them from the old ones.
+    """Predicted distribution of a step's new variables, by its processes from the old ones.
 
     Attributes:
         smoother: holds the old variables.
@@ -119,7 +119,7 @@ class Prediction:
 
 @dataclass
 class InnovationGate:
-    """The innovations of a run, and which measurements were used.
+    """Innovations of a run by family, with the inlier mask of the measurements.
 
     Attributes:
         families: family -> rows of time, 1 if used, and the innovation whitened by its own covariance, whose norm
@@ -183,21 +183,21 @@ class InnovationGate:
         return np.asarray(used)
 
     def record(self, factor: Factor, whitened: Array, used: NDArray[np.bool_]) -> None:
-        """Add the innovations (n, m) of a measurement."""
+        """Append the innovations (n, m) of a measurement to its family."""
         assert factor.measurement is not None
         time = factor.measurement.model.time
         rows = self.families.setdefault(factor.family, RowBuffer())
         rows.add(np.column_stack([time, used, whitened.reshape(len(time), -1)]))
 
     def adopt(self, residuals: Mapping[str, Residuals]) -> None:
-        """Take the residuals of a solution as the innovations so far, and its inliers."""
+        """Replace the innovations and inlier masks by the residuals and inliers of a solution."""
         self.families = {
             family: RowBuffer(np.column_stack([found.time, found.used, found.whitened]))
             for family, found in residuals.items()
         }
 
     def chi_square(self) -> ChiSquare:
-        """The sum of the squared innovations of the measurements used."""
+        """Sum of squared innovations over the inliers."""
         families = {}
         for family, rows in self.families.items():
             used = rows.array[rows.array[:, 1] > 0.0, 2:]
@@ -205,14 +205,14 @@ class InnovationGate:
         return ChiSquare(sum(v for v, _ in families.values()), sum(d for _, d in families.values()), families)
 
     def residuals(self) -> dict[str, Residuals]:
-        """Family -> the innovations."""
+        """Innovations of each family, as residuals."""
         return {
             family: Residuals(rows.array[:, 0].copy(), rows.array[:, 2:].copy(), rows.array[:, 1] > 0.0)
             for family, rows in self.families.items()
         }
 
     def correlation_lengths(self) -> dict[str, float]:
-        """Family -> how many innovations in a row count as one, of those whose innovations are correlated in time."""
+        """Number of consecutive innovations that count as one, by family, for correlated families."""
         found = {
             family: autocorrelation(np.where(each.used[:, None], each.whitened, 0.0))
             for family, each in self.residuals().items()
@@ -220,9 +220,9 @@ class InnovationGate:
         return {family: 1.0 + 2.0 * float(lags.sum()) for family, lags in found.items() if len(lags)}
 
     def rejected(self) -> dict[str, int]:
-        """Family -> number of measurements left out."""
+        """Number of rejected measurements of each family."""
         return {family: rejected + self.unusable.get(family, 0) for family, (_, rejected) in self._counts().items()}
 
     def _counts(self) -> dict[str, tuple[int, int]]:
-        """Family -> number of measurements, and of those rejected."""
+        """Number of measurements and number of rejected ones, by family."""
         return {family: (len(rows), int((rows.array[:, 1] == 0.0).sum())) for family, rows in self.families.items()}

@@ -27,7 +27,7 @@ from alidade.pipelines.solvers.layout import Layout
 def _factors(
     layout: Layout, at: Sequence[Index], right: Array, jacobians: Sequence[Array]
 ) -> list[gtsam.GaussianFactor]:
-    """The rows of a group: one factor if all are about the same variables, else one a measurement."""
+    """Convert a group's rows to Gaussian factors: one if all have the same variables, else one per measurement."""
     n, m = right.shape
     if all(len(each) == 1 for each in at):
         columns = [np.broadcast_to(J, (n, *J.shape[1:])).reshape(n * m, -1) for J in jacobians]
@@ -38,7 +38,7 @@ def _factors(
 
 
 def _factor(keys: Sequence[int], blocks: Sequence[Array], right: Array) -> gtsam.JacobianFactor:
-    """Rows [A | b]; blocks of a variable that is there twice add up."""
+    """Build a Gaussian factor from rows [A | b]; blocks of a repeated variable add up."""
     summed: dict[int, Array] = {}
     for key, block in zip(keys, blocks, strict=True):
         summed[key] = summed[key] + block if key in summed else block
@@ -62,7 +62,7 @@ class GtsamSystem:
 
     @classmethod
     def of(cls, layout: Layout, groups: Iterable[tuple[Sequence[Index], Array, Sequence[Array]]]) -> GtsamSystem:
-        """The system of groups of rows.
+        """Build the system from groups of rows.
 
         Args:
             layout: of the variables.
@@ -109,7 +109,7 @@ class GtsamSystem:
         return found
 
     def _minimum(self, graph: gtsam.GaussianFactorGraph, found: GtsamFactorization) -> float:
-        """Sum of squares at the solution; where there is none, what the rows of R leave of it."""
+        """Sum of squares at the solution, or what elimination leaves of it if R is singular."""
         try:
             last = np.asarray(np.linalg.solve(found.root[:-1, :-1], found.root[:-1, -1:]), dtype=float)
             moves = found.moves(last, 1.0, None)
@@ -137,7 +137,7 @@ class GtsamSystem:
 
 
 def undetermined(error: RuntimeError) -> IndeterminateStateError:
-    """Error for gtsam's text about an indeterminate system, with the name of the state nearby."""
+    """Convert gtsam's indeterminate-system text to an error that names the state nearby."""
     found = re.search(r"Symbol: (\w+)", str(error))
     return IndeterminateStateError(UNDETERMINED.replace("a state", f"state {found[1]}") if found else UNDETERMINED)
 
@@ -178,7 +178,7 @@ class _Conditional:
 
 @dataclass(frozen=True, eq=False)
 class GtsamFactorization(Factorization):
-    """R of a system that gtsam eliminated."""
+    """R of a linear system that gtsam eliminates."""
 
     layout: Layout
     c: int
@@ -187,11 +187,11 @@ class GtsamFactorization(Factorization):
 
     @property
     def explained(self) -> float:
-        """Decrease of the sum of squares by the solution."""
+        """Decrease of the sum of squares from a zero step to the solution."""
         return sum(float(np.square(d).sum()) for d in (self.root[:-1, -1], *(each.d for each in self._conditionals)))
 
     def moves(self, last: Array, right: float, generator: np.random.Generator | None) -> dict[int, Array]:
-        """Moves (dim, n) of all variables, by position, for those of the last node and the shared unknowns."""
+        """Moves (dim, n) of each variable, by position, that follow from the last node and the shared unknowns."""
         layout, found, J = self.layout, dict[int, Array](), self.layout.sizes[2]
         for at in np.flatnonzero((layout.keyframe < 0) & ((layout.node <= 0) | (layout.node == J - 1))).tolist():
             found[at] = layout.root_columns(int(layout.key[at])) @ last

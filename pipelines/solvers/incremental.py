@@ -108,7 +108,7 @@ def solve_incremental(problem: Problem, window: Window = DEFAULT_WINDOW) -> Esti
 
 
 class IncrementalSolver:
-    """One pass of a smoother through the steps.
+    """Incremental solver: batch solutions in the initialisation phase, then one pass of a smoother.
 
     Attributes:
         problem: the graph, or a later one of the same recording, grown: the steps added are among its own.
@@ -137,7 +137,7 @@ class IncrementalSolver:
 
     @classmethod
     def resumed(cls, problem: Problem, saved: RunState) -> IncrementalSolver:
-        """A run that continues from a saved one."""
+        """Continue a saved run."""
         assert saved.marginal is not None
         solver = cls(problem, saved.window)
         solver.state, solver.initialising = saved, False
@@ -147,7 +147,7 @@ class IncrementalSolver:
 
     @property
     def can_checkpoint(self) -> bool:
-        """Whether the run is at a point where it can be saved."""
+        """Whether the state can be saved now: its past is marginalised out and no step was added since."""
         return self.state.marginal is not None and not self.steps_since
 
     @property
@@ -164,11 +164,11 @@ class IncrementalSolver:
 
     @property
     def keys(self) -> list[int]:
-        """The variables that hold the parameters now."""
+        """Keys of the variables that hold the parameters after the last step."""
         return [self.state.current_keys.get(p.key, p.key) for p in self.problem.parameters]
 
     def add_step(self, step: Step) -> None:
-        """Add a step. Raises as solve_incremental does; the solver cannot be used any more then."""
+        """Add a step. Raises as solve_incremental does, and the solver is unusable afterwards."""
         state = self.state
         state.walked.update(key for key, held in step.current_keys.items() if state.current_keys.get(key, held) != held)
         state.current_keys.update(step.current_keys)
@@ -191,11 +191,11 @@ class IncrementalSolver:
     # -- what is reported
 
     def values(self) -> Array:
-        """The reported numbers (n,) now, weak directions at their priors."""
+        """Reported numbers (n,) after the last step, weak directions at their priors."""
         return self._constrained()[0]
 
     def covariance(self) -> Array:
-        """Joint covariance (n, n) of `values`."""
+        """Joint covariance (n, n) of the reported numbers after the last step."""
         return self._constrained()[1]
 
     def posterior_history(self) -> PosteriorHistory | None:
@@ -218,12 +218,12 @@ class IncrementalSolver:
         )
 
     def chi_square(self) -> ChiSquare:
-        """Squared residuals of the last batch solution, after the initialisation phase squared innovations."""
+        """Sum of squared residuals of the last batch solution; after initialisation, of squared innovations."""
         found = self.estimate().chi_square if self.initialising else None
         return self.state.gate.chi_square() if found is None else found
 
     def finish(self, seconds: float) -> Estimate:
-        """The estimate after the last step, as batch has it. More steps may follow."""
+        """Return the final estimate, as the batch solver reports it; more steps may follow."""
         if self.initialising and len(self.steps_since) > self._of[0]:
             self._solve_batch()  # which may end the initialisation phase
         if self.initialising:
@@ -231,7 +231,7 @@ class IncrementalSolver:
         return replace(self.estimate(), seconds={"solve": seconds})
 
     def estimate(self) -> Estimate:
-        """The estimate now. Raises IndeterminateError when it is no finite number."""
+        """Return the estimate after the last step. Raises IndeterminateError if a value is not finite."""
         if not self.initialising:
             return self._filtered()
         if self._estimate is None:
@@ -240,7 +240,7 @@ class IncrementalSolver:
         return self._estimate
 
     def _estimate_of(self, solved: Solved) -> Estimate:
-        """Everything that is reported of a batch solution, with what was known over time."""
+        """Return the estimate of a batch solution, with the run's history and rejected measurements."""
         estimate = whole_estimate(solved)
         return replace(
             estimate,
@@ -251,13 +251,13 @@ class IncrementalSolver:
         )
 
     def _history(self, inflation: Array | None) -> History:
-        """What was known over time, with sigmas (n,) times as wide."""
+        """Return values and sigmas at the steps so far, the sigmas inflated by factors (n,)."""
         rows, n = self.state.history.array.copy(), len(self.problem.quantities)
         history = History(rows[:, 0], rows[:, 1 : 1 + n], rows[:, 1 + n :])
         return history if inflation is None else history.inflated(inflation)
 
     def _filtered(self) -> Estimate:
-        """The estimate of the smoother."""
+        """Return the estimate of the smoother, with its history and residuals."""
         reported, directions = self._smoothed()
         values, covariance = reported.numbers, reported.covariance(directions.covariance())
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
@@ -293,7 +293,7 @@ class IncrementalSolver:
         return self._solved
 
     def _posterior_of(self, solved: Solved) -> Posterior:
-        """The posterior of a batch solution; at its prior while outliers may be the majority of a family.
+        """Posterior of a batch solution; at the prior while outliers may be the majority of a family.
 
         So are numbers for which second order does not go far enough yet.
         """
@@ -301,7 +301,7 @@ class IncrementalSolver:
         return at_prior(solved.posterior, self._beyond[solved.posterior.reported.free] | is_undecided)
 
     def _constrained(self) -> tuple[Array, Array]:
-        """Values (n,) and covariance (n, n) of the reported numbers, weak directions at their priors.
+        """Return values (n,) and covariance (n, n) of the reported numbers, weak directions at their priors.
 
         Raises:
             IndeterminateError: the smoother's covariance is singular.
@@ -313,14 +313,14 @@ class IncrementalSolver:
         return reported.numbers, reported.covariance(directions.covariance())
 
     def _smoothed(self) -> tuple[Reported, WeakDirections]:
-        """The numbers of the smoother, weak directions at their priors, and the directions of their covariance."""
+        """Return the smoother's reported numbers, weak directions at their priors, and those directions."""
         reported = self._reported()
         variances, axes = np.linalg.eigh(self._smoothed_covariance(reported))
         R = axes.T / np.sqrt(np.clip(variances, _LEAST_VARIANCE, WIDEST**2))[:, None]
         return constrained(reported, R, np.zeros(len(R)))
 
     def _smoothed_covariance(self, reported: Reported) -> Array:
-        """The smoother's covariance (m, m) of the free reported numbers, in units of their usual priors' sigmas."""
+        """Covariance (m, m) of the smoother's free reported numbers, in units of their default prior sigmas."""
         assert self._smoother is not None
         J = reported.jacobian[reported.free] / reported.scale[:, None]
         try:
@@ -332,7 +332,7 @@ class IncrementalSolver:
         return np.asarray(covariance)
 
     def _reported(self) -> Reported:
-        """The reported numbers of the smoother, with their Jacobian by the tangents of the variables that hold them."""
+        """Return the smoother's reported numbers, with their Jacobian by the tangents of the parameters' variables."""
         assert self._smoother is not None
         values, keys = self._smoother.estimate(), self.keys
         dims = values.dims()  # made anew of all variables at every call
@@ -361,7 +361,7 @@ class IncrementalSolver:
         self._record()
 
     def _selected(self, smoother: Smoother, step: Step, about: gtsam.Values, new: gtsam.Values) -> list[Factor]:
-        """The processes of a step and the measurements used, for a window linear about the values."""
+        """Return the processes and the inlier measurements of a step, linearised if the smoother has a window."""
         factors = weigh(step.factors, self.state.levels)
         require_known_variables(factors, about, step.time)
         processes = [f for f in factors if f.measurement is None]
@@ -380,7 +380,7 @@ class IncrementalSolver:
         return processes + measurements
 
     def _ages(self, timestamps: Mapping[int, float]) -> dict[int, float]:
-        """Times of last use, s, in the window's unit: the number of the keyframe, or as they are."""
+        """Convert times of last use, s, to the window's unit: keyframe numbers, or s unchanged."""
         if not isinstance(self.state.window, Keyframes):
             return dict(timestamps)
         number = self._before + np.searchsorted(self._times, list(timestamps.values()))
@@ -390,7 +390,7 @@ class IncrementalSolver:
         self.state.attitudes.add(np.column_stack([attitudes.time, attitudes.wxyz]))
 
     def _record(self) -> None:
-        """Add the estimate now to the history, and after the initialisation phase to the moments."""
+        """Append the current estimate to the history and, after the initialisation phase, to the moments."""
         if not len(self.state.history) or self.time - self.state.history.array[-1, 0] >= 1.0 / _HISTORY_RATE:
             numbers, covariance = self._constrained()
             self.state.history.add(np.concatenate([[self.time], numbers, np.sqrt(np.diag(covariance))])[None])
@@ -403,7 +403,7 @@ class IncrementalSolver:
     # -- batch solutions
 
     def _solve_batch(self) -> None:
-        """Solve everything since the marginal in batch; once that is linear enough, start the smoother from it."""
+        """Solve all steps since the marginal in batch; if the result is linear enough, start the smoother."""
         solved = self._batch_solution(self._all_steps_since())
         if self.state.marginal is None:
             self.state.gate.adopt(residuals_by_family(solved.engine, solved.solution.values))
@@ -436,14 +436,14 @@ class IncrementalSolver:
         self._record()
 
     def _is_linear(self, solved: Solved) -> bool:
-        """Whether a smoother can continue from a solution: no weak direction, a small share of second order."""
+        """Whether a smoother can continue from a solution: no weak direction, little second-order variance."""
         if self.state.trouble or len(self.steps_since) < MIN_STEPS or self.state.gate.too_few_to_decide():
             return False
         posterior = solved.posterior
         return not posterior.directions.weak.shape[1] and posterior.second_order_share() < _MAX_CURVATURE
 
     def _all_steps_since(self) -> list[Step]:
-        """The steps since the marginal, the marginal as the first of them."""
+        """Return the steps since the marginal, preceded by a step that holds the marginal itself."""
         if self.state.marginal is None:
             return self.steps_since
         start = Step(self.state.marginal.time, self.state.marginal.estimate, [self.state.marginal.factor])
@@ -451,7 +451,7 @@ class IncrementalSolver:
         return [start, *self.steps_since]
 
     def _batch_solution(self, steps: Sequence[Step]) -> Solved:
-        """The most probable values of some steps; noise levels are estimated until something was marginalised out.
+        """Solve some steps robustly in batch; noise levels are estimated until a marginal exists.
 
         Raises:
             InputError: a factor gives no finite numbers.
@@ -471,7 +471,7 @@ class IncrementalSolver:
         return solved
 
     def _finite(self, steps: Sequence[Step], values: gtsam.Values) -> list[Step]:
-        """The steps without measurements that give no finite numbers at the values; these are counted.
+        """Remove and count the measurements of steps whose residuals at the values are not finite.
 
         Raises:
             InputError: another factor gives none, or a measurement before the first solution.
@@ -485,7 +485,7 @@ class IncrementalSolver:
         return list(steps)
 
     def _start_from(self, solved: Solved) -> None:
-        """Start the smoother from a solution: from its active variables alone, or without a window from all of it."""
+        """Start the smoother from a batch solution: from its active variables, or without a window from all."""
         values = solved.compiled.layout.to_gtsam(solved.solution.values)
         stamps = self._ages({key: time for step in self.steps_since for key, time in step.timestamps.items()})
         if self.state.marginal is not None:
@@ -501,7 +501,7 @@ class IncrementalSolver:
         self._continue_from(MarginalState.of(self.time, system.graph, values, active_variables(values, stamps), stamps))
 
     def _continue_from(self, state: MarginalState) -> None:
-        """Continue from a Gaussian alone."""
+        """Restart the smoother from a marginal as the only information."""
         self.state.marginal, self._outdated, self.steps_since = state, self.steps_since, []
         self._start([state.factor], state.estimate, state.stamps)
 

@@ -39,7 +39,7 @@ Unknown = tuple[str, int | None]
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A recording with its own numbers eliminated: R y = d of the device's, S y + T z = e of its own z beside them.
+    """A recording's square-root information, R y = d on the device's numbers y, S y + T z = e on its own z.
 
     Attributes:
         names: (n,) of the device's numbers.
@@ -60,7 +60,7 @@ class Part:
 
     @classmethod
     def of(cls, sqrt_info: SqrtInformation, device: Mapping[str, float]) -> Part:
-        """y and z are the numbers themselves, not steps from an estimate."""
+        """Eliminate a recording's own numbers from its information; y and z are absolute, no steps."""
         shared = [i for i, name in enumerate(sqrt_info.names) if name in device]
         own = [i for i, name in enumerate(sqrt_info.names) if name not in device]
         n, scales = len(own), sqrt_info.scales[shared]
@@ -100,20 +100,20 @@ class Joined:
     covariance: Array
 
     def device(self, recording: int) -> GaussianPrior:
-        """The device's numbers as they are in a recording."""
+        """Posterior of the device's numbers as of one recording."""
         return self._gaussian_prior(recording, self.values, self.covariance)
 
     def others(self, recording: int) -> GaussianPrior:
-        """Prior of one recording: information of all other recordings and the device's priors."""
+        """Prior for one recording from all other recordings and the device's priors."""
         rows = [each for i, each in enumerate(self.rows) if i != recording]
         return self._gaussian_prior(recording, *_solved(rows, self.scales))
 
     def own(self, recording: int) -> GaussianPrior:
-        """A recording's own numbers, from all recordings."""
+        """Posterior of a recording's own numbers, by the joint estimate."""
         return self.all(recording).of(self.parts[recording].own)
 
     def all(self, recording: int) -> GaussianPrior:
-        """The device's numbers as they are in a recording, those that only others know as they were last, its own."""
+        """Posterior of all numbers as of a recording: the device's, known or last known, and the recording's own."""
         part = self.parts[recording]
         names, gain, inverse = self._of_unknowns(recording)
         covariance, mean = gain @ self.covariance @ gain.T, gain @ self.values
@@ -123,7 +123,7 @@ class Joined:
         return GaussianPrior(names, mean, covariance)
 
     def budget(self, recording: int, recordings: Sequence[str]) -> dict[str, dict[str, float]]:
-        """Number of `all` -> source -> its share of the number's variance, the largest first; shares sum to one.
+        """Error budget of the numbers of `all`: each source's share of the variance, the largest first; sums to one.
 
         Sources are the recordings (what each says, with its own numbers' priors), every prior of the device by itself
         ("prior of NAME"; "prior" of several together), and the walk between recordings.
@@ -149,7 +149,7 @@ class Joined:
         }
 
     def _of_unknowns(self, recording: int) -> tuple[tuple[str, ...], Array, Array]:
-        """Numbers of `all`, (k,), what each gets of the unknowns, (k, n), and its own of its rows, (m, m)."""
+        """Names (k,) of the numbers of `all`, their gain (k, n) by the unknowns, and own inverse root T^-1 (m, m)."""
         part = self.parts[recording]
         latest = {name: i for i, (name, _) in enumerate(self.unknowns)}
         missing = [name for name in latest if name not in part.names]
@@ -159,7 +159,7 @@ class Joined:
         return (*part.names, *missing, *part.own), gain, np.asarray(inverse)
 
     def _priors(self, A: Array) -> list[str]:
-        """Names of the numbers that each row of the priors is about."""
+        """Source label of each prior row: "prior of NAME", or "prior" where a row has several numbers."""
         size = np.abs(A * self.scales)
         about = [np.flatnonzero(row > _ROUNDING * row.max(initial=0.0)) for row in size]
         return [f"prior of {self.unknowns[k[0]][0]}" if len(k) == 1 else "prior" for k in about]
@@ -172,16 +172,16 @@ class Joined:
 
     @property
     def walking(self) -> tuple[str, ...]:
-        """Names of the device's numbers that walk."""
+        """Names of the device's numbers that change from recording to recording as a random walk."""
         return tuple(dict.fromkeys(name for name, recording in self.unknowns if recording is not None))
 
     def sigmas_to(self, other: Joined) -> float:
-        """The largest difference of two joint estimates of the same unknowns, in the sigmas of this one."""
+        """Largest difference from another joint estimate of the same unknowns, in this one's sigmas."""
         return float(np.max(np.abs(other.values - self.values) / np.sqrt(np.diag(self.covariance)), initial=0.0))
 
     @property
     def disagreement(self) -> tuple[float, int]:
-        """Chi-square of what the recordings say of the device beside each other, priors apart, and its freedoms."""
+        """Chi-square of the recordings' residuals about a common device, without priors, and its degrees of freedom."""
         A, b = (np.concatenate(each) for each in zip(*self.rows[:-1], strict=True))
         u, s, _ = np.linalg.svd(A * self.scales, full_matrices=False)
         fitted = u[:, s > 1.0 / _FAINT]
@@ -195,14 +195,14 @@ class Joined:
         )
 
     def _places(self, recording: int) -> list[int]:
-        """Positions of the device's numbers among a recording's."""
+        """Positions among the unknowns of the device's numbers as of a recording."""
         places = {unknown: i for i, unknown in enumerate(self.unknowns)}
         names = self.parts[recording].names
         return [places[name, None] if (name, None) in places else places[name, recording] for name in names]
 
 
 def grown(sigmas: Sequence[float], inflations: Sequence[float]) -> float:
-    """Inflation of a joint sigma: the recordings' own factors, weighted by their information about the number."""
+    """Inflation of a joint sigma: rms of the recordings' inflations, weighted by their information on the number."""
     found = [(sigma, inflation) for sigma, inflation in zip(sigmas, inflations, strict=True) if sigma > 0.0]
     if not found:
         return 1.0
@@ -211,7 +211,7 @@ def grown(sigmas: Sequence[float], inflations: Sequence[float]) -> float:
 
 
 def information_at_levels(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> SqrtInformation:
-    """Square-root information of a problem about its numbers, linear about its solution, at given noise levels.
+    """Square-root information about a problem's numbers, linearised at its solution, for given noise levels.
 
     Raises:
         IndeterminateError: a state is not determined.
@@ -237,7 +237,7 @@ def join(informations: Sequence[SqrtInformation], rates: Mapping[str, float], da
     places = {unknown: k for k, unknown in enumerate(unknowns)}
 
     def spread(R: Array, names: Sequence[str], i: int) -> Array:
-        """Rows about a recording's numbers as rows about the unknowns."""
+        """Map rows about one recording's numbers to columns of the joint unknowns."""
         out = np.zeros((len(R), len(unknowns)))
         for k, name in enumerate(names):
             out[:, places[name, i if rates[name] else None]] = R[:, k]
@@ -250,7 +250,7 @@ def join(informations: Sequence[SqrtInformation], rates: Mapping[str, float], da
 
 
 def _walks(places: Mapping[Unknown, int], rates: Mapping[str, float], days: Sequence[float]) -> tuple[Array, Array]:
-    """Numbers that walk from one recording to the next."""
+    """Random-walk rows [A | 0] between consecutive recordings, for the numbers with a rate."""
     rows = [np.empty((0, len(places)))]
     for name, rate in rates.items():
         for before, after in pairwise([i for i in range(len(days)) if rate and (name, i) in places]):
@@ -267,7 +267,7 @@ def _priors(
     rates: Mapping[str, float],
     spread: Callable[[Array, Sequence[str], int], Array],
 ) -> tuple[Array, Array]:
-    """The device's priors, each as the first recording has it that knows the number."""
+    """Prior rows of the device; a number's prior is that of the first recording that has the number."""
     rows, rights = [], []
     covered: set[str] = set()
     for i, each in enumerate(informations):
@@ -283,7 +283,7 @@ def _priors(
 
 
 def _solved(rows: Sequence[tuple[Array, Array]], scales: Array) -> tuple[Array, Array]:
-    """The unknowns and their covariance."""
+    """Solve stacked rows by least squares; return the unknowns (n,) and their covariance (n, n)."""
     A, b = (np.concatenate(each) for each in zip(*rows, strict=True))
     triangle = np.linalg.qr(np.column_stack([A * scales, b])).R
     n = len(scales)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class NotAChainError(Exception):
-    """A problem's factors are not rows of a chain; says which and why."""
+    """A problem's factors do not form a chain; the message names the factor and the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class Layout:
         return out, Values({block: np.concatenate(each) for block, each in parts.items()})
 
     def at(self, keys: Sequence[int] | Index) -> Index:
-        """Positions of variables among `key`. Raises NotAChainError for one that has no value."""
+        """Positions of the variables with some keys. Raises NotAChainError for a key without a value."""
         wanted = np.asarray(keys, dtype=np.intp)
         found = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
         if (self.key[found] != wanted).any():
@@ -130,17 +130,17 @@ class Layout:
         return found
 
     def size(self, at: int) -> int:
-        """Numbers of the tangent of the variable at a position."""
+        """Tangent dimension of the variable at a position."""
         return dimension(self.blocks[self.block[at]])
 
     def roles(self, columns: Sequence[int | list[int]]) -> tuple[tuple[bool, bool, bool], ...]:
-        """Whether each block of a factor is one variable for all its measurements, whether a state, whether a node."""
+        """Whether each block of a factor is one variable for all measurements, a state, a node: three flags each."""
         at = self.at([column if isinstance(column, int) else column[0] for column in columns])
         of = zip(columns, self.keyframe[at] >= 0, self.node[at] >= 0, strict=True)
         return tuple((isinstance(column, int), bool(state), bool(node)) for column, state, node in of)
 
     def flat(self, some: Index) -> tuple[Index, Index]:
-        """Columns of variables of one kind in (states, nodes, shared, 0) laid flat, twice: of a node b_0 and its own.
+        """Columns of variables of one kind in a flat tangent, twice: of a node's b_0, then of the node's own part.
 
         What is not there is the zero at the end.
         """
@@ -153,13 +153,13 @@ class Layout:
         return one, np.where((self.node[some] > 0)[:, None], at_node, end)
 
     def tangents(self, step: Tangent) -> Array:
-        """A step laid flat, zero at the end: (unknowns + 1, ...)."""
+        """Flatten a step to (unknowns + 1, ...), with a zero at the end for absent parts."""
         tail = step.shared.shape[1:]
         parts = [step.states.reshape(-1, *tail), step.nodes.reshape(-1, *tail), step.shared, np.zeros((1, *tail))]
         return np.concatenate(parts)
 
     def retract(self, values: Values, step: Tangent) -> Values:
-        """Values moved by a step."""
+        """Retract values along a step."""
         flat, moved = self.tangents(step), {}
         for i, block in enumerate(self.blocks):
             some = np.flatnonzero(self.block == i)
@@ -170,12 +170,12 @@ class Layout:
         return Values(moved)
 
     def of_key(self, values: Values, key: int) -> Array:
-        """Value (width,) of the variable with a key."""
+        """Value (width,) of the variable with a given key."""
         (at,) = self.at([key])
         return values.arrays[self.blocks[self.block[at]]][self.row[at]]
 
     def to_gtsam(self, values: Values, keys: Iterable[int] | None = None) -> gtsam.Values:
-        """Values of some variables, or of all."""
+        """Convert the values of some variables, or of all, to gtsam."""
         import gtsam
 
         out = gtsam.Values()
@@ -186,7 +186,7 @@ class Layout:
         return out
 
     def from_gtsam(self, values: gtsam.Values) -> Values:
-        """The values of all variables as gtsam has them."""
+        """Read the values of all variables from gtsam."""
         arrays = {}
         for i, block in enumerate(self.blocks):
             some = np.flatnonzero(self.block == i)
@@ -196,7 +196,7 @@ class Layout:
         return Values(arrays)
 
     def with_shared(self, values: Values, block: Block, value: Array) -> tuple[Layout, Values, int]:
-        """The layout with one more shared variable, the last of its columns, all values, and its position."""
+        """Append a shared variable; return the layout, the values with it, and its position."""
         known = values.arrays.get(block, np.empty((0, width(block))))
         blocks = self.blocks if block in self.blocks else (*self.blocks, block)
         numbers = {
@@ -215,7 +215,7 @@ class Layout:
         return replace(self, **grown, blocks=blocks, sizes=sizes), Values(arrays), len(self.key)
 
     def root_columns(self, key: int) -> Array:
-        """Columns (d, c + s) by which a variable's tangent follows from the last node and the shared unknowns.
+        """Jacobian (d, c + s) of a variable's tangent by the last node and the shared unknowns.
 
         Raises NotAChainError for a state, or a node that is not the last.
         """
@@ -232,7 +232,7 @@ class Layout:
 
 
 def _alike(values: gtsam.Values, key: Index, letter: Index) -> list[Index]:
-    """Variables of one letter, or single ones where letters do not say what they are."""
+    """Group variables by the letter of their key; single where letter or dimensions are not common."""
     dims = values.dims()
     dim = np.array([dims[k] for k in key.tolist()])
     groups: list[Index] = []
@@ -275,7 +275,7 @@ def insert_value(values: gtsam.Values, key: int, block: Block, value: Array) -> 
 def _states(
     layout: ChainLayout | None, key: Index, letter: Index, index: Index, size: Index, shared: Collection[int]
 ) -> tuple[Index, Index, int]:
-    """Keyframe of each variable, -1 of no state; first of its numbers in the state; the numbers of a state."""
+    """Keyframe (-1: none) of each variable, its offset in the state, and the size of a state."""
     keyframe, offset = np.full(len(key), -1), np.zeros(len(key), dtype=np.intp)
     if layout is None:
         some = ~np.isin(key, list(shared))
@@ -294,7 +294,7 @@ def _states(
 def _nodes(
     layout: ChainLayout | None, letter: Index, index: Index, size: Index
 ) -> tuple[Index, Index, int, tuple[int, int]]:
-    """Node of each variable, -1 of none; first of its numbers there; position of the first node; count and size."""
+    """Node (-1: none) of each variable, its offset there; position of the first node; node count and size."""
     node, part = np.full(len(letter), -1), np.zeros(len(letter), dtype=np.intp)
     names = "" if layout is None else layout.nodes
     some = np.isin(letter, [ord(c) for c in names])
@@ -312,7 +312,7 @@ def _nodes(
 
 
 def _kept(shape: tuple[int, int], place: Index, offset: Index, size: Index) -> NDArray[np.bool_]:
-    """Mask of the numbers of states, or nodes, that variables have."""
+    """Mask of the entries of all states, or nodes, that belong to a variable."""
     out = np.zeros(shape, dtype=bool)
     if out.size:
         for begin, width in {*zip(offset[place >= 0].tolist(), size[place >= 0].tolist(), strict=True)}:

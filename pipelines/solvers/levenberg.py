@@ -67,7 +67,7 @@ DEFAULT = LevenbergConfig()
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Values with the linear system about them.
+    """Values, the linear system about these, and the cost.
 
     Attributes:
         engine: with the loss and the weights in force.
@@ -82,7 +82,7 @@ class Point:
 
     @classmethod
     def of(cls, engine: Linearization, values: Values) -> Point:
-        """Linearise about some values."""
+        """Linearise an engine about some values."""
         return cls(engine, values, *engine.at(values))
 
     @cached_property
@@ -93,7 +93,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Point):
-    """End of a minimisation: values and linear system.
+    """Result of a minimisation: values, linear system, cost, and whether it converged.
 
     Attributes:
         converged: whether it is a minimum; `message` says how or why not.
@@ -105,7 +105,7 @@ class Solution(Point):
     iterations: int
 
     def at_inliers(self) -> Solution:
-        """The solution's system without what the loss rejects here. Raises IndeterminateStateError."""
+        """Return the solution with the rejected measurements left out. Raises IndeterminateStateError."""
         engine = self.engine.counting(self.engine.inliers(self.values))
         out = replace(self, engine=engine, cost=engine.cost(self.values))
         vars(out).update(factorization=self.factorization)
@@ -115,7 +115,7 @@ class Solution(Point):
 def minimize(
     engine: Linearization, values: Values, config: LevenbergConfig = DEFAULT, known: tuple[System, float] | None = None
 ) -> Solution:
-    """Minimise an engine's cost from some values; `known`: the system about these, and the cost."""
+    """Minimise an engine's cost from some values; `known` gives the linear system and cost there."""
     here = Point(engine, values, *known) if known else Point.of(engine, values)
     damping, growth, iteration, served = 0.0, 2.0, 0, _INITIAL_DAMPING
 
@@ -154,7 +154,7 @@ def minimize(
 
 
 def _is_minimum(enough: float, damping: float, predicted: float, decrease: float) -> bool:
-    """Whether a step, by its damping and the decrease of the cost, shows that where it ends is a minimum."""
+    """Whether the end of a step is a minimum, from its damping and the predicted and actual decrease."""
     if damping > 0.0:
         determined = damping <= _INITIAL_DAMPING and predicted < _DETERMINED
         return determined and (decrease <= 0.0 or damping == _INITIAL_DAMPING)
@@ -165,7 +165,7 @@ def _is_minimum(enough: float, damping: float, predicted: float, decrease: float
 def _reached(
     engine: Linearization, here: Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
 ) -> tuple[Point, int]:
-    """Point after a step whose length or end is corrected, and the number of corrections."""
+    """Return the point after a step, lengthened or corrected to second order, and the number of corrections."""
     there = Point.of(engine, engine.layout.retract(here.values, step))
     if here.cost - there.cost > _DOUBLE * predicted:
         return _lengthened(engine, here.values, step, there.cost), 0
@@ -187,7 +187,7 @@ def _reached(
 
 
 def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: float) -> Point:
-    """Point after a step that is doubled as long as the cost falls; `cost` is that after the single step."""
+    """Double a step while the cost falls and return its end; `cost` is that after the single step."""
     length = 1.0
 
     def ahead(length: float) -> Values:
@@ -199,12 +199,12 @@ def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: floa
 
 
 def _enough(config: LevenbergConfig, point: Point, rows: int) -> float:
-    """A decrease that is none: the tolerance, in squared sigmas as large as residuals of so many rows, and rounding."""
+    """Decrease of the cost that counts as none: tolerance times the mean square residual, plus rounding."""
     return config.cost_tolerance * max(1.0, point.system.squares / max(rows, 1)) + 1e-13 * point.cost
 
 
 def _step(system: System, damping: float) -> tuple[Tangent | None, float]:
-    """A step, None where the damped system is singular, and the decrease that it predicts."""
+    """Solve a damped system; return the step (None if singular) and the predicted decrease of the cost."""
     try:
         factorization = system.eliminate(damping)
         step = Tangent(*factorization.solve())

@@ -47,7 +47,7 @@ CANCELLED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class NativeModel(Model):
-    """A native gtsam factor as a model of one measurement, linearised by gtsam.
+    """Measurement model of one native gtsam factor, which gtsam linearises.
 
     Attributes:
         factor: of which `blocks` are the variables.
@@ -75,7 +75,7 @@ class NativeModel(Model):
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Measurements of one kind, evaluated together, and where their rows and columns stand.
+    """Measurements of one kind, evaluated together, with their positions in a linear system.
 
     Attributes:
         family: of them all.
@@ -136,36 +136,36 @@ class Group:
         return np.ones(shape) if self.weights is None else self.weights.copy()
 
     def counting(self, used: Mask) -> Group:
-        """Without its loss: those of its n measurements that are used in full, the others not at all."""
+        """Return the group with given inliers at full weight, the rest excluded, and no robust loss."""
         return replace(self, loss=None, excluded=None if used.all() else ~used)
 
     def weighted(self, residuals: Array) -> Array:
-        """Residuals with the noise weights."""
+        """Multiply residuals by the noise weights."""
         return residuals if self.weights is None else self.weights * residuals
 
     def cost(self, residuals: Array) -> float:
-        """Twice the sum of the losses of whitened residuals, unweighted."""
+        """Twice the sum of the robust losses of unweighted whitened residuals."""
         squares = np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)]))
         return float(self._included(squares if self.loss is None else self.loss.cost(squares)).sum())
 
     def used(self, residuals: Array) -> Array:
-        """Weights (n,) by the loss of measurements with these unweighted whitened residuals."""
+        """Robust weights (n,) of the measurements, from their unweighted whitened residuals (n, m)."""
         if self.loss is None:
             return self._included(np.ones(len(residuals)))
         return self._included(self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)]))))
 
     def inliers(self, values: Values) -> Mask:
-        """Mask (n,) of the measurements that count at some values: neither rejected by the loss nor excluded."""
+        """Mask (n,) of the measurements that the loss does not reject at some values and that are not excluded."""
         if self.loss is None:
             return np.ones(len(self.model.time), dtype=bool) if self.excluded is None else ~self.excluded
         return np.asarray(self.used(self.evaluate(values)[0]) > 0.5)
 
     def _included(self, each: Array) -> Array:
-        """Numbers (n,), zero for what is excluded."""
+        """Set numbers (n,) of excluded measurements to zero."""
         return each if self.excluded is None else np.where(self.excluded, 0.0, each)
 
     def whitened(self, values: Values) -> tuple[Array, tuple[Array, ...], float]:
-        """Right side (n, m), Jacobian (n, m, dim) by each block, both under loss and weights; and the cost."""
+        """Right side (n, m), Jacobian (n, m, dim) by each block, under loss and noise weights; and the cost."""
         residuals, linearize = self.evaluate(values)
         factor = np.broadcast_to(np.sqrt(self.used(residuals))[:, None], residuals.shape)
         if self.weights is not None:
@@ -176,16 +176,16 @@ class Group:
 
     @property
     def is_divisible(self) -> bool:
-        """Whether some of its measurements may be evaluated without the others."""
+        """Whether the model can evaluate some of the group's measurements without the others."""
         return len(self.place) == 1 or hasattr(self.model, "stacked")
 
     def within(self, begin: int, end: int) -> Group | None:
-        """The group's measurements with a place from `begin` until before `end`, if there are any."""
+        """Select the measurements whose place is in `begin` ... `end` - 1; None if there is none."""
         some = np.flatnonzero((self.place >= begin) & (self.place < end))
         return self.of(some) if len(some) else None
 
     def divided(self) -> Iterator[Group]:
-        """All of its measurements, so many at a time that what follows from them is small."""
+        """Yield the group in parts of bounded size, to bound memory."""
         n = len(self.place)
         if n <= PART_STATES or not self.is_divisible:
             yield self
@@ -194,7 +194,7 @@ class Group:
             yield self.of(np.arange(begin, min(begin + PART_STATES, n)))
 
     def of(self, some: Index) -> Group:
-        """The group with some of its measurements only."""
+        """Select some of the group's measurements."""
         if len(some) == len(self.place):
             return self
 
@@ -240,7 +240,7 @@ def _add(out: Array, columns: Index, jacobian: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Factors of a problem, ready to be evaluated together.
+    """Compiled factors of a problem, which evaluates and linearises them together.
 
     Attributes:
         layout: of its variables.
@@ -258,7 +258,7 @@ class Linearization:
 
     @classmethod
     def of(cls, factors: Sequence[Factor], layout: Layout, chain: bool = True) -> Linearization:
-        """Compile factors. Raises NotAChainError where they do not fit the chain; without `chain` nothing has to."""
+        """Compile factors. Raises NotAChainError if they do not fit the chain; `chain=False` accepts any graph."""
         kinds: dict[Hashable, list[tuple[int, Factor, BoundModel]]] = {}
         for i, factor in enumerate(factors):
             v = factor.bound or _native(factor, layout)
@@ -275,7 +275,7 @@ class Linearization:
         return cls(layout, groups, piece, (int(used[0].max()) + absent, int(used[1].max())), chain)
 
     def at(self, values: Values) -> tuple[System, float]:
-        """The system about the values, and its cost: twice the sum of the losses."""
+        """Linearise about the values; return the system and the cost, twice the sum of the losses."""
         if self.is_chain:
             return self._chain_at(values)
         each = [(group.at, *group.whitened(values)) for group in self.groups]
@@ -310,26 +310,26 @@ class Linearization:
         return replace(chain, squares=squares), cost
 
     def within(self, begin: int, end: int) -> Iterator[Group]:
-        """The measurements at keyframes from `begin` until before `end`."""
+        """Yield the measurements at keyframes `begin` ... `end` - 1 by group."""
         for group in self.groups:
             if group.target in ("state", "pair") and (part := group.within(begin, end)) is not None:
                 yield part
 
     def divided(self) -> Iterator[Group]:
-        """All measurements by kind, so many at a time that what follows from them is small."""
+        """Yield all groups in parts of bounded size, to bound memory."""
         for group in self.groups:
             yield from group.divided()
 
     def cost(self, values: Values) -> float:
-        """Twice the sum of the losses."""
+        """Twice the sum of the robust losses at some values."""
         return self.cost_of(self.unweighted(values))
 
     def cost_of(self, unweighted: Sequence[Array]) -> float:
-        """Twice the sum of the losses, by the unweighted whitened residuals (n, m) of each group."""
+        """Twice the sum of the robust losses, from the unweighted whitened residuals (n, m) of each group."""
         return sum(group.cost(own) for group, own in zip(self.groups, unweighted, strict=True))
 
     def unweighted(self, values: Values) -> list[Array]:
-        """Whitened residuals (n, m) of each group without weights of noise and loss, outliers included."""
+        """Whitened residuals (n, m) of each group, outliers included, without noise and robust weights."""
         return [group.evaluate(values)[0] for group in self.groups]
 
     def residuals(self, values: Values) -> list[Array]:
@@ -338,7 +338,7 @@ class Linearization:
 
     @property
     def measured(self) -> dict[str, list[Group]]:
-        """Family -> its groups of measurements."""
+        """Groups of measurements of each family."""
         found: dict[str, list[Group]] = {}
         for group in self.groups:
             if group.is_measurement:
@@ -346,19 +346,19 @@ class Linearization:
         return found
 
     def with_groups(self, groups: Sequence[Group]) -> Linearization:
-        """The linearisation with other measurements at the same variables."""
+        """Replace the groups by others at the same variables."""
         return replace(self, groups=groups)
 
     def inliers(self, values: Values) -> list[Mask]:
-        """Of each group the mask (n,) of the measurements that count at some values."""
+        """Mask (n,) of each group's measurements that count at some values."""
         return [group.inliers(values) for group in self.groups]
 
     def counting(self, used: Sequence[Mask]) -> Linearization:
-        """The measurements that are used, (n,) of each group, in full, whatever they are elsewhere; no others."""
+        """Give the measurements of the masks (n,) full weight and exclude all others, without robust losses."""
         return self.with_groups([group.counting(own) for group, own in zip(self.groups, used, strict=True)])
 
     def products(self, group: Group, values: Values, flat: Array) -> tuple[Array, Array]:
-        """A x (n, m, k) of a group's whitened rows with k tangent vectors laid flat, and its right side (n, m)."""
+        """Product A x (n, m, k) of a group's whitened rows and k flat tangents, and the right side (n, m)."""
         right, jacobians, _ = group.whitened(values)
         out = np.zeros((*right.shape, flat.shape[1]))
         for at, J in zip(group.at, jacobians, strict=True):
@@ -368,7 +368,7 @@ class Linearization:
 
     @property
     def time(self) -> Array:
-        """Times of the keyframes (N,), s: of what joins each to the one before, else of the last measurement there."""
+        """Times of the keyframes (N,), s: of the factor from the previous keyframe, or of the last measurement."""
         out = np.full(self.layout.sizes[0], -np.inf)
         for target in ("state", "pair", ""):
             known = np.full(len(out), -np.inf)
@@ -380,11 +380,11 @@ class Linearization:
         return np.maximum.accumulate(np.where(out > -np.inf, out, known[0] if len(known) else 0.0))
 
     def under(self, loss: TruncatedLoss | None) -> Linearization:
-        """The linearization with another loss for measurements that have one."""
+        """Replace the robust loss of all groups that have one."""
         return replace(self, groups=[g if g.loss is None else replace(g, loss=loss) for g in self.groups])
 
     def _walk(self, rows: list[list[Array]]) -> Array:
-        """Rows (J, w, 2 c + 1) about nodes; unit rows for numbers of no variable."""
+        """Stack rows (J, w, 2 c + 1) about nodes, with unit rows for entries without a variable."""
         c, absent = self.layout.sizes[3], ~self.layout.kept[1]
         units = [np.eye(2 * c + 1)[np.flatnonzero(each)] for each in absent]
         whole = [np.concatenate([unit, *each]) for unit, each in zip(units, rows, strict=True)]
@@ -396,7 +396,7 @@ class Linearization:
 
 @dataclass(frozen=True, eq=False)
 class LinearizedChain(Chain):
-    """Rows of a chain that are made wherever they are asked for, of so many keyframes that all take too much memory.
+    """A chain linearised part by part on demand, for problems whose rows exceed the memory.
 
     Attributes:
         linearization, values: of the factors, and about which.
@@ -415,11 +415,11 @@ class LinearizedChain(Chain):
         return self.linearization.layout.sizes[0]
 
     def part(self, begin: int, end: int) -> ChainSystem:
-        """Rows about some consecutive keyframes, linearised now."""
+        """Linearise the rows about keyframes `begin` ... `end` - 1."""
         return self.rows(begin, end)[0]
 
     def rows(self, begin: int, end: int) -> tuple[ChainSystem, float]:
-        """A part, and twice the sum of the losses of its measurements."""
+        """Linearise the rows about some keyframes; return them and twice the sum of the losses."""
         n, d, w, (m, b), cost = end - begin, self.d, self.border, self.linearization.sizes, 0.0
         measured, between = np.zeros((n, m, d + w)), np.zeros((n, b, 2 * d + w))
         for group in self.linearization.within(begin, end):
@@ -447,7 +447,7 @@ def _require_cancelled(rows: Array, c: int, family: str) -> None:
 
 
 def _native(factor: Factor, layout: Layout) -> BoundModel:
-    """A native gtsam factor as a measurement. Raises NotAChainError where it may reject measurements by itself."""
+    """Wrap a native gtsam factor as a model. Raises NotAChainError for a robust or constrained noise model."""
     import gtsam
 
     native = factor.native
@@ -462,7 +462,7 @@ def _native(factor: Factor, layout: Layout) -> BoundModel:
 
 @dataclass(eq=False)
 class _Draft:
-    """A group before its rows have places.
+    """A group without rows and columns assigned yet.
 
     Attributes:
         group: without target, rows and columns.
@@ -528,7 +528,7 @@ class _Draft:
         return cls(group, last, span + 1, node, bool(reach.any()), whole)
 
     def placed(self, layout: Layout, piece: Index, used: Index, chain: bool) -> Group:
-        """The group, its rows below those of others that are already there."""
+        """Assign target, rows and columns to the group, its rows below those already placed."""
         c, group, rows = layout.sizes[3], self.group, self.group.model.rows
         n = len(self.last)
         target, place, row = "shared", np.full(n, -1), group.row
@@ -550,11 +550,11 @@ class _Draft:
         return replace(group, target=target, place=place, row=row, columns=columns)
 
     def _is_walk(self, layout: Layout) -> bool:
-        """Whether every measurement is about differences of nodes and means alone."""
+        """Whether every measurement involves nodes alone and joins each to the one before."""
         return self.pair and all((layout.node[each] >= 0).all() for each in self.group.at)
 
     def _columns(self, i: int, layout: Layout, target: str, piece: Index) -> list[Index]:
-        """Columns of a block on its target; see Group."""
+        """Columns of a block within the rows of its target; see `Group.columns`."""
         d, c = layout.sizes[1], layout.sizes[3]
         at = self.group.at[i]
         span = np.arange(dimension(layout.blocks[layout.block[at[0]]]))
@@ -577,12 +577,12 @@ class _Draft:
 
 
 def _single(columns: Index) -> Index:
-    """Columns (1,) where all rows are equal, else unchanged."""
+    """Reduce columns to (1, .) where all rows are equal."""
     return columns[:1] if (columns == columns[:1]).all() else columns
 
 
 def _positions(columns: Sequence[int | list[int]], lengths: Sequence[int], layout: Layout) -> Index:
-    """Positions (n or 1,) of a block's variables."""
+    """Positions (n or 1,) in the layout of a block's variables."""
     if isinstance(columns[0], int):
         at = layout.at([int(column) for column in columns if isinstance(column, int)])
         return at[:1] if (at == at[0]).all() else np.repeat(at, lengths)
@@ -590,13 +590,13 @@ def _positions(columns: Sequence[int | list[int]], lengths: Sequence[int], layou
 
 
 def _joined(parts: Sequence[Array | None], lengths: Sequence[int]) -> Array | None:
-    """Numbers (n,) of the measurements of all factors; None where no factor has any."""
+    """Concatenate per-measurement numbers (n,) of all factors; None where no factor has any."""
     each = [np.broadcast_to(p, length) for p, length in zip(parts, lengths, strict=True) if p is not None]
     return np.concatenate(each) if each else None
 
 
 def _below(place: Index, rows: int, used: Index) -> Index:
-    """First row (n,) of each measurement among those at its place; `used` (N,), rows there, grows."""
+    """Assign each measurement (n,) its first row at its place; `used` (N,), the rows filled there, grows."""
     order = np.argsort(place, kind="stable")
     begins = np.flatnonzero(np.diff(place[order], prepend=-1))
     counts = np.diff(begins, append=len(order))
@@ -608,7 +608,7 @@ def _below(place: Index, rows: int, used: Index) -> Index:
 
 
 def _pieces(drafts: Sequence[_Draft], layout: Layout) -> Index:
-    """Node in force at each keyframe, (N,), such that every node is in force at one."""
+    """Index (N,) of the node in force at each keyframe; every node is in force at one at least."""
     N, d, J, c, _ = layout.sizes
     if not c:
         return np.zeros(N, dtype=np.intp)

@@ -73,7 +73,7 @@ _DIFFUSE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows of the measurements of one kind, whitened as stated.
+    """Linearised rows of the measurements of one kind, whitened by the stated noise.
 
     Attributes:
         family: of all of them.
@@ -98,23 +98,23 @@ class Rows:
     is_measurement: bool
 
     def of(self, kept: Mask, renumbered: Index) -> Rows:
-        """Selected rows, their states renumbered."""
+        """Select some rows and renumber their states."""
         states = tuple((renumbered[i[kept]], J[kept]) for i, J in self.states)
         beside, fixed = (None if each is None else each[kept] for each in (self.beside, self.fixed))
         parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside, fixed)
         return Rows(self.family, self.group, *parts, self.is_measurement)
 
     def right(self, some: Any = ..., by_shared: bool = True) -> Array:
-        """Residuals of some of them, and beside these the derivatives by the shared parameters, (n, m, 1 + p) or 1."""
+        """Residuals of selected rows, with the Jacobian by the shared parameters beside: (n, m, 1 + p or 1)."""
         residuals = self.residuals[some][..., None]
         return np.concatenate([residuals, self.shared[some]], axis=2) if by_shared else residuals
 
     def has(self, noise: Noise) -> bool:
-        """Whether a noise is part of their variance."""
+        """Whether a noise contributes to the variance of these rows."""
         return self.family in noise.families and (self.beside is not None or not noise.beside)
 
     def variance(self, levels: Sequence[Level]) -> Array:
-        """Variance (n,) at some levels, over the stated one."""
+        """Variance (n,) of the rows at some noise levels, relative to the stated variance."""
         out = self._white(levels) + (0.0 if self.fixed is None else self.fixed)
         for level in levels:
             if level.noise.beside and self.has(level.noise):
@@ -122,13 +122,13 @@ class Rows:
         return out
 
     def share(self, level: Level, levels: Sequence[Level]) -> Array:
-        """Share (n,) of that variance that one of the levels causes."""
+        """Share (n,) of the rows' variance at some noise levels that one of the levels contributes."""
         if not self.has(level.noise):
             return np.zeros(len(self.time))
         return (self._added(level) if level.noise.beside else self._white(levels)) / self.variance(levels)
 
     def _white(self, levels: Sequence[Level]) -> Array:
-        """What their own noise makes of the variance (n,)."""
+        """Contribution (n,) of the rows' own noise to their variance, relative to the stated one."""
         out = np.ones(len(self.time)) if self.fixed is None else 1.0 - self.fixed
         for level in levels:
             if self.has(level.noise) and not level.noise.beside:
@@ -136,14 +136,14 @@ class Rows:
         return out
 
     def _added(self, level: Level) -> Array:
-        """What a noise beside their own adds to the variance (n,)."""
+        """Contribution (n,) of an additional noise to the rows' variance, relative to the stated one."""
         assert self.beside is not None
         return np.asarray((level.used * self.beside) ** 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Innovations of n measurements of one kind.
+    """Innovations of n measurements of one kind: normalised squares, and whitened with derivatives.
 
     Attributes:
         squares: (n,) of their norms over their own covariance.
@@ -157,7 +157,7 @@ class Innovations:
 
 @dataclass(frozen=True, eq=False)
 class LinearChain:
-    """A problem about a solution: states of a chain, each joined to the next at most, and shared parameters.
+    """A problem linearised about a solution: a chain of states, and shared parameters.
 
     Attributes:
         size: N states of d numbers.
@@ -171,7 +171,7 @@ class LinearChain:
 
     @classmethod
     def of(cls, linearization: Linearization, values: Values) -> LinearChain:
-        """Chain of a problem's factors at their stated noise, linearised at given values."""
+        """Linearise a problem's factors at their stated noise about given values."""
         (n, d, _, c, p), drafts = linearization.layout.sizes, list[Rows]()
         prior = [np.zeros((0, p + 1))]
         for number, group in enumerate(linearization.under(None).groups):
@@ -204,7 +204,7 @@ class LinearChain:
         return cls((n, d), tuple(drafts), np.concatenate(prior))
 
     def liveliest(self, factors: list[Array], most: int = ENOUGH_KEYFRAMES) -> tuple[LinearChain, list[Array]]:
-        """Chain over some pieces, half of them those with most motion, and further data about its rows.
+        """Keep about `most` keyframes, half of them in the pieces with most motion; select `factors` alike.
 
         What grows with motion shows there; what is white everywhere.
         """
@@ -229,30 +229,30 @@ class LinearChain:
         return part, [each[own] for each, own in zip(factors, inside, strict=True)]
 
     def reversed(self) -> LinearChain:
-        """The same chain with its states in the opposite order."""
+        """Return the same chain with its states in the opposite order."""
         last = self.size[0] - 1
         rows = tuple(replace(r, states=tuple((last - i, J) for i, J in r.states[::-1])) for r in self.rows)
         return replace(self, rows=rows)
 
     @property
     def limits(self) -> list[float]:
-        """Gate of the squared innovations of each kind of rows."""
+        """Gate of the squared normalised innovations of each kind of rows."""
         return [gate(rows.residuals.shape[1]) ** 2 for rows in self.rows]
 
     def factors(self, widening: Widening | None, of_rejected: float = np.inf) -> list[Array]:
-        """Factors (n,) of the variances of each kind of rows, `of_rejected` that of measurements that are rejected."""
+        """Variance factors (n,) of each kind of rows by a widening; `of_rejected` is that of rejected measurements."""
         each = [np.ones(len(rows.time)) if widening is None else widening[rows.group] for rows in self.rows]
         return [np.where(np.isinf(wide), of_rejected, wide**2) for wide in each]
 
     def variances(
         self, levels: Sequence[Level], widening: Widening | None = None, of_rejected: float = np.inf
     ) -> list[Array]:
-        """Variances (n,) of each kind of rows, over the stated ones, widened as `factors` has it."""
+        """Variances (n,) of each kind of rows at some noise levels, relative to the stated ones, and widened."""
         factors = self.factors(widening, of_rejected)
         return [rows.variance(levels) * factor for rows, factor in zip(self.rows, factors, strict=True)]
 
     def solved(self, variances: Sequence[Array]) -> _Solution | None:
-        """The most likely states and parameters given variances (n,) of the rows of each kind; None: undetermined.
+        """Solve for states and parameters given the rows' relative variances (n,); None where undetermined.
 
         Rows of infinite variance have no say.
         """
@@ -293,7 +293,7 @@ class LinearChain:
 
     @cached_property
     def _products(self) -> list[tuple[Array, list[Array], Array | None, list[Array], list[Array]]]:
-        """Products of each kind of rows independent of the levels: squares, J'J, J_i'J_j, J'r and J'J_shared."""
+        """Products of each kind of rows that no level changes: squares, J'J, J_i'J_j, J'r and J'J_shared."""
         found = []
         for rows in self.rows:
             r, transposed = rows.residuals, [np.swapaxes(J, 1, 2) for _, J in rows.states]
@@ -304,7 +304,7 @@ class LinearChain:
         return found
 
     def moves(self, states: Array, shared: Array) -> list[Array]:
-        """A x, rows (n, m, k) of each kind, of states (N d, k) and shared parameters (p, k)."""
+        """Product A x, (n, m, k) for each kind of rows, with states (N d, k) and shared parameters (p, k)."""
         n, d = self.size
         each, out = states.reshape(n, d, -1), []
         for rows in self.rows:
@@ -317,7 +317,7 @@ class LinearChain:
     def innovations(
         self, variances: Sequence[Array], limits: Sequence[float], by_shared: bool = False
     ) -> dict[int, Innovations]:
-        """Innovations of measurements, by number of their kind.
+        """Innovations of the measurements by index of their kind, from Kalman filters over overlapping pieces.
 
         Predicted from the keyframes before, parameters as they are, by a filter that uses what lies beyond a limit with
         a variance that takes it there. In pieces that begin with nothing known `_WARM_UP` keyframes before, all at the
@@ -365,7 +365,7 @@ class LinearChain:
         return {kind: Innovations(*each) for kind, each in found.items()}
 
     def transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
-        """x_k = F_k x_k-1 + c_k and the covariance Q_k; a state that nothing joins to the one before is diffuse.
+        """Transitions x_k = F_k x_k-1 + c_k with covariance Q_k; diffuse where no factor joins two states.
 
         `c` has the derivatives by the shared parameters beside it where they are asked for.
         """
@@ -386,7 +386,7 @@ class LinearChain:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """A chain's most likely states and parameters.
+    """Most likely states and parameters of a linear chain, with the factorized information.
 
     Attributes:
         chain: the problem.
@@ -408,7 +408,7 @@ class _Solution:
     value: float
 
     def solve(self, states: Array, shared: Array) -> tuple[Array, Array]:
-        """Information's inverse times right sides (N d, k) and (p, k)."""
+        """Solve the normal equations for right sides (N d, k) of the states and (p, k) of the shared parameters."""
         from scipy.linalg import cho_solve_banded
 
         right = shared - self.border.T @ states
@@ -416,12 +416,12 @@ class _Solution:
         return cho_solve_banded((self.root, False), states, check_finite=False) - self.border @ x, x
 
     def covariance(self, by_shared: Array) -> Array:
-        """Covariance (r, r) of numbers with derivatives (r, p) by the shared parameters."""
+        """Covariance (r, r) of r functions with Jacobian (r, p) by the shared parameters."""
         half = np.linalg.solve(self.small, by_shared.T)
         return np.asarray(half.T @ half)
 
     def gathered(self, of_rows: Sequence[Array]) -> tuple[Array, Array]:
-        """A'y of whitened rows y (n, m, k) of each kind."""
+        """Product A'y for whitened rows y (n, m, k) of each kind: states (N d, k), shared parameters (p, k)."""
         (n, d), p, k = self.chain.size, self.chain.prior.shape[1] - 1, of_rows[0].shape[2]
         states, shared = np.zeros((n, d, k)), np.zeros((p, k))
         for rows, w, y in zip(self.chain.rows, self.weights, of_rows, strict=True):
@@ -432,12 +432,12 @@ class _Solution:
         return states.reshape(n * d, k), shared
 
     def spread(self, states: Array, shared: Array) -> list[Array]:
-        """A x, whitened rows (n, m, k) of each kind, of states (N d, k) and shared parameters (p, k)."""
+        """Product A x with whitened rows, (n, m, k) by kind, from states (N d, k) and shared parameters (p, k)."""
         moves = self.chain.moves(states, shared)
         return [w[:, None, None] * move for w, move in zip(self.weights, moves, strict=True)]
 
     def residuals(self) -> list[Array]:
-        """Residuals (n, m) of each kind, whitened as stated."""
+        """Residuals (n, m) of each kind of rows at the solution, whitened by the stated noise."""
         moves = self.chain.moves(self.states[:, None], self.shared[:, None])
         return [rows.residuals + move[..., 0] for rows, move in zip(self.chain.rows, moves, strict=True)]
 
@@ -475,7 +475,7 @@ class _Solution:
 def estimate_levels(
     chain: LinearChain, levels: Sequence[Level], widening: Widening | None = None, from_above: bool = False
 ) -> tuple[Level, ...]:
-    """Levels that maximise the marginal likelihood at a linearisation, by Newton steps with average information.
+    """Estimate the noise levels of largest marginal likelihood at a linearisation, by average-information steps.
 
     What is stated counts as roughly known at first, which gives what the recording says; then as well as it is known,
     unless the recording contradicts it.
@@ -512,7 +512,7 @@ def estimate_levels(
 def _maximum(
     chain: LinearChain, factors: Sequence[Array], levels: Sequence[Level], free: Sequence[int], known: Array
 ) -> tuple[tuple[Level, ...], float]:
-    """The maximum with some levels free, and -2 log L there, the levels' own prior included.
+    """Maximise the marginal likelihood over the free levels; return all levels and -2 log L with their prior.
 
     What parameters miss their priors by is not in it: a scale beyond its data sheet is no noise.
 
@@ -572,12 +572,12 @@ def _maximum(
 
 
 def unwidened(used: Sequence[Mask]) -> Widening:
-    """No widening: of each group the measurements (n,) that are used count as stated, the others are rejected."""
+    """Widening without effect: factor 1 for each group's inliers (n,), infinity for the rejected measurements."""
     return [np.where(own, 1.0, np.inf) for own in used]
 
 
 def widened(chain: LinearChain, levels: Sequence[Level], widening: Widening) -> Widening:
-    """The widening of measurements at given levels, from one that says which of them were rejected.
+    """Widening of the measurements at given noise levels; `widening` marks the measurements rejected so far.
 
     An outlier is what was rejected and, without any say of its own, lies beyond `OUTLIER_GATES` gates of the solution:
     the innovation of the first measurements has no prediction.
@@ -633,19 +633,19 @@ def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = 
 
 
 def _square(S: Array, y: Array) -> Array:
-    """y' S^-1 y, (n,)."""
+    """Quadratic form y' S^-1 y, (n,)."""
     return np.asarray(np.einsum("ni,ni->n", y, np.linalg.solve(S, y[..., None])[..., 0]))
 
 
 def _shares(chain: LinearChain, levels: Sequence[Level], which: Sequence[int]) -> list[list[Array]]:
-    """Shares (n,) of the variance of each kind of rows that some of the levels cause."""
+    """Shares (n,) of the variance of each kind of rows that the levels `which` contribute."""
     return [[rows.share(levels[i], levels) for rows in chain.rows] for i in which]
 
 
 def _effective(
     chain: LinearChain, levels: Sequence[Level], free: Sequence[int], covariance: Array
 ) -> tuple[Level, ...]:
-    """The levels, those that have others beside them with what these are together.
+    """Set the effective total noise of each level whose rows an additional noise shares.
 
     `covariance` (k, k) is of the logarithms of the free ones.
     """
@@ -663,7 +663,7 @@ def _effective(
 
 
 def _add(to: Array, at: Index, blocks: Array) -> None:
-    """Add blocks (n, ...) at positions that may repeat."""
+    """Add blocks (n, ...) to an array at positions that may repeat."""
     if len(at) and (np.diff(at) > 0).all():
         to[at] += blocks
     else:
@@ -684,14 +684,14 @@ def _banded(diagonal: Array, ahead: Array) -> Array:
 
 
 def _queue(state: Index, n: int) -> tuple[Index, Index, Index]:
-    """Measurements in order of their states, where those of each state begin (n,) and how many it has (n,)."""
+    """Order of measurements by state, and the first one (n,) and the number (n,) of each state's."""
     counts = np.bincount(state, minlength=n)
     return np.argsort(state, kind="stable"), np.cumsum(counts) - counts, counts
 
 
 @dataclass(frozen=True, eq=False)
 class LikelihoodMaximum:
-    """Values and levels of the largest marginal likelihood, or near it.
+    """Values, noise levels and widening at or near the maximum of the marginal likelihood.
 
     Attributes:
         values: of all variables.
@@ -707,7 +707,7 @@ class LikelihoodMaximum:
 def maximise_likelihood(
     linearization: Linearization, start: LikelihoodMaximum, rounds: int = _ROUNDS, from_above: bool = False
 ) -> LikelihoodMaximum:
-    """Levels and values in turn: levels at a linearisation, a Gauss-Newton step with them, and again.
+    """Maximise the marginal likelihood by alternating noise levels and Gauss-Newton steps of the values.
 
     Nodes of a bias stay where they are.
 
@@ -733,7 +733,7 @@ def maximise_likelihood(
 
 
 def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...] | None:
-    """Where two noises of the same rows begin a second time: `_ABOVE` what is stated, with equal shares; None without.
+    """Alternative start for two noises of the same rows: at `_ABOVE`, with equal shares; None if there is no pair.
 
     -2 log L is flat in the logarithm of a level whose share vanishes: what begins there stays, and another noise takes
     its part.
@@ -753,7 +753,7 @@ def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...
 
 
 def _solution_at(linearization: Linearization, found: LikelihoodMaximum, config: LevenbergConfig) -> Solution:
-    """The solution near a maximum: outliers are left out, all else counts as wide as it is."""
+    """Minimise from a likelihood maximum, without outliers and with widened sigmas of the other measurements."""
     used = [np.isfinite(wide) for wide in found.widening]
     engine = apply_levels(linearization, found.levels).counting(used)
     groups = [
@@ -766,7 +766,7 @@ def _solution_at(linearization: Linearization, found: LikelihoodMaximum, config:
 def solve_likelihood(
     compiled: Compiled, solution: Solution, levels: Sequence[Level], config: LevenbergConfig
 ) -> tuple[Compiled, Solution, tuple[Level, ...]]:
-    """The solution at the noise levels of the largest marginal likelihood, of a problem fine enough for them.
+    """Minimise at the noise levels of largest marginal likelihood, on a denser graph if the levels need one.
 
     Args:
         compiled: the problem, compiled for the chain.
@@ -801,7 +801,7 @@ def solve_likelihood(
 
 
 def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Values:
-    """First values of a problem, with the parameters as they are known of another graph of it."""
+    """Initial values of a problem with the parameters replaced by those of another graph of the problem."""
     layout, arrays = compiled.layout, {block: array.copy() for block, array in compiled.initial.arrays.items()}
     keys = [p.key for p in compiled.problem.parameters]
     for key, at in zip(keys, layout.at(keys).tolist(), strict=True):
@@ -810,7 +810,7 @@ def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Val
 
 
 def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> Array:
-    """Ratio of sandwich to nominal sigma of the reported numbers, (n,), at least 1.
+    """Ratio (n,) of sandwich to nominal sigma of the reported numbers; at least 1, and 1 if not significant.
 
     Above 1 where something errs slowly that no noise of the model has, as with the pose. Up to `certain_ratio` it
     counts as 1.
@@ -824,13 +824,13 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
 
 
 def _at(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[LinearChain, list[Array]]:
-    """The chain about a solution, and variances (n,) of each kind of rows there; outliers have no say."""
+    """Linearise the chain about a solution; return it and the variances (n,) of each kind of rows."""
     chain = LinearChain.of(compiled.engine, solution.values)
     return chain, chain.variances(levels, unwidened(solution.engine.inliers(solution.values)), NO_SAY)
 
 
 def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> dict[str, Residuals]:
-    """Innovations by family at noise levels, white and of unit variance if the model is right; outliers have no say."""
+    """Innovations of each family at given noise levels: white, of unit variance, if the model is right."""
     chain, variances = _at(compiled, levels, solution)
     used = solution.engine.inliers(solution.values)
     return {

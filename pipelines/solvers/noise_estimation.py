@@ -53,7 +53,7 @@ def estimate_noise(
     loss: TruncatedLoss | None,
     config: LevenbergConfig,
 ) -> tuple[Solution, tuple[Level, ...]]:
-    """The solution with the noise levels that the recording has, and these.
+    """Estimate the noise levels from the residuals; return the solution with these levels, and the levels.
 
     Args:
         engine: with the noise stated.
@@ -88,7 +88,7 @@ def estimate_noise(
 
 
 def apply_levels(engine: Linearization, levels: Sequence[Level]) -> Linearization:
-    """The measurements with their noise at these levels, over what they were whitened by."""
+    """Scale the measurements' weights from the noise used for whitening to the noise at some levels."""
     scaled = acting(levels)
     if not scaled:
         return engine
@@ -96,7 +96,7 @@ def apply_levels(engine: Linearization, levels: Sequence[Level]) -> Linearizatio
 
 
 def acting(levels: Iterable[Level]) -> list[Level]:
-    """Levels whose noise differs from that by which the measurements were whitened."""
+    """Select the levels whose noise differs from the noise used for whitening."""
     return [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
 
 
@@ -106,7 +106,7 @@ def _at_levels(group: Group, levels: Sequence[Level]) -> Group:
 
 
 def level_weights(weights: Array, levels: Iterable[Level], beside: Array | None, fixed: Array | None = None) -> Array:
-    """Weights (n, m) of measurements with their noise at these levels, over what they were whitened by.
+    """Weights (n, m) that change measurements from the noise used for whitening to the noise at some levels.
 
     Args:
         weights: (n, m) beside the levels.
@@ -125,13 +125,13 @@ def level_weights(weights: Array, levels: Iterable[Level], beside: Array | None,
 
 
 def _additional(beside: Array | None, level: float) -> Array:
-    """Variance (n, 1) of a noise beside others, in units of the whitening variance."""
+    """Variance (n, 1) of an additional noise, in units of the whitening variance."""
     assert beside is not None
     return ((level * beside) ** 2)[:, None]
 
 
 def _far(levels: Sequence[Level], others: Sequence[Level]) -> bool:
-    """Whether levels are so far from others that outliers of the one are measurements of the other."""
+    """Whether a level differs so much from its former value that the former gate rejects the wrong measurements."""
     pairs = zip(levels, others, strict=True)
     low, high = 1.0 / _MISPLACED, _MISPLACED
     return any(not low < a.scale / b.scale < high for a, b in pairs if not a.noise.beside)
@@ -144,7 +144,7 @@ def refine(
     expected: ExpectedSquares,
     first: bool,
 ) -> tuple[tuple[Level, ...], bool]:
-    """The levels at a solution, and whether they are those that it was made with.
+    """Update the noise levels from the residuals at a solution; return them and whether they have converged.
 
     Args:
         levels: that the engine has now.
@@ -172,7 +172,7 @@ def refine(
 
 
 def _redundancy(noise: Noise, expected: ExpectedSquares) -> float:
-    """Expected sum of a noise's whitened squares if it is at the level it has."""
+    """Expected sum of a noise's whitened squares at its current level."""
     return sum(
         square
         for (family, row), square in expected.items()
@@ -181,7 +181,7 @@ def _redundancy(noise: Noise, expected: ExpectedSquares) -> float:
 
 
 def _refined(level: Level, groups: Sequence[Group], values: Values, redundancy: float, first: bool) -> Level:
-    """Improved estimate of a noise level."""
+    """Update one noise level from its whitened residuals."""
     square, typical = _size(level.noise, groups, values)
     if first and typical > 0.0 and not _MISPLACED**-2 < square / typical < _MISPLACED**2:
         square = typical
@@ -192,7 +192,7 @@ def _refined(level: Level, groups: Sequence[Group], values: Values, redundancy: 
 
 
 def _found_beside(level: Level, groups: Sequence[Group], values: Values, redundancy: float) -> tuple[Level, bool]:
-    """A noise beside others as the residuals have it, and whether that changes little.
+    """Update an additional noise from the residuals; return its level and whether it has converged.
 
     With v the variance of a row, f the part of it that is this noise's, and e the residual, all rows alike redundant,
     the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. Where outliers are rejected, what is beyond two sigmas
@@ -221,7 +221,7 @@ def _found_beside(level: Level, groups: Sequence[Group], values: Values, redunda
 
 
 def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float) -> Level:
-    """A process at the level that its residuals have, between what its samples say and what was stated.
+    """Update the level of a process from its residuals, between its lower bound `least` and the stated level.
 
     Where measurements take most of the redundancy its squares hardly determine levels in between: it stays as stated if
     these fit, else it is taken down to its samples and up from there as far as its residuals ask for.
@@ -236,7 +236,7 @@ def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: f
 
 
 def _level(now: float, square: float, redundancy: float, known: float) -> float:
-    """Logarithm of the root of the level's posterior mean square.
+    """Logarithm of the root of a noise level's posterior mean square.
 
     The mode u is the root of square exp(2 (now - u)) - redundancy - u / known^2, by Newton's method. With v the
     variance of the logarithm there, the mean square is exp(2 (u + v)): sigmas contain what few residuals leave unknown.
@@ -255,13 +255,13 @@ def _rows(noise: Noise, rows: int) -> list[int]:
 
 
 def _used_square(group: Group, values: Values) -> Array:
-    """Squares (n, m) of weighted residuals, zero of rejected measurements."""
+    """Squares (n, m) of the weighted residuals, zero for rejected measurements."""
     residuals = group.evaluate(values)[0]
     return np.where((group.used(residuals) > 0.5)[:, None], group.weighted(residuals) ** 2, 0.0)
 
 
 def _size(noise: Noise, groups: Sequence[Group], values: Values) -> tuple[float, float]:
-    """Sum of squares of a noise's whitened residuals that are used, and what it would be if all were of typical size.
+    """Sum of the inliers' squared whitened residuals of a noise, and that sum estimated from their typical size.
 
     Of few residuals, and of processes, the latter is 0.
     """

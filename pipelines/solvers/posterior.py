@@ -45,7 +45,7 @@ UNSEEN = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Reported:
-    """Reported numbers about some values of all variables.
+    """Reported numbers at some values, with their Jacobian and priors.
 
     Attributes:
         names: (n,) of all numbers.
@@ -78,7 +78,7 @@ class Reported:
 
     @classmethod
     def at(cls, problem: Problem, known: gtsam.Values, keys: Sequence[int], columns: Sequence[Array]) -> Reported:
-        """Evaluate the coordinates of all parameters.
+        """Evaluate the coordinates of all parameters at gtsam values, with their Jacobians by the unknowns.
 
         Args:
             problem: of which the parameters are.
@@ -115,14 +115,14 @@ class Reported:
 
     @cached_property
     def basis(self) -> Array:
-        """Directions (c + s, p + m) of last node and shared unknowns: p that move no number, then those of u."""
+        """Basis (c + s, p + m) of last node and shared unknowns: p directions that move no number, then those of u."""
         inverse = np.linalg.pinv(self.jacobian)
         _, sizes, axes = np.linalg.svd(self.jacobian, full_matrices=True)
         seen = int(np.count_nonzero(sizes > UNSEEN * sizes.max(initial=0.0)))
         return np.hstack([axes[seen:].T, inverse[:, self.free] * self.scale])
 
     def root(self, root: Array) -> ReportedRoot:
-        """The square-root information of the free numbers from that of (last node, shared unknowns, right side)."""
+        """Project R of (last node, shared unknowns, right side) on the free numbers' square-root information."""
         basis = self.basis
         R = np.asarray(np.linalg.qr(np.column_stack([root[:, :-1] @ basis, root[:, -1]]), mode="r"), dtype=float)
         missing = max(0, R.shape[1] - len(R))  # rows, where there are fewer than numbers
@@ -137,7 +137,7 @@ class Reported:
 
 @dataclass(frozen=True, eq=False)
 class ReportedRoot:
-    """Square-root information of moves of the free reported numbers u.
+    """Square-root information |R du - d| about moves of the free reported numbers u.
 
     Attributes:
         basis: (c + s, p + m) moves of the last node and the shared unknowns: p that no number sees, then those of u.
@@ -151,7 +151,7 @@ class ReportedRoot:
 
     @property
     def R(self) -> Array:
-        """Square-root information (m, m) of u, everything else marginalised out."""
+        """Square-root information (m, m) of u, all other unknowns marginalised out."""
         return self.triangle[self.unseen : -1, self.unseen : -1]
 
     @property
@@ -160,7 +160,7 @@ class ReportedRoot:
         return self.triangle[self.unseen : -1, -1]
 
     def last(self, du: Array, right: float = 1.0) -> Array:
-        """Moves (c + s, k) of the last node and the shared unknowns for moves (m, k) of u, the rest optimal.
+        """Moves (c + s, k) of last node and shared unknowns for moves (m, k) of u, other directions optimal.
 
         `right`: factor of the right side; 0 for the response to the moves alone.
         """
@@ -176,7 +176,7 @@ class ReportedRoot:
 
 
 def responses(factorization: Factorization, jacobian: Array, basis: Array) -> Tangent:
-    """N^-1 J' of all unknowns, a column for each row of a Jacobian (n, c + s) by the last node and the shared unknowns.
+    """Solve N x = J' for the Jacobian J (n, c + s) by last node and shared unknowns: all unknowns, n columns.
 
     Args:
         factorization: of the system.
@@ -193,7 +193,7 @@ def responses(factorization: Factorization, jacobian: Array, basis: Array) -> Ta
 
 
 def draws(factorization: Factorization, count: int, generator: np.random.Generator) -> Tangent:
-    """Deviations from the posterior mean, drawn; the first bias node does not deviate from itself."""
+    """Draw deviations of all unknowns from the posterior mean; the first bias node's own part is zero."""
     states, nodes, shared = factorization.sample(count, generator)
     nodes[:1] = 0.0
     return Tangent(states, nodes, shared)
@@ -201,7 +201,7 @@ def draws(factorization: Factorization, count: int, generator: np.random.Generat
 
 @dataclass(frozen=True, eq=False)
 class Leverage:
-    """Leverages of the rows of a group.
+    """Leverages (n, m) of a group's whitened rows.
 
     Attributes:
         group: of n measurements of m rows.
@@ -256,7 +256,7 @@ def leverages(engine: Linearization, system: System, factorization: Factorizatio
 
 
 def _of_shared(layout: Layout, factorization: Factorization, group: Group, values: Values) -> Array:
-    """Leverages (n, m) of rows about the shared unknowns alone, exact."""
+    """Exact leverages (n, m) of rows about the shared unknowns alone."""
     s = layout.sizes[4]
     rows, _ = group.rows(values, s + 1)
     A = np.pad(rows[..., :-1].reshape(-1, s), ((0, 0), (factorization.c, 0)))
@@ -265,7 +265,7 @@ def _of_shared(layout: Layout, factorization: Factorization, group: Group, value
 
 
 def _summing_to(found: Sequence[Leverage], unknowns: int) -> list[Leverage]:
-    """Leverages that sum to the number of unknowns, corrected where they are uncertain: neither 0 nor 1."""
+    """Correct uncertain leverages, those neither 0 nor 1, so that all sum to the number of unknowns."""
     weights = [max(float((each.h - each.h**2)[each.used].sum()), 0.0) for each in found]
     share = (unknowns - sum(float(each.h.sum()) for each in found)) / max(sum(weights), 1e-300)
     return [
@@ -276,7 +276,7 @@ def _summing_to(found: Sequence[Leverage], unknowns: int) -> list[Leverage]:
 
 @dataclass(frozen=True, eq=False)
 class _Variances:
-    """Variances of what the rows of a chain predict, under its posterior.
+    """Posterior variances of the predictions of a chain's rows.
 
     Attributes:
         measured, between: (2, N, m), (2, N, b) of the rows of these names, and their right sides.
@@ -313,14 +313,14 @@ class _Variances:
 
 
 def _moved(rows: Array, following: Array, shared: Array) -> Array:
-    """Rows (n, m, k + s + 1) times moves (n, k, q) and (s, q), (n, m, q)."""
+    """Multiply rows (n, m, k + s + 1) by moves (n, k, q) of states and (s, q) of shared unknowns: (n, m, q)."""
     n, k, q = following.shape
     about = rows.reshape(-1, rows.shape[2])[:, k:-1] @ shared
     return np.asarray(rows[..., :k] @ following + about.reshape(n, rows.shape[1], q))
 
 
 def _quadratic(rows: Array, covariances: Array) -> Array:
-    """Variances (n, m) of rows (n, m, k), from covariances (n, k, k)."""
+    """Variances (n, m) of the combinations in rows (n, m, k), from covariances (n, k, k)."""
     return np.einsum("nmk,nmk->nm", rows @ covariances, rows)
 
 
@@ -330,7 +330,7 @@ def _unknowns(layout: Layout) -> int:
 
 
 def chi_square(found: Sequence[Leverage]) -> ChiSquare:
-    """Sum of squares of measurements and processes and their degrees of freedom, whole and by family; none negative."""
+    """Sum of squares and degrees of freedom of measurements and processes, in total and by family."""
     families: dict[str, tuple[float, float]] = {}
     for each in found:
         family, used = each.group.family, each.used
@@ -360,7 +360,7 @@ def expected_squares(
 def sqrt_information(
     compiled: Compiled, engine: Linearization, values: Values, device: Collection[str]
 ) -> SqrtInformation:
-    """Square-root information about the free reported numbers, priors of the device set apart.
+    """Square-root information about the free reported numbers, with the device's priors kept separate.
 
     Args:
         compiled: the problem.
@@ -408,7 +408,7 @@ def sqrt_information(
 
 
 def moved_to(compiled: Compiled, engine: Linearization, values: Values, numbers: Mapping[str, float]) -> Values:
-    """Values with some of the reported numbers moved, the other numbers kept and all states optimal to first order."""
+    """Move some reported numbers to given values, keep the others, and re-optimise the states to first order."""
     reported = Reported.of(compiled, values)
     wanted = np.array([numbers.get(n, here) for n, here in zip(reported.names, reported.numbers, strict=True)])
     du = (wanted - reported.numbers)[reported.free] / reported.scale
@@ -418,19 +418,19 @@ def moved_to(compiled: Compiled, engine: Linearization, values: Values, numbers:
 
 
 def followed(factorization: Factorization, last: Array) -> Tangent:
-    """Moves of all unknowns that go with moves (c + s, 1) of the last node and the shared ones, the rest optimal."""
+    """Complete moves (c + s, 1) of last node and shared unknowns by the optimal moves of all states and nodes."""
     states, nodes = factorization.given(last)
     return Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
 
 
 def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask (r,) of rows about some of the named numbers and no others; numbers are in prior units."""
+    """Mask (r,) of rows that involve some of the named numbers and no others; columns in prior units."""
     about = np.abs(rows) > UNSEEN**0.75 * np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
     return np.asarray((about & named).any(axis=1) & ~(about & ~named).any(axis=1))
 
 
 def sqrt_information_of(gaussian_prior: GaussianPrior, scales: Sequence[float]) -> SqrtInformation:
-    """A Gaussian prior without fixed numbers as rows of unit variance; `scales` (n,) of the usual priors."""
+    """Convert a Gaussian prior, without fixed numbers, to rows of unit variance; `scales` (n,) of default priors."""
     n, sigmas = len(gaussian_prior.names), gaussian_prior.sigmas
     R = root_of_information(gaussian_prior.covariance / np.outer(sigmas, sigmas), sigmas)
     return SqrtInformation(
@@ -445,7 +445,7 @@ def sqrt_information_of(gaussian_prior: GaussianPrior, scales: Sequence[float]) 
 
 
 def fewest(R: Array, d: Array, scales: Array) -> tuple[Array, Array]:
-    """Square-root information with the least number of rows, without empty columns."""
+    """Compress square-root information (R, d) to its rank by SVD, scaled by `scales` (n,)."""
     if not len(R):
         return R, d
     u, s, vt = np.linalg.svd(R * scales, full_matrices=False)

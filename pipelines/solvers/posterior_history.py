@@ -20,7 +20,7 @@ from alidade.pipelines.solvers.weak_directions import Posterior, constrained
 
 
 def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHistory | None:
-    """Values and joint covariance of the reported numbers at moments, weak directions at their priors.
+    """Filtered values and joint covariance of the reported numbers over time, weak directions at priors.
 
     The last moment has the posterior's own. None where there is but one, or no chain.
     """
@@ -45,7 +45,7 @@ def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHist
 def _known(
     problem: Problem, layout: Layout, values: Values, keys: Sequence[int], end: Reported, root: Array
 ) -> tuple[Array, Array]:
-    """Numbers (n,) and their covariance (n, n) at a moment, `keys` the variables that hold the parameters then.
+    """Filtered numbers (n,) and covariance (n, n) at one moment; `keys` of the parameters' variables then.
 
     `end` is the same at the end, which `root` is about.
     """
@@ -62,7 +62,7 @@ def _known(
 
 
 def _at_node(layout: Layout, variable: int, node: int) -> int:
-    """The variable of the same kind at a node; itself where it belongs to none."""
+    """Key of the same quantity's variable at another node; the key itself for a variable without nodes."""
     (at,) = layout.at([variable])
     if layout.node[at] < 0:
         return variable
@@ -71,7 +71,7 @@ def _at_node(layout: Layout, variable: int, node: int) -> int:
 
 
 def smoothed(compiled: Compiled, posterior: Posterior, covariance: Array) -> History | None:
-    """The reported numbers where nodes of a bias begin, that bias from the whole recording; None where none walks.
+    """Smoothed history of the reported numbers at the nodes of a walking bias; None if no bias walks.
 
     Args:
         compiled: the problem.

@@ -49,7 +49,7 @@ _MAX_CHANCE = 1e-3
 def solve_robust(
     engine: Linearization, values: Values, loss: TruncatedLoss | None, config: LevenbergConfig = DEFAULT
 ) -> Solution:
-    """Minimise the truncated loss from a first guess."""
+    """Minimise the truncated loss from an initial guess."""
     plain = engine.under(None)
     if loss is None:
         return minimize(plain, values, config)
@@ -79,7 +79,7 @@ def solve_robust(
 def _hardened(
     engine: Linearization, values: Values, softness: float, loss: TruncatedLoss, config: LevenbergConfig
 ) -> Values:
-    """Values to which measurements lead whose sigmas are so many times as large first, and then less and less.
+    """Find initial values by softened measurements: all sigmas `softness` times as large, reduced in stages.
 
     A dozen pictures, three of them outliers, are explained by a gyro scale 200 sigmas from its prior, and every way
     from there leads past the minimum. While measurements are soft, priors and process models hold.
@@ -95,7 +95,7 @@ def _hardened(
 
 
 def _soft(engine: Linearization, softness: float) -> Linearization:
-    """The engine with the sigmas of all measurements multiplied."""
+    """Multiply the sigmas of all measurements by `softness`."""
     soft = [replace(g, weights=g.all_weights / softness) if g.is_measurement else g for g in engine.groups]
     return engine.with_groups(soft)
 
@@ -107,7 +107,7 @@ def solve_truncated(
     config: LevenbergConfig,
     known: tuple[System, float] | None = None,
 ) -> Solution:
-    """Least squares on what lies inside the gate near some values, and on all of a family that loses too much.
+    """Minimise the truncated loss near some values; a family that loses its majority keeps all measurements.
 
     `known` is the system about the values, and the cost.
     """
@@ -125,7 +125,7 @@ def solve_truncated(
 def _graduated(
     engine: Linearization, values: Values, loss: TruncatedLoss, config: LevenbergConfig
 ) -> tuple[Values, int]:
-    """Values to which one surrogate of the loss after the other leads, and the iterations that takes."""
+    """Minimise a sequence of surrogates of the truncated loss (GNC); return values and iteration count."""
     residuals = engine.unweighted(values)
     each = zip(engine.groups, residuals, strict=True)
     largest = max((_norms(g, own).max(initial=0.0) for g, own in each if g.loss is not None), default=0.0)
@@ -152,19 +152,19 @@ def _graduated(
 
 
 def _undecided(engine: Linearization, residuals: Sequence[Array]) -> float:
-    """Share of measurements whose robust weight is neither 0 nor 1, by the whitened residuals of each group."""
+    """Share of measurements with a robust weight neither 0 nor 1, from each group's whitened residuals."""
     each = zip(engine.groups, residuals, strict=True)
     whole = np.concatenate([group.used(own) for group, own in each if group.loss is not None])
     return float(((whole > 0.0) & (whole < 1.0)).mean())
 
 
 def _norms(group: Group, residuals: Array) -> Array:
-    """Norms (n,) of measurements by their unweighted whitened residuals (n, m)."""
+    """Norms (n,) of measurements, from their unweighted whitened residuals (n, m)."""
     return np.linalg.norm(group.weighted(residuals), axis=1)
 
 
 def without_onsets(engine: Linearization, solution: Solution) -> Linearization | None:
-    """The engine without what lies at the smooth ends of disturbed intervals; None where there are none.
+    """Exclude the measurements at the onset and end of disturbed intervals; None where there are none.
 
     Of vectors alone: one component of a disturbance varies with the attitude.
     """
@@ -187,7 +187,7 @@ def without_onsets(engine: Linearization, solution: Solution) -> Linearization |
 
 
 def _mostly_rejected(engine: Linearization, values: Values) -> set[str]:
-    """Families that lose more than half of their measurements significantly (binomial test against one half)."""
+    """Families with significantly more than half of the measurements rejected (binomial test)."""
     counts: dict[str, list[int]] = {}
     for group in engine.groups:
         if group.loss is not None:

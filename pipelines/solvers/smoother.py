@@ -20,34 +20,34 @@ _RELINEARIZE_MOVE = 1e-2
 
 
 class Smoother(ABC):
-    """A smoother of the calibration variables and of recent states."""
+    """Incremental smoother of the calibration variables and of recent states."""
 
     @abstractmethod
     def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        """Add factors and new variables; `stamps` are times of last use of variables that age.
+        """Add factors and new variables; `stamps` are times of last use, s, of variables that leave the window.
 
         Raises RuntimeError, after which the smoother cannot be used, if the system is singular.
         """
 
     @abstractmethod
     def linearization_point(self) -> gtsam.Values:
-        """Values about which new factors are to be linear; the caller may add to them."""
+        """Values about which new factors are linearised; the caller may add new variables to them."""
 
     @abstractmethod
     def estimate(self) -> gtsam.Values:
-        """Current values of all variables; the caller may add to them."""
+        """Current values of all variables, in a container to which the caller may add."""
 
     @abstractmethod
     def moves(self, keys: Sequence[int]) -> Array:
-        """Moves (d,) of variables, in their order, from the linearization point to the estimate."""
+        """Moves (d,) of variables, in the order of `keys`, from the linearisation point to the estimate."""
 
     @abstractmethod
     def covariance(self, keys: Sequence[int]) -> Array:
-        """Joint marginal covariance (d, d) of variables, in their order."""
+        """Joint marginal covariance (d, d) of variables, in the order of `keys`."""
 
 
 class Isam2(Smoother):
-    """iSAM2 over the whole history: factors of variables that have moved are linearised again."""
+    """iSAM2 over the whole history, which relinearises the factors of variables that have moved."""
 
     def __init__(self) -> None:
         params = gtsam.ISAM2Params()
@@ -81,7 +81,7 @@ class Isam2(Smoother):
 
 
 class FixedLagSmoother(Smoother):
-    """A Gaussian in square-root form: active variables, and conditionals of those of the window before.
+    """Fixed-lag smoother in square-root form: a dense block of active variables, conditionals of the others.
 
     Active are the variables of the last moment and those that never age: a few dozen numbers that every measurement
     joins, one dense block. The others were eliminated from it in time order and stay as conditionals until their time
@@ -115,7 +115,7 @@ class FixedLagSmoother(Smoother):
         self._moves = self._solution()
 
     def _solution(self) -> gtsam.VectorValues:
-        """Moves of all variables from their first values."""
+        """Moves of all variables from their first values, the linearisation point."""
         assert self._present is not None
         bayes_net = gtsam.GaussianBayesNet()
         for conditional in (*(conditional for _, conditional in self._past), self._present):
@@ -123,7 +123,7 @@ class FixedLagSmoother(Smoother):
         return bayes_net.optimize()
 
     def _eliminate(self, graph: gtsam.GaussianFactorGraph) -> None:
-        """Eliminate a system, variables that are no longer active first, in time order."""
+        """Eliminate a linear system in time order, the variables no longer active first."""
         latest = max(self._stamps.values(), default=0.0)
         keys = graph.keyVector()
         for key in sorted((k for k in keys if self._stamps.get(k, latest) < latest), key=self._stamps.__getitem__):
@@ -135,7 +135,7 @@ class FixedLagSmoother(Smoother):
         self._present, _ = gtsam.EliminateQR(graph, ordering_of(active))
 
     def _forget(self) -> None:
-        """Remove the variables whose time has left the window."""
+        """Remove the variables last used before the window begins."""
         earliest = max(self._stamps.values(), default=0.0) - self._window
         while self._past and self._stamps[self._past[0][0]] < earliest:
             key, _ = self._past.pop(0)
@@ -157,7 +157,7 @@ class FixedLagSmoother(Smoother):
         return np.concatenate([(0.0 if key in moved else 1.0) * self._moves.at(key) for key in keys])
 
     def active_variables(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
-        """The Gaussian of the active variables, all others marginalised out, and values about which it is linear."""
+        """Marginal Gaussian of the active variables, and the values about which it is linear."""
         return self._conditionals(len(self._past)), self._first
 
     def covariance(self, keys: Sequence[int]) -> Array:
@@ -171,15 +171,15 @@ class FixedLagSmoother(Smoother):
         return np.asarray(rows @ rows.T)
 
     def _moved(self) -> set[int]:
-        """Active vectors, about whose estimate new factors are linear."""
+        """Keys of the active vectors; new factors are linearised about their estimate, not their first value."""
         return set() if self._present is None else self._vectors.intersection(self._present.keys())
 
     def _oldest(self, keys: Collection[int]) -> int:
-        """Index of the oldest of the variables among the conditionals; their number if none of them is there."""
+        """Index of the first conditional of any of the keys; the number of conditionals if none has one."""
         return next((i for i, (key, _) in enumerate(self._past) if key in keys), len(self._past))
 
     def _conditionals(self, first: int) -> gtsam.GaussianFactorGraph:
-        """The conditionals from one on, the active variables' Gaussian with them."""
+        """Graph of the conditionals from index `first` on, and of the active variables' Gaussian."""
         graph = gtsam.GaussianFactorGraph()
         for _, conditional in self._past[first:]:
             graph.push_back(conditional)
@@ -189,7 +189,7 @@ class FixedLagSmoother(Smoother):
 
 
 def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
-    """The keys as gtsam's ordering."""
+    """Convert keys to a gtsam ordering."""
     ordering = gtsam.Ordering()
     for key in keys:
         ordering.push_back(key)
@@ -197,7 +197,7 @@ def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
 
 
 def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
-    """Slice of each variable in the stacked tangents, in this order."""
+    """Slice of each variable in the stacked tangents of `keys`, in that order."""
     found, start = {}, 0
     for key in keys:
         found[key] = slice(start, start + dims[key])
@@ -206,7 +206,7 @@ def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
 
 
 def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
-    """The gtsam graph of the factors, in their order."""
+    """Collect the factors in a gtsam graph, in their order."""
     graph = gtsam.NonlinearFactorGraph()
     for f in factors:
         graph.add(f.factor)
@@ -214,7 +214,7 @@ def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
 
 
 def linear_graph_of(factors: Sequence[Factor], values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-    """The linear system of the factors about the values, in their order."""
+    """Linearise the factors about the values, in their order, to a Gaussian factor graph."""
     graph = gtsam.GaussianFactorGraph()
     for f in factors:
         graph.push_back(f.linearized(values))
@@ -222,12 +222,12 @@ def linear_graph_of(factors: Sequence[Factor], values: gtsam.Values) -> gtsam.Ga
 
 
 def linearized(factor: Factor, values: gtsam.Values) -> Factor:
-    """The factor linearised about the values for good."""
+    """Freeze a factor at its linearisation about the values."""
     return Factor(factor.family, gtsam.LinearContainerFactor(factor.linearized(values), values))
 
 
 def without_loss(factor: Factor) -> Factor:
-    """The factor without its loss: a smoother takes whole measurements or leaves them out."""
+    """Return the factor without its robust loss."""
     measurement = factor.measurement
     if measurement is None or measurement.loss is None:
         return factor
@@ -235,7 +235,7 @@ def without_loss(factor: Factor) -> Factor:
 
 
 def inliers(factor: Factor, values: gtsam.Values, loss: TruncatedLoss | None) -> Factor | None:
-    """The factor on the measurements to which the loss gives weight at the values; None if there are none."""
+    """Restrict the factor to the measurements with robust weight at the values; None if there are none."""
     if factor.measurement is None:
         return factor
     used = factor.measurement.under(loss).used(values)
@@ -247,7 +247,7 @@ def inliers(factor: Factor, values: gtsam.Values, loss: TruncatedLoss | None) ->
 
 
 def weigh(factors: Sequence[Factor], levels: Sequence[Level]) -> list[Factor]:
-    """The factors with their measurements' noise at these levels."""
+    """Scale the factors' measurement noise to these levels."""
     scaled = acting(levels)
     if not scaled:
         return list(factors)

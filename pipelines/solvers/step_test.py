@@ -62,7 +62,7 @@ NOTHING = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Tests of a step before each of J keyframes, at the levels of the solution without one.
+    """Test statistics of a rotation step before each of J keyframes, linearised at the solution without a step.
 
     Attributes:
         keyframe: (J,) the first one after it.
@@ -83,7 +83,7 @@ class Scan:
     information: Array
 
     def best(self) -> list[int]:
-        """The candidates, at most four: the two largest falls, the largest smaller test, and that where both agree.
+        """Indices of up to four candidates: the largest falls, the largest joint test, the largest that agrees.
 
         Motion dates a step to about a second, the jump with the chain unbroken to a keyframe. The largest fall may be a
         glitch of the reference, and its end lies close to it.
@@ -100,7 +100,7 @@ class Scan:
 
 
 def scan(chain: LinearChain, variances: Sequence[Array], columns: Index) -> Scan | None:
-    """Tests of a step at every keyframe; None where there are too few.
+    """Test for a step of a rotation at every keyframe; None if the recording has too few keyframes.
 
     Args:
         chain: about the solution.
@@ -115,7 +115,7 @@ def scan(chain: LinearChain, variances: Sequence[Array], columns: Index) -> Scan
 
 
 def _candidates(chain: LinearChain) -> tuple[Index, Array, Array]:
-    """Keyframes with measurements, the time of their first, and that of the last before."""
+    """Indices of the keyframes with measurements, time of their first one and of the last one before, s."""
     n, parts = chain.size[0], [r for r in chain.rows if r.is_measurement and len(r.states) == 1]
     first, last = np.full(n, np.inf), np.full(n, -np.inf)
     for rows in parts:
@@ -130,7 +130,7 @@ def _candidates(chain: LinearChain) -> tuple[Index, Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """One filter: of each keyframe the state by what comes before and with it, as (d, 1 + p) and covariances.
+    """One Kalman filter pass: predicted and updated states (N, d, 1 + p) with covariances (N, d, d).
 
     Attributes:
         X, P: predicted.
@@ -145,7 +145,7 @@ class _Pass:
     own: tuple[Array, Array]
 
     def learned(self, some: slice, beside: Array) -> Array:
-        """Information (m, 1 + p, 1 + p) on (1, shared) from the measurements of some keyframes, states eliminated."""
+        """Information (m, 1 + p, 1 + p) on (1, shared) from some keyframes' measurements, states marginalised out."""
         H, g = (each[some] for each in self.own)
         X, b = self.X[some], H @ self.X[some] + g
         crossed = np.swapaxes(X, 1, 2) @ (b + g)
@@ -154,7 +154,7 @@ class _Pass:
 
 
 def _filtered(chain: LinearChain, variances: Sequence[Array]) -> _Pass:
-    """A Kalman filter over the keyframes one after the other, derivatives by the shared parameters beside the state."""
+    """Run a Kalman filter over the keyframes, with the states' derivatives by the shared parameters."""
     (n, d), q = chain.size, chain.prior.shape[1]
     F, c, Q = chain.transitions(variances, True)
     H, g = np.zeros((n, d, d)), np.zeros((n, d, q))
@@ -174,7 +174,7 @@ def _filtered(chain: LinearChain, variances: Sequence[Array]) -> _Pass:
 
 
 def _beside(chain: LinearChain, variances: Sequence[Array], begin: int, end: int) -> Array:
-    """Squares (m, 1 + p, 1 + p) of residual and shared columns of the measurements of some keyframes."""
+    """Weighted squares (m, 1 + p, 1 + p) of [residual | shared Jacobian] of some keyframes' measurements."""
     out = np.zeros((end - begin, chain.prior.shape[1], chain.prior.shape[1]))
     for rows, variance in zip(chain.rows, variances, strict=True):
         if len(rows.states) == 1:
@@ -188,7 +188,7 @@ def _beside(chain: LinearChain, variances: Sequence[Array], begin: int, end: int
 def _two_sides(
     chain: LinearChain, variances: Sequence[Array], candidates: Index
 ) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
-    """For blocks of candidates: information A, B (m, q, q) on (1, shared), states X, Y (m, d, q) at j, covariance V.
+    """Yield information A, B (m, q, q), states X, Y (m, d, q) before and from j on, and V, in blocks of candidates j.
 
     A and X are from before j, priors included, B and Y from j on; V is that of their difference.
     """
@@ -213,7 +213,7 @@ def _two_sides(
 
 
 def _alone(chain: LinearChain, variances: Sequence[Array]) -> Array:
-    """Information (q, q) on (1, shared) of priors and of rows without a state."""
+    """Information (q, q) on (1, shared) from priors and from rows that involve no state."""
     prior = np.roll(chain.prior, 1, axis=1)
     out: Array = prior.T @ prior
     for rows, variance in zip(chain.rows, variances, strict=True):
@@ -224,7 +224,7 @@ def _alone(chain: LinearChain, variances: Sequence[Array]) -> Array:
 
 
 def _tests(A: Array, B: Array, X: Array, Y: Array, V: Array, columns: Index) -> tuple[Array, ...]:
-    """Fall with the step, chi-square of it by motion alone, how far both are apart, the step and its information."""
+    """Test statistics of candidates: fall of chi-square, fall by motion alone, their distance, step, information."""
     q, d = A.shape[1], len(columns)
     at = np.append(np.arange(q), 1 + columns)
     alone = B[:, at[:, None], at]
@@ -239,7 +239,7 @@ def _tests(A: Array, B: Array, X: Array, Y: Array, V: Array, columns: Index) -> 
 
 
 def _step_of(N: Array, q: int) -> tuple[Array, Array, Array]:
-    """Chi-square, value and information of the last numbers in information N on (1, shared, step)."""
+    """Chi-square, value and information of the step, from information N (m, ., .) on (1, shared, step)."""
     right = np.concatenate([N[:, 1:q, :1], N[:, 1:q, q:]], axis=2)
     solved = np.linalg.solve(N[:, 1:q, 1:q], right)
     whole = np.concatenate([N[:, q:, :1], N[:, q:, q:]], axis=2) - N[:, q:, 1:q] @ solved
@@ -249,12 +249,12 @@ def _step_of(N: Array, q: int) -> tuple[Array, Array, Array]:
 
 
 def _square(information: Array, x: Array) -> Array:
-    """x' information x, (n,)."""
+    """Quadratic form x' information x, (n,)."""
     return np.asarray(np.einsum("ni,nij,nj->n", x, information, x))
 
 
 def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
-    """Steps of one of `Problem.step_candidates` that explain a recording best, the most significant first.
+    """Find the steps of one of `Problem.step_candidates` that explain a recording best, most significant first.
 
     None where the recording determines too little for the tests.
     """
@@ -284,7 +284,7 @@ def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Soluti
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """A solution at the levels of the largest likelihood; what is rejected to an end of the recording is widened.
+    """Solution at the noise levels of largest marginal likelihood, with its linear chain and variances.
 
     Attributes:
         engine: with the noise stated.
@@ -313,14 +313,14 @@ class _Fit:
         return cls(engine, values, tuple(levels), chain, variances, value)
 
     def scanned(self, parameter: Parameter) -> Scan | None:
-        """Tests of steps of a parameter; None: it is none of the recording, or that is too short."""
+        """Test for steps of a parameter at all keyframes; None if it is not shared or the recording too short."""
         layout = self.engine.layout
         columns = np.flatnonzero(layout.root_columns(parameter.key)[:, layout.sizes[3] :].any(axis=0))
         return scan(self.chain, self.variances, columns) if len(columns) else None
 
 
 def _transient(outliers: Mask) -> Mask:
-    """Mask (n,) of outliers with measurements before and after them: the reference went off and came back."""
+    """Mask (n,) of the outliers that have inliers both before and after: a disturbance of the reference that ends."""
     used = np.flatnonzero(~outliers)
     between = np.zeros(len(outliers), dtype=bool)
     if len(used):
@@ -331,13 +331,13 @@ def _transient(outliers: Mask) -> Mask:
 def _maximised(
     engine: Linearization, values: Values, levels: Sequence[Level], outliers: Widening, transient: Widening
 ) -> _Fit:
-    """Noise levels and values of the largest likelihood, from initial ones."""
+    """Maximise the marginal likelihood over noise levels and values from initial ones."""
     best = maximise_likelihood(engine, LikelihoodMaximum(values, tuple(levels), outliers))
     return _Fit.of(engine, best.values, best.levels, transient)
 
 
 def _scanned(base: _Fit, parameter: Parameter, found: Scan) -> StepEstimate:
-    """The best candidate at the solution without a step."""
+    """Estimate of the step with the largest fall of chi-square, linearised at the solution without a step."""
     i = int(np.argmax(found.fall))
     layout, covariance = base.engine.layout, np.linalg.inv(found.information[i])
     _, J = parameter.coordinates(layout.to_gtsam(base.values, [parameter.key]), parameter.key)
@@ -348,13 +348,13 @@ def _scanned(base: _Fit, parameter: Parameter, found: Scan) -> StepEstimate:
 
 
 def _named(parameter: Parameter, steps: Array, covariance: Array) -> dict[str, tuple[float, float]]:
-    """Quantity -> step and its sigma."""
+    """Step and sigma of each quantity of a parameter, by name."""
     each = zip(steps.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
     return {q.name: step for q, step in zip(parameter.quantities, each, strict=True)}
 
 
 def _length(step: Array, covariance: Array) -> tuple[float, float]:
-    """Length of a vector, and its sigma along itself."""
+    """Length of a vector, and its sigma along the vector."""
     length = float(np.linalg.norm(step))
     along = step / max(length, 1e-300)
     return length, float(np.sqrt(along @ covariance @ along))
@@ -363,7 +363,7 @@ def _length(step: Array, covariance: Array) -> tuple[float, float]:
 def _solved_again(
     without: _Fit, base: _Fit, outliers: Widening, transient: Widening, parameter: Parameter, found: Scan, i: int
 ) -> StepEstimate | None:
-    """A candidate with levels, widening and linearisation of its own; None: it is not determined."""
+    """Re-estimate with a step at candidate i, noise levels and widening included; None if undetermined."""
     engine, values, late = split(base.engine, base.values, parameter.key, float(found.time[i]), found.step[i])
     try:
         fit = _maximised(engine, values, base.levels, outliers, transient)
@@ -407,7 +407,7 @@ def _solved_again(
 
 
 def _returns(fit: _Fit, columns: Index, time: float, turn: Array) -> bool:
-    """Whether a rotation steps back soon after its step: the reference was off, the mount is not.
+    """Whether a rotation steps back within `_GLITCH_S`: a glitch of the reference, not a slip of the mount.
 
     Args:
         fit: with the step.
@@ -425,14 +425,14 @@ def _returns(fit: _Fit, columns: Index, time: float, turn: Array) -> bool:
 
 
 def _leads_to(rows: Rows, keyframe: int) -> Mask:
-    """Mask (n,) of rows that join a keyframe to the one before."""
+    """Mask (n,) of rows that join a keyframe to its predecessor."""
     if len(rows.states) != 2:
         return np.zeros(len(rows.time), dtype=bool)
     return np.asarray(rows.states[1][0] == keyframe)
 
 
 def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, at: Array) -> float:
-    """Largest ratio of sandwich to nominal sigma over directions of numbers that go with the shared ones by D."""
+    """Largest ratio of sandwich to nominal sigma over all directions of numbers with Jacobian D by the shared ones."""
     nominal, robust, _ = sandwich(chain, variances, at)
     root = np.linalg.inv(np.linalg.cholesky(D @ nominal @ D.T))
     return max(1.0, float(np.linalg.eigvalsh(root @ D @ robust @ D.T @ root.T)[-1]) ** 0.5)
@@ -441,7 +441,7 @@ def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, at: Array) 
 def split(
     engine: Linearization, values: Values, key: int, time: float, step: Array
 ) -> tuple[Linearization, Values, int]:
-    """The linearisation with another rotation in force from a time on, the values, and that rotation's key.
+    """Add a second rotation in force from a time on; return linearisation, values and the rotation's key.
 
     Args:
         engine: as it is.
@@ -465,7 +465,7 @@ def split(
 
 
 def _with_late(group: Group, at: int, late: int, row: int, further: int, time: float) -> Group:
-    """A group of which late measurements have a variable so many columns further."""
+    """Rewire a group's measurements from a time on to another variable, `further` columns to the right."""
     blocks = [i for i, each in enumerate(group.at) if group.is_measurement and (each == at).all()]
     if not blocks:
         return group

@@ -73,7 +73,7 @@ KNOWN = 0.1
 
 @dataclass(frozen=True, eq=False)
 class WeakDirections:
-    """Orthonormal directions of the whitened numbers u, split by what the recording determines.
+    """Orthonormal directions of the whitened numbers u: strong (determined by the recording) and weak.
 
     Attributes:
         strong: (m, k) columns, best determined first.
@@ -110,7 +110,7 @@ class WeakDirections:
     def given(
         cls, R: Array, weak: Array, precision: Array, calibrated: NDArray[np.bool_] | None = None
     ) -> WeakDirections:
-        """Weak directions (m, w) as given, all others with the covariance that R and the prior of these leave.
+        """Split by given weak directions (m, w); the others get the covariance from R and the weak ones' prior.
 
         With C = (R_o'R_o)^-1 of the others, G = -C R_o'R_w their slope along the weak ones and S the prior covariance
         of the weak ones it is C + G S G'. Those that would follow the weak ones past their own priors are weak, too.
@@ -153,29 +153,29 @@ class WeakDirections:
 
     @property
     def all_sigmas(self) -> Array:
-        """Sigmas (m,) along the axes: posterior of the strong ones, prior of the weak ones."""
+        """Sigmas (m,) along the axes: posterior for strong directions, prior for weak ones."""
         return np.concatenate([self.sigmas, np.sqrt(np.diag(self.prior_covariance))])
 
     @property
     def followers(self) -> NDArray[np.bool_]:
-        """Mask (k, m): a strong direction is known so much better than an axis that it follows it."""
+        """Mask (k, m): the strong direction has a sigma so small that it depends on its slope along the axis."""
         return np.asarray(self.sigmas[:, None] < FOLLOWS * self.all_sigmas)
 
     def covariance(self) -> Array:
-        """Covariance (m, m) of u: posterior of strong directions, prior of weak ones, no correlation between them."""
+        """Covariance (m, m) of u: posterior for strong directions, prior for weak ones, uncorrelated."""
         root = self.strong * self.sigmas
         return root @ root.T + self.weak @ self.prior_covariance @ self.weak.T
 
     def root(self, power: float) -> Array:
-        """Covariance (m, m) of the strong directions to the half of a power."""
+        """Covariance (m, m) of the strong directions, raised to power / 2."""
         return np.asarray((self.strong * self.sigmas**power) @ self.strong.T)
 
     def again(self, R: Array) -> WeakDirections:
-        """The weak directions, with the strong ones of another square-root information (m, m)."""
+        """Keep the weak directions and recompute the strong ones from another square-root information (m, m)."""
         return WeakDirections.given(R, self.weak, self.precision, self.calibrated)
 
     def with_curvature(self, covariance: Array) -> WeakDirections:
-        """Add a covariance (k, k) of second order to the strong directions; those that become too wide are weak."""
+        """Add second-order covariance (k, k) to the strong directions; directions that get too wide become weak."""
         variances, axes = np.linalg.eigh(np.diag(self.sigmas**2) + covariance)
         axes, wide = self.strong @ axes, variances > MAX_SIGMA**2
         more = _calibrated(axes[:, wide], self.calibrated)
@@ -188,7 +188,7 @@ class WeakDirections:
 
 
 def _calibrated(wide: Array, calibrated: NDArray[np.bool_] | None, at_least: int = 0) -> Array:
-    """Directions in the span of wide ones (m, n) in which calibrated numbers have the larger part."""
+    """Directions (m, .) in the span of wide ones (m, n) that consist mostly of calibrated numbers."""
     if calibrated is None or not wide.shape[1]:
         return wide
     shares, turn = np.linalg.eigh(wide[calibrated].T @ wide[calibrated])
@@ -197,7 +197,7 @@ def _calibrated(wide: Array, calibrated: NDArray[np.bool_] | None, at_least: int
 
 
 def constrained_step(directions: WeakDirections, R: Array, d: Array, u: Array) -> Array:
-    """Move (m,) of u to the minimum over the strong directions, the weak ones at their prior means.
+    """Step (m,) of u to the minimum over the strong directions, the weak ones at their prior means.
 
     Args:
         directions: of the system at u.
@@ -213,7 +213,7 @@ def constrained_step(directions: WeakDirections, R: Array, d: Array, u: Array) -
 
 
 def constrained(reported: Reported, R: Array, d: Array) -> tuple[Reported, WeakDirections]:
-    """The numbers at the minimum of a linear system about them, weak directions at their priors, and its directions.
+    """Move the numbers to a linear system's minimum, weak directions at their priors; return both.
 
     Args:
         reported: where the system is linearised.
@@ -230,7 +230,7 @@ def slopes(
     follows: NDArray[np.bool_],
     ways: Array,
 ) -> Array:
-    """Slopes (n, k, m), in sigmas, of the strong directions along the axes, at points moved along ways (m, n).
+    """Slopes (n, k, m), in sigmas, of the strong directions along all axes, at points offset by ways (m, n).
 
     Args:
         directions: of the system at its solution.
@@ -245,7 +245,7 @@ def slopes(
 
 
 def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Array]]) -> Array:
-    """Covariance (k, k) of second order: how far strong directions follow the less known ones.
+    """Second-order covariance (k, k) of the strong directions, from their nonlinear dependence on the others.
 
     A strong direction that follows by w'Hw/2, w white in units of sigmas, has the variance tr(HH)/2 and the mean
     tr(H)/2 beside what the linear system says. Hw is the slope of its conditional minimum at w. Slopes at DRAWS
@@ -277,7 +277,7 @@ def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Arra
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The final posterior of the reported numbers: the one that all results are made of.
+    """Final posterior of the reported numbers, the source of all results.
 
     Attributes:
         at: values of all variables, weak directions at their prior means, with the system there; its engine is without
@@ -294,11 +294,11 @@ class Posterior:
 
     @property
     def covariance(self) -> Array:
-        """Covariance (n, n) of all reported numbers."""
+        """Covariance (n, n) of all reported numbers, fixed ones zero."""
         return self.reported.covariance(self.directions.covariance())
 
     def second_order_share(self) -> float:
-        """Largest ratio of the second-order variance to the variance that the linear system has."""
+        """Largest ratio of second-order to linear variance over all strong directions."""
         linear = self.directions.again(self.reported.root(self.at.factorization.root).R)
         unit = linear.strong / linear.sigmas
         return float(np.linalg.norm((self.directions.strong * self.directions.sigmas).T @ unit, 2)) ** 2 - 1.0
@@ -330,7 +330,7 @@ def constrained_solution(compiled: Compiled, minimum: Point) -> Posterior:
 
 
 def _contradicts(before: Posterior, after: Posterior) -> bool:
-    """Whether measurements and other priors contradict that more directions are at their prior means.
+    """Whether the cost contradicts moving additional directions to their prior means.
 
     What is hardly determined can be moved at a cost: a chi-square of (move / MAX_SIGMA)^2, to first order.
     """
@@ -339,12 +339,12 @@ def _contradicts(before: Posterior, after: Posterior) -> bool:
 
 
 def _unknown(compiled: Compiled, minimum: Point) -> Posterior:
-    """The posterior where no constrained minimum is found: all that is calibrated has its prior."""
+    """Posterior where no constrained minimum is found: all calibrated numbers at their priors."""
     return replace(_constrained(compiled, minimum, unfinished(compiled, minimum).directions), converged=False)
 
 
 def unfinished(compiled: Compiled, point: Point) -> Posterior:
-    """The posterior about values that are no minimum: all that is calibrated has its prior's covariance there."""
+    """Posterior about values that are no minimum: all calibrated numbers keep their prior covariance."""
     reported = Reported.of(compiled, point.values)
     R = reported.root(point.factorization.root).R
     weak = np.eye(len(R))[:, reported.calibrated]
@@ -354,7 +354,7 @@ def unfinished(compiled: Compiled, point: Point) -> Posterior:
 
 
 def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
-    """The posterior with some free numbers (m,) at their priors, uncorrelated with the rest, which keeps its marginal.
+    """Put some free numbers (m,) at their priors, uncorrelated with the rest, whose marginal stays.
 
     Those without a prior stay as they are.
     """
@@ -369,7 +369,7 @@ def at_prior(posterior: Posterior, numbers: NDArray[np.bool_]) -> Posterior:
 
 
 def beyond_second_order(compiled: Compiled, found: Posterior) -> NDArray[np.bool_]:
-    """Which free numbers (m,), those of one variable together, are part of terms of higher than second order.
+    """Mask (m,) of free numbers with significant terms beyond second order, alike within one variable.
 
     Second order goes far enough where slopes grow in proportion to the way: half the way they are half of what they
     are at the whole one. What that misses is compared with the covariance of all that stays.
@@ -396,7 +396,7 @@ def beyond_second_order(compiled: Compiled, found: Posterior) -> NDArray[np.bool
 
 
 def _share(known: Array, missed: Array) -> float:
-    """Largest ratio of two sigmas of a combination of numbers, by square roots (k, .) of their covariances."""
+    """Largest ratio of two sigmas over all combinations of numbers, from square roots (k, .) of their covariances."""
     if not len(known):
         return 0.0
     R = np.asarray(np.linalg.qr(known.T, mode="r"))
@@ -404,7 +404,7 @@ def _share(known: Array, missed: Array) -> float:
 
 
 def _constrained(compiled: Compiled, start: Point, fixed: WeakDirections | None = None) -> Posterior:
-    """The minimum with the weak directions at their prior means: those of the system there, or fixed ones.
+    """Find the minimum with the weak directions at their prior means; directions are re-found unless `fixed`.
 
     `start` is a minimum without constraints.
     """
@@ -437,12 +437,12 @@ def _constrained(compiled: Compiled, start: Point, fixed: WeakDirections | None 
 
 
 def _moved(at: Point, found: ReportedRoot, du: Array) -> Values:
-    """Values with the reported numbers moved by du (m,), all else where it is optimal then."""
+    """Move the reported numbers by du (m,) and all other unknowns to their conditional optimum."""
     return at.engine.layout.retract(at.values, followed(at.factorization, found.last(du[:, None])))
 
 
 def moved_roots(compiled: Compiled, found: Posterior, moves: Array) -> Iterator[Array]:
-    """Square-root information (m, m) of the numbers moved by (m, n) from a solution, all else following."""
+    """Yield the square-root information (m, m) of u re-linearised at points offset by the columns of (m, n)."""
     at = found.at
     last = found.reported.root(at.factorization.root).last(moves, 0.0)
     states, nodes = at.factorization.propagate(last)

@@ -21,7 +21,7 @@ Window = Keyframes | float | None
 
 
 def check_window(window: object) -> None:
-    """Raise InputError unless this is a window."""
+    """Raise InputError unless a window is a positive length or None."""
     if window is not None and not (isinstance(window, numbers.Real) and 0.0 < float(window) < float("inf")):
         raise InputError(f"window: {window!r}; seconds above zero are needed, or None for the whole history")
 
