@@ -49,7 +49,7 @@ class AllanCurve:
 
 
 def allan_curve(pieces: Sequence[Array], interval_s: float) -> AllanCurve:
-    """Overlapping Allan deviation, averaging times in octaves.
+    """Compute the overlapping Allan deviation at averaging times in octaves.
 
     Args:
         pieces: samples of a rate, each piece evenly spaced by interval_s; the differences of all are averaged.
@@ -73,7 +73,7 @@ def allan_curve(pieces: Sequence[Array], interval_s: float) -> AllanCurve:
 
 
 def allan_variance(tau: Array, squares: Array) -> Array:
-    """Allan variance (n,) of noises whose Q^2, N^2, B^2, K^2 are `squares` (4,), at tau (n,), s."""
+    """Allan variance (n,) of the model with Q^2, N^2, B^2, K^2 in `squares` (4,), at tau (n,), s."""
     return np.asarray(_shares(tau) @ squares)
 
 
@@ -90,7 +90,7 @@ def confidence(curve: AllanCurve, squares: Array) -> tuple[Array, Array, Array]:
 
 
 def _second_differences_squared(integral: Array, m: int) -> float:
-    """Sum of the squared second differences over m samples."""
+    """Sum of the squared second differences of an integrated signal over m samples."""
     count, total = len(integral) - 2 * m, 0.0
     for start in range(0, count, _BLOCK):
         stop = min(start + _BLOCK, count)
@@ -101,13 +101,13 @@ def _second_differences_squared(integral: Array, m: int) -> float:
 
 
 def _shares(tau: Array) -> Array:
-    """Allan variance (n, 4) of noises with Q, N, B, K = 1."""
+    """Allan variance (n, 4) of noises with unit coefficients Q, N, B, K, at tau (n,), s."""
     flat = np.full(len(tau), 2.0 * np.log(2.0) / np.pi)
     return np.stack([3.0 / tau**2, 1.0 / tau, flat, tau / 3.0], axis=1)
 
 
 def _degrees_of_freedom(curve: AllanCurve, tau: float, squares: Array) -> float:
-    """Twice the squared mean of the estimate over its variance."""
+    """Equivalent degrees of freedom of an Allan variance: twice the squared mean over the variance."""
     m = round(tau / curve.interval_s)
     # Longer averages are taken at a coarser grid of lags, on which the covariance is as smooth. That of quantisation is
     # not, and gets too few degrees of freedom there: where it matters, tau is short.
@@ -126,7 +126,7 @@ def _degrees_of_freedom(curve: AllanCurve, tau: float, squares: Array) -> float:
 
 
 def _second_difference_covariance(lag: Array, tau: float, squares: Array) -> Array:
-    """Covariance (n,) of second differences of the integral over tau that are lag (n,), s, apart."""
+    """Covariance (n,) of second differences (span tau, s) of the integral, at lags (n,), s."""
     out = np.zeros(len(lag))
     for shift, factor in ((-2, 1.0), (-1, -4.0), (0, 6.0), (1, -4.0), (2, 1.0)):
         out += factor * _integral_covariance(np.abs(lag + shift * tau), tau, squares)
@@ -134,7 +134,7 @@ def _second_difference_covariance(lag: Array, tau: float, squares: Array) -> Arr
 
 
 def _integral_covariance(t: Array, tau: float, squares: Array) -> Array:
-    """Generalised autocovariance of the integral at t (n,) >= 0, s."""
+    """Generalised autocovariance (n,) of the integrated noise at times t (n,) >= 0, s."""
     q, n, b, k = squares
     # A time of zero but for rounding.
     same = t < 1e-6 * tau

@@ -54,7 +54,7 @@ _STRETCHES = 3.0
 
 @dataclass(frozen=True)
 class Stability:
-    """The largest difference between an estimate on the way and the final one.
+    """Largest difference between the estimate at any earlier time and the final one, with its p-value.
 
     Attributes:
         statistic: its size as a standard normal number, by the cube root of chi-square over its degrees of freedom.
@@ -71,19 +71,19 @@ class Stability:
 
     @property
     def departures(self) -> dict[str, float]:
-        """Parameter -> estimate until then less the final one, in the sigmas of that difference; largest first."""
+        """Estimate before the change minus the final one, in sigmas of the difference, by parameter; largest first."""
         return {name: -size / max(sigma, 1e-300) for name, (size, sigma) in self.differences.items()}
 
     @property
     def changed(self) -> bool:
-        """Whether it is more than chance."""
+        """Whether the difference is significant."""
         return self.level < LEVEL
 
 
 def change_finding(
     found: Stability, parts: Mapping[str, SplitHalf], quantities: Sequence[Quantity], ratio: float = 1.0
 ) -> Finding | None:
-    """The finding of kind `change`: a NOTE where no step is material; None where no step is significant.
+    """Finding of kind `change`: a NOTE if no step is material; None if no step is significant.
 
     Its steps are those between the segments that are significant, the most significant first; where the segments have
     none, the estimate of the whole recording less that until the change, if that is significant by itself. A step is
@@ -110,18 +110,18 @@ def change_finding(
 
 
 def _significant(steps: Mapping[str, tuple[float, float]], ratio: float) -> dict[str, tuple[float, float]]:
-    """Steps beyond `_STEP` of their sigmas times the ratio, with these; the most significant first."""
+    """Select steps beyond `_STEP` sigmas, the sigmas multiplied by the ratio; most significant first."""
     wide = {name: (size, ratio * sigma) for name, (size, sigma) in steps.items()}
     return _by_size({name: step for name, step in wide.items() if abs(step[0]) > _STEP * step[1]})
 
 
 def _by_size(steps: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-    """Steps with their sigmas, the largest over its sigma first."""
+    """Sort steps by size over sigma, the largest first."""
     return dict(sorted(steps.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
 
 
 def step_stability(step: StepEstimate, duration: float) -> Stability:
-    """The test of a step anywhere in a recording, which has a time to step every `_EVERY_S`."""
+    """Convert a step estimate to a stability test, its p-value corrected for the number of possible times."""
     from scipy.special import chdtrc
 
     times = max(duration, _EVERY_S) / _EVERY_S
@@ -131,7 +131,7 @@ def step_stability(step: StepEstimate, duration: float) -> Stability:
 
 
 def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Sequence[Quantity]) -> Finding | None:
-    """The most severe finding, of kind `change` or `jump`, on a step that is significant; None where none is.
+    """Most severe finding of kind `change` or `jump` on significant steps; None if no step is significant.
 
     A change is a step that motion alone shows too, and the same one; it is a NOTE where it is not material. A `jump` is
     a material one that motion attributes neither to the mount nor to the reference.
@@ -148,7 +148,7 @@ def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Seq
 
 
 def _changed(step: StepEstimate, duration: float, quantities: Sequence[Quantity]) -> Finding | None:
-    """The finding that something changed; None where the step is not significant."""
+    """Finding of kind `change` on a step; None if the step is not significant."""
     significant = _significant(step.steps, step.ratio)
     if not significant or not step_stability(step, duration).changed:
         return None
@@ -157,37 +157,37 @@ def _changed(step: StepEstimate, duration: float, quantities: Sequence[Quantity]
 
 
 def _jump(step: StepEstimate) -> Finding:
-    """The finding that vision jumped: from a size on that no healthy reference has it keeps from `calibrated`."""
+    """Finding that the vision reference jumped: WEAK beyond the size of a healthy reference's jumps, else NOTE."""
     severity = Severity.WEAK if _certain_size(step) > _USUAL_JUMP else Severity.NOTE
     sizes = {"size": step.size, "sigma": step.ratio * step.sigma}
     return Finding("jump", severity, {"since_s": step.since_s, "time_s": step.time_s, **sizes})
 
 
 def _certain_size(step: StepEstimate) -> float:
-    """Lower bound of a step at two sigmas, rad."""
+    """Lower bound of a step's size at two sigmas, rad."""
     return step.size - _SURE * step.ratio * step.sigma
 
 
 def _is_material(step: StepEstimate, quantities: Sequence[Quantity]) -> bool:
-    """Whether a step is certainly more than half of what is required, and than a reference's own slow error."""
+    """Whether a step certainly exceeds half the required accuracy and the slow error of a reference."""
     required = min(q.require for q in quantities if q.name in step.steps)
     return _certain_size(step) > max(_MATERIAL * required, _LEAST_STEP)
 
 
 def _is_jump(step: StepEstimate, duration: float) -> bool:
-    """Whether vision jumps by a step, be that the mount's or not."""
+    """Whether the vision reference jumps significantly at a step, by the mount's slip or by its own error."""
     return step.jumped and step.agrees and step_stability(replace(step, by_motion=np.inf), duration).changed
 
 
 def with_change(estimate: Estimate, change: Finding) -> Estimate:
-    """The estimate with an immaterial change in its covariance: the steps occur together, P + s s'."""
+    """Add an immaterial change to an estimate's covariance: P + s s', with all steps s at once."""
     steps: Mapping[str, tuple[float, float]] = change.evidence["steps"]
     step = np.array([steps.get(name, (0.0, 0.0))[0] for name in estimate.names])
     return widened(estimate, CHANGE, step[:, None], change.evidence["time_s"])
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
-    """Stability of an estimate; None without a posterior over time, or without anything that could change.
+    """Test an estimate's stability over time; None without a posterior history or anything that could change.
 
     Quantities that walk are left out, since they may change, and those that are hardly better known than before.
 
@@ -225,7 +225,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
 
 
 def _long_enough(estimate: Estimate, numbers: int) -> float:
-    """Time, s, from which all families of coloured residuals have enough segments; infinite where they never do."""
+    """Time, s, from which every coloured family has enough correlation lengths; infinite if one never has."""
     latest = -np.inf
     for family, together in estimate.colours.items():
         times = np.sort(estimate.residuals[family].time)
@@ -238,7 +238,7 @@ def _long_enough(estimate: Estimate, numbers: int) -> float:
 def _with_priors_as_found(
     estimate: Estimate, quantities: Sequence[Quantity], values: Array, P: Array
 ) -> tuple[Array, Array]:
-    """Posterior (k, n), (k, n, n) over time under priors widened so that no parameter lies far beyond its own.
+    """Posterior values (k, n) and covariances (k, n, n) over time, under priors widened to fit the estimate.
 
     Widening priors changes the information by numbers on the diagonal (Woodbury 1950), of all of them at once.
     Variances above the priors', as terms of second order may make them, count as the priors'.
@@ -261,7 +261,7 @@ def _with_priors_as_found(
 
 
 def _whitening(P: Array, last: Array) -> Array:
-    """Matrix (r, n) that whitens differences between the estimate with covariance P and the last one."""
+    """Matrix (r, n) that whitens the difference between an estimate with covariance P and the final one."""
     root = np.linalg.cholesky(P + 1e-12 * np.diag(np.diag(P)))
     scaled = np.linalg.solve(root, np.linalg.solve(root, P - last).T)
     eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
@@ -270,7 +270,7 @@ def _whitening(P: Array, last: Array) -> Array:
 
 
 def _as_normal(square: Array, dof: Array) -> Array:
-    """Chi-square as a standard normal number (Wilson, Hilferty 1931); minus infinity without degrees of freedom."""
+    """Convert chi-square to a standard normal number (Wilson, Hilferty 1931); -inf for zero degrees of freedom."""
     dof = np.broadcast_to(dof, square.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
         size = (np.cbrt(square / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
@@ -278,7 +278,7 @@ def _as_normal(square: Array, dof: Array) -> Array:
 
 
 def _exceeded(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -> float:
-    """Share of drawn paths whose largest difference is as large or larger."""
+    """Share of simulated histories whose largest normalised difference is at least `size`."""
     rng = np.random.default_rng(0)
     n = P.shape[1]
     roots = [_root(P[i] - P[i + 1], P[i]) for i in range(len(P) - 1)]
@@ -295,7 +295,7 @@ def _exceeded(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -
 
 
 def _root(covariance: Array, larger: Array) -> Array:
-    """R with R R' the covariance, what rounding made negative left out; `larger` is one that is, with its scale."""
+    """Square root R R' of a covariance without negative eigenvalues; `larger` covariance gives the scale."""
     scale = np.sqrt(np.maximum(np.diag(larger), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))

@@ -20,7 +20,7 @@ _STRETCH = 5.0
 
 @dataclass(frozen=True)
 class ChecklistItem:
-    """Motion or position that a method needs, and how far it is covered.
+    """Motion or position that a method needs, with the share covered so far.
 
     Attributes:
         what: its name.
@@ -40,7 +40,7 @@ class ChecklistItem:
 
 
 def swayed(name: str, turned: Array, enough: float, what: str, who: str) -> list[ChecklistItem]:
-    """An item an axis: how far it turned (3,) rad, of which `enough` is wanted.
+    """Build a checklist item for each axis: angle rotated (3,) rad against the required angle `enough`, rad.
 
     `what` to do comes before the axis; `who` is to be turned, in a word.
     """
@@ -61,7 +61,7 @@ def swayed(name: str, turned: Array, enough: float, what: str, who: str) -> list
 
 
 def turned(t: Array, gyro: Array) -> Array:
-    """Largest rotation about each axis within a few seconds, (3,) rad."""
+    """Largest rotation about each axis within a few seconds, (3,) rad, by integrating gyro rates."""
     rate = gyro - np.median(gyro, axis=0)
     angle = np.vstack([np.zeros(3), np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(t)[:, None], axis=0)])
     starts = np.searchsorted(t, np.arange(t[0], t[-1], _STRETCH))

@@ -19,7 +19,7 @@ from alidade.pipelines.settings import Config
 
 @dataclass(frozen=True)
 class SplitHalf:
-    """A parameter from either segment of a recording: values and sigmas, SI."""
+    """A parameter's estimates from the two segments of a recording: values and sigmas, SI."""
 
     first: float
     first_sigma: float
@@ -49,7 +49,7 @@ _Number = tuple[Quantity, float, float]
 def split_halves(
     build: Build, faults: FaultModel, data: Any, config: Config
 ) -> tuple[dict[str, SplitHalf], tuple[str, ...]]:
-    """Solve either half of a recording by itself, see `solve_segments`; also "first", "second" of those not solved."""
+    """Solve both halves of a recording separately, see `solve_segments`; also "first", "second" if unsolved."""
     start, stop = faults.span(data)
     parts = _solved_parts(build, faults, data, config, 0.5 * (start + stop))
     return _in_both(*parts), tuple(name for name, part in zip(("first", "second"), parts, strict=True) if not part)
@@ -58,7 +58,7 @@ def split_halves(
 def solve_segments(
     build: Build, faults: FaultModel, data: Any, config: Config, middle: float, levels: Sequence[Level] = ()
 ) -> dict[str, SplitHalf]:
-    """The parameters that a recording determines both before and after a time (s); none when a part has no solution.
+    """Solve the segments before and after a time, s; return the parameters that both determine.
 
     Parameters that a prior determines in either part are left out: they would agree whatever was recorded. A bias that
     walks differs between the parts by its walk too.
@@ -92,7 +92,7 @@ def _in_both(first: Mapping[str, _Number], second: Mapping[str, _Number]) -> dic
 
 
 def _at_levels(build: Build, levels: Mapping[str, Level], data: Any, config: Config) -> Problem:
-    """The problem with noise levels that are known."""
+    """Build the problem with the noise levels of a previous solution fixed."""
     problem = build(data, config)
     known = (levels.get(level.noise.name, level) for level in problem.noises)
     noises = tuple(
@@ -105,7 +105,7 @@ def _at_levels(build: Build, levels: Mapping[str, Level], data: Any, config: Con
 def _solved(
     build: Build, faults: FaultModel, data: Any, config: Config, start: float, stop: float
 ) -> dict[str, _Number]:
-    """The numbers of [start, stop), s, of a recording by itself; none when it has no solution."""
+    """Solve the segment [start, stop), s, of a recording by itself; empty if there is no solution."""
     found = solve_trial(build, faults.segment(data, start, stop), config, f"{start:.0f} to {stop:.0f} s")
     if found is None or not found.estimate.converged:
         return {}

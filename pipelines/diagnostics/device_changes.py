@@ -67,7 +67,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Together:
-    """A step of all numbers at once: chi-square and degrees of freedom, and how often chance does as much."""
+    """Joint test of all numbers for a step after one recording: chi-square, degrees of freedom, significance."""
 
     after: int
     chi_square: float
@@ -77,7 +77,7 @@ class Together:
 
 @dataclass(frozen=True)
 class Rate:
-    """Random-walk rate of a kind of numbers, SI per root of a day, with its upper limit `upper` (95 %)."""
+    """Random-walk rate of a kind of numbers, SI per square root of a day, and the 95 % upper limit `upper`."""
 
     rate: float
     upper: float
@@ -85,7 +85,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes of a device found in a history of recordings.
+    """Changes of a device found over the history of its recordings.
 
     Attributes:
         level: p-value of any step.
@@ -105,13 +105,13 @@ class Changes:
 
     @property
     def judged(self) -> tuple[Change, ...]:
-        """Every number's step after every recording, those found as they are with all of them."""
+        """Each number's step after each recording; the significant steps are estimated jointly."""
         found = {(step.name, step.after): step for step in self.found}
         return tuple(found.get((step.name, step.after), step) for step in self.steps)
 
     @property
     def any(self) -> bool:
-        """Whether anything changed."""
+        """Whether any change is significant."""
         return bool(self.found) or any(each.significant for each in self.together)
 
 
@@ -122,7 +122,7 @@ def changes(
     asked: Collection[str] | None = None,
     level: float = LEVEL,
 ) -> Changes:
-    """Changes of the device's numbers, which count as the same in all recordings.
+    """Test a device's numbers for steps between recordings.
 
     Args:
         joined: the recordings, in the order of their dates.
@@ -157,7 +157,7 @@ def changes(
 
 
 def _columns(joined: Joined, questions: Sequence[tuple[str, int, int]]) -> Array:
-    """Columns (rows, questions) of a unit step of a number in all recordings after one."""
+    """Columns (rows, questions) of the joint system for a unit step of a number in all recordings after one."""
     ends = np.cumsum([len(d) for _, d in joined.rows])
     whole = np.concatenate([R for R, _ in joined.rows])
     after, last = ends[: len(joined.parts)], ends[len(joined.parts) - 1]
@@ -168,7 +168,7 @@ def _columns(joined: Joined, questions: Sequence[tuple[str, int, int]]) -> Array
 
 
 def _without(A: Array, columns: Array, b: Array) -> tuple[Array, Array]:
-    """Columns and right sides less what the unknowns explain."""
+    """Project columns and right side b on the complement of A's range."""
     basis = np.linalg.qr(A).Q
     return columns - basis @ (basis.T @ columns), b - basis @ (basis.T @ b)
 
@@ -185,7 +185,7 @@ def _steps(questions: Sequence[tuple[str, int, int]], left: Array, residual: Arr
 def _found(
     A: Array, b: Array, columns: Array, questions: Sequence[tuple[str, int, int]], grown: Array, limit: float
 ) -> list[Change]:
-    """One step after the other, each with those before it in the system."""
+    """Find significant steps one by one, each estimated with the earlier ones in the system."""
     taken: list[int] = []
     while len(taken) < _MOST_STEPS:
         left, residual = _without(np.hstack([A, columns[:, taken]]), columns, b)
@@ -207,7 +207,7 @@ def _found(
 
 
 def _limit(left: Array, level: float) -> float:
-    """Size in sigmas that the largest of all steps has by chance in one history in so many."""
+    """Threshold, in sigmas, on the largest of all steps, for a false-alarm probability `level`."""
     singly, tests = level * (1.0 - _JOINTLY), left.shape[1]
     if tests > _MOST_TESTS or singly * _DRAWN < _FEW:
         return float(quantile(1.0 - singly / tests, 1.0)) ** 0.5
@@ -243,7 +243,7 @@ def _rates(
     days: Sequence[float],
     grown: Array,
 ) -> dict[str, Rate]:
-    """Kind -> how its numbers walk."""
+    """Estimate the random-walk rate of each kind of numbers."""
     found = {}
     for which in dict.fromkeys(kind(name) for name, _, _ in questions):
         own = [i for i, (name, _, _) in enumerate(questions) if kind(name) == which]
@@ -257,7 +257,7 @@ def _rates(
 
 
 def _rate(squares: Array, information: Array) -> Rate:
-    """Maximum-likelihood rate from squares of independent numbers with variances 1 + rate^2 information."""
+    """Maximum-likelihood rate, from squares of independent numbers with variances 1 + rate^2 information."""
 
     def doubled(rate: float) -> float:
         variance = 1.0 + rate**2 * information
@@ -267,7 +267,7 @@ def _rate(squares: Array, information: Array) -> Rate:
 
 
 def maximum_likelihood_sigma(minus_two_log_likelihood: Callable[[float], float], scale: float) -> tuple[float, float]:
-    """The standard deviation of the largest likelihood, and its 95 % upper bound, which may be infinite.
+    """Maximum-likelihood standard deviation and its 95 % upper bound, which may be infinite.
 
     Args:
         minus_two_log_likelihood: of a standard deviation >= 0; it has one minimum.
@@ -296,7 +296,7 @@ Verdict = Literal["holds", "changed", "unknown", "same"]
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """Whether an earlier calibration still holds on a recording.
+    """Result of a test whether an earlier calibration holds on a new recording.
 
     Attributes:
         changes: of the parameters between the two.
@@ -308,26 +308,26 @@ class CalibrationCheck:
 
     @property
     def verdict(self) -> Verdict:
-        """Unknown where the recording determines no parameter that could be compared."""
+        """Verdict: "unknown" where the recording determines no comparable parameter, else "changed" or "holds"."""
         if not self.changes.steps:
             return "unknown"
         return "changed" if self.changes.any else "holds"
 
     @property
     def steps(self) -> Sequence[Change]:
-        """Change of every parameter; changes found are given with all others found."""
+        """Change of every parameter, with all significant changes estimated jointly."""
         return self.changes.judged
 
     @property
     def matters(self) -> bool:
-        """Whether a parameter that changed did by more than is required of it."""
+        """Whether a significant change exceeds the parameter's required accuracy."""
         return any(abs(step.size) > self.quantities[step.name].require for step in self.changes.found)
 
 
 def check_calibration(
     known: GaussianPrior, sqrt_info: SqrtInformation, quantities: Sequence[Quantity], inflations: Mapping[str, float]
 ) -> CalibrationCheck:
-    """Test an earlier calibration against a recording of the device, as two recordings of one device are.
+    """Test an earlier calibration against a recording, as two recordings of one device.
 
     The priors count once. The recording's own numbers, its bias and its time offset, are its own.
 

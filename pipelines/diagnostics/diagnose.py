@@ -26,7 +26,7 @@ _RESIDUAL = ("not_converged", "misfit", "noise", "correlation", "rejection")
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When a departure counts. Shares are of a family of measurements or of the recording."""
+    """Thresholds of the findings; shares are of a family of measurements or of the recording."""
 
     rejected_note: float = 0.10
     rejected: float = 0.25
@@ -61,7 +61,7 @@ def diagnose(
     hypotheses: Sequence[Finding] = (),
     contradictions: Sequence[Finding] = (),
 ) -> tuple[Finding, ...]:
-    """All findings, the most severe first; equally severe ones in causal order, cause before symptom.
+    """Derive all findings from an estimate, the most severe first; equally severe ones cause before symptom.
 
     Args:
         estimate: values (n,) with their final covariance (n, n).
@@ -91,7 +91,7 @@ def diagnose(
 
 
 def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
-    """Why there is no solution: what the solver said, and before it that most parameters are not determined."""
+    """Reason why there is no solution, in words: the solver's message, or too many undetermined parameters."""
     found = [verdict(q, sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True) if q.judged]
     open_ones, free = found.count("unobservable"), len(found) - found.count("fixed")
     if estimate.converged or deadline.passed() or open_ones <= _MOST * free:
@@ -103,7 +103,7 @@ def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
 
 
 def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
-    """Whether faults of the data are to be tested as hypotheses, each by solving again."""
+    """Whether the findings call for tests of data faults, each of which solves the problem again."""
     if estimate.solver == "published":
         return False
     correlated = estimate.colours.keys()
@@ -116,7 +116,7 @@ def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
 
 
 def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
-    """Nuisance parameters and those of a prior tighter than usual, worst first, inseparable ones as one.
+    """Findings on nuisance and tightly stated parameters far from their priors, worst first.
 
     Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
     """
@@ -137,7 +137,7 @@ def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iter
 
 
 def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
-    """Calibrated parameters far from their priors, worst first: legitimate for a mount of 90 deg, and worth a note."""
+    """Findings of calibrated parameters far from their priors, worst first; legitimate for a mount of 90 deg."""
     z = {
         j: float((estimate.values[j] - q.prior_mean) / q.prior_sigma)
         for j, q in enumerate(quantities)
@@ -157,7 +157,7 @@ def _prior_conflict(
 
 
 def rejections(estimate: Estimate) -> list[Finding]:
-    """Families of which more is rejected than outliers are, the largest share first."""
+    """Findings of families with more rejected measurements than outliers explain, the largest share first."""
     every = {f: r.used for f, r in estimate.residuals.items() if len(r.used) >= LIMITS.min_few}
     least = {
         f: LIMITS.rejected_note if len(used) >= LIMITS.min_family else LIMITS.rejected_few for f, used in every.items()
@@ -172,7 +172,7 @@ def rejections(estimate: Estimate) -> list[Finding]:
 
 
 def _noise(estimate: Estimate) -> Iterator[Finding]:
-    """Statements that the recording contradicts; an estimate far above its statement is no noise."""
+    """Findings of stated or default noise levels that the recording contradicts."""
     for level in estimate.levels:
         known, own = level.together, set(level.noise.families)
         least = -np.inf if level.sigma is None else (level.found or 0.0) - LIMITS.noise_sigmas * level.sigma
@@ -188,13 +188,13 @@ def _noise(estimate: Estimate) -> Iterator[Finding]:
 
 
 def _share(level: Level) -> float:
-    """A noise over the level beyond which errors are no noise; 0 where it is stated, not at its default."""
+    """Ratio of a default noise's level to the limit for noise, beyond which errors are systematic; 0 if stated."""
     is_default = level.noise.source == "default"
     return level.used / (level.noise.no_noise or level.noise.spec.no_noise) if is_default else 0.0
 
 
 def _correlations(estimate: Estimate) -> Iterator[Finding]:
-    """Residuals correlated for so long that they are no noise; a correlation length counts measurements."""
+    """Findings of residuals with correlation lengths, in measurements, too long for noise."""
     for family, length in estimate.colours.items():
         share = length / len(estimate.residuals[family].time)
         if share > LIMITS.correlated:
@@ -202,7 +202,7 @@ def _correlations(estimate: Estimate) -> Iterator[Finding]:
 
 
 def _error_map(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
-    """Errors by where measurements are made; INCONSISTENT where they are as far above their data sheet as no noise."""
+    """Finding of systematic errors by position; INCONSISTENT far beyond the data sheet."""
     found = estimate.error_map
     if found is None:
         return
@@ -232,7 +232,7 @@ def _slow_errors(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator
 
 
 def misfits(chi_square: ChiSquare | None, levels: Sequence[Level]) -> list[Finding]:
-    """Chi-square of all residuals where the noise is known exactly; of single processes where levels are estimated."""
+    """Findings of chi-square: of all residuals if the noise is known exactly, else of single processes."""
     if chi_square is None:
         return []
     levels = levels if any(level.noise.estimated for level in levels) else ()
@@ -256,7 +256,7 @@ def _misfit(family: str | None, fit: Fit, largest: str, noise_factor: float, sev
 
 
 def disturbances(estimate: Estimate) -> Iterator[Finding]:
-    """Intervals in which most measurements of a family are rejected, in time order."""
+    """Findings of intervals with most measurements of a family rejected, in time order."""
     for family, residuals in estimate.residuals.items():
         order = np.argsort(residuals.time, kind="stable")
         time, rejected = residuals.time[order], ~residuals.used[order]
@@ -271,7 +271,7 @@ def disturbances(estimate: Estimate) -> Iterator[Finding]:
 
 
 def _dominant_priors(quantities: Sequence[Quantity], covariance: Array) -> Iterator[Finding]:
-    """Data-sheet figures that make most of the variance of weak parameters, the largest share first.
+    """Findings of data-sheet figures that cause most of a weak parameter's variance, largest share first.
 
     The share of a figure is the part of a variance that conditioning on its nuisance parameters removes:
     P_wn P_nn^-1 P_nw over P_ww; the covariance (n, n) is in the order of the quantities.
@@ -294,7 +294,7 @@ def _dominant_priors(quantities: Sequence[Quantity], covariance: Array) -> Itera
 
 
 def _ambiguity(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
-    """The second best solution where it is nearly as likely, the parameters that differ most first."""
+    """Finding of a second solution nearly as likely as the best, most different parameters first."""
     if estimate.second is None:
         return
     there, scales = estimate.second.values, np.array([q.scale for q in quantities])

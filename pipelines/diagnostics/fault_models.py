@@ -27,7 +27,7 @@ class ScaleFactor:
 
 @dataclass(frozen=True)
 class ExactInput:
-    """A number of data or config that the graph has no uncertainty of.
+    """A number of data or config without uncertainty in the graph.
 
     Attributes:
         name: as in result.json.
@@ -44,7 +44,7 @@ class ExactInput:
 
 @dataclass(frozen=True)
 class DataFault:
-    """A fault that only one method's data can have.
+    """A data fault specific to one method.
 
     Attributes:
         label: in words.
@@ -60,7 +60,7 @@ class DataFault:
 
 @dataclass(frozen=True)
 class FaultModel:
-    """Faults that are tested by solving again, in the names of the data's fields.
+    """Faults to test by solving again, in terms of the data's fields.
 
     Attributes:
         streams: stamps -> what carries them.
@@ -85,12 +85,12 @@ class FaultModel:
         return [time for name in self.streams if (time := getattr(data, name)) is not None]
 
     def span(self, data: Any) -> tuple[float, float]:
-        """First and last stamp, s; zeros where there is none."""
+        """First and last stamp, s; zeros where there are no stamps."""
         times = [time for time in self.times(data) if len(time)]
         return float(min((t[0] for t in times), default=0.0)), float(max((t[-1] for t in times), default=0.0))
 
     def segment(self, data: Any, start: float, stop: float) -> Any:
-        """The data of [start, stop), s; times stay as they are."""
+        """Select the data in [start, stop), s, with unchanged times."""
         changes: dict[str, Array] = {}
         for stamps, fields in self.streams.items():
             time = getattr(data, stamps)

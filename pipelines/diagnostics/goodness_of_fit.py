@@ -30,7 +30,7 @@ class Fit:
 
     @classmethod
     def of(cls, value: float, dof: float) -> Fit:
-        """Chi-square value with its interval."""
+        """Build a chi-square value with its interval."""
         if dof < 1.0:
             return cls(value, dof, np.nan, np.nan)
         return cls(value, dof, quantile(_TAIL, dof), quantile(1.0 - _TAIL, dof))
@@ -67,7 +67,7 @@ class InnovationTest:
 
     @classmethod
     def of(cls, residuals: Residuals) -> InnovationTest | None:
-        """Test the innovations of used measurements; None when there are too few."""
+        """Test the innovations of inlier measurements; None if there are too few."""
         used = residuals.whitened[residuals.used]
         n, rows = used.shape
         if n < _MIN_INNOVATIONS:
@@ -81,7 +81,7 @@ class InnovationTest:
 
 @dataclass(frozen=True)
 class SolverDifference:
-    """The largest difference of an estimate from a reference solution.
+    """Largest difference of an estimate from a reference solution, in sigmas.
 
     Attributes:
         parameter: that differs most, in units of its own sigma.
@@ -95,7 +95,7 @@ class SolverDifference:
 
 
 def solver_difference(estimate: Estimate, reference: Estimate) -> SolverDifference | None:
-    """Compare with a reference solution of the same problem; None when that has none, or all is fixed."""
+    """Compare with a reference solution of the same problem; None if unconverged or without free numbers."""
     free = np.flatnonzero((estimate.sigmas > 0.0) & (reference.sigmas > 0.0))
     if not len(free) or not reference.converged:
         return None

@@ -57,7 +57,7 @@ def find_hypotheses(
     estimate: Estimate | None = None,
     freed: Config | None = None,
 ) -> tuple[Finding, ...]:
-    """Faults with whose correction a recording fits that does not as it is, the best fit first.
+    """Find faults whose correction makes a misfitting recording fit, the best fit first.
 
     Args:
         build: makes the graph of the data.
@@ -93,7 +93,7 @@ def find_hypotheses(
 
 
 def misstatements(build: Build, model: FaultModel, data: Any, config: Config) -> tuple[Finding, ...]:
-    """Statements of the config without which the recording fits as well, by parameters much nearer to their priors.
+    """Find config statements without which the recording fits equally well and much nearer to the priors.
 
     Arguments as of `find_hypotheses`. Faults without such a statement cost nothing.
     """
@@ -106,7 +106,7 @@ def misstatements(build: Build, model: FaultModel, data: Any, config: Config) ->
 
 
 def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]:
-    """One finding for hypotheses whose chi-square is alike, the best of them named and the others its equivalents."""
+    """Combine hypotheses of nearly equal cost into one finding: the best, with the others as equivalents."""
     groups: list[list[_Tested]] = []
     for each in found:
         if groups and each[0].cost_with_priors - groups[-1][0][0].cost_with_priors < _SIGNIFICANT**2:
@@ -130,14 +130,14 @@ def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]
 
 
 def _explaining(build: Build, cases: Iterable[TrialCase], before: TrialFit, concurrent: int) -> list[_Tested]:
-    """The cases that explain the misfit, the best fit first."""
+    """Solve the cases and keep those that explain the misfit, the best fit first."""
     found = [each for each in _solved(build, cases, concurrent) if _explains(before, each[0])]
     # Corrections that fit alike are weighed by their priors: a mount that is likely before one that is not.
     return sorted(found, key=lambda each: each[0].cost_with_priors / max(each[0].dof, 1.0))
 
 
 def _solved(build: Build, cases: Iterable[TrialCase], concurrent: int) -> list[_Tested]:
-    """The cases that have a solution."""
+    """Solve the cases and keep those with a solution."""
     cases = list(cases)
     works = [partial(solve_trial, build, case.data, case.config, case.label) for case in cases]
     fits = parallel.done(works, _WHAT, concurrent)
@@ -145,7 +145,7 @@ def _solved(build: Build, cases: Iterable[TrialCase], concurrent: int) -> list[_
 
 
 def _promising(build: Build, model: FaultModel, data: Any, config: Config, before: TrialFit) -> list[TrialCase]:
-    """The cases worth solving, by their scores after a few iterations on a short segment, alike ones by priors."""
+    """Select the cases worth solving, by scores after a few iterations on a short segment."""
     found = list(trial_cases(build, model, data, config))
     cases = [*found, TrialCase("", data, config)]
     if model.cut and before.estimate.residuals:
@@ -173,7 +173,7 @@ def _worst_segment(residuals: Mapping[str, Residuals], length: float) -> tuple[f
 
 
 def _explains(before: TrialFit, after: TrialFit) -> bool:
-    """Whether chi-square falls by far more than chance, and to (nearly) what it should be.
+    """Whether a correction reduces chi-square significantly and to (nearly) its expectation.
 
     A corrected gyro whose noise is far larger than its residuals fits any motion, as larger noise would.
     """
@@ -185,7 +185,7 @@ def _explains(before: TrialFit, after: TrialFit) -> bool:
 
 
 def _noise(build: Build, data: Any, config: Config) -> list[_Tested]:
-    """Noises whose estimate is larger than stated, the largest first; none so large as to explain anything."""
+    """Noises with an estimate larger than stated, the largest first, limited to plausible factors."""
     found = solve_trial(build, data, config.model_copy(update={"noise_known": _NOISE_KNOWN}))
     levels = [level for level in found.estimate.levels if level.contradicted] if found is not None else []
     return [

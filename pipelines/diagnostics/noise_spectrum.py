@@ -93,7 +93,7 @@ class NoiseFit:
 
 @dataclass(frozen=True, eq=False)
 class _Bins:
-    """Bins of the transform: mean power (n,), how many numbers are in each, mean variance for each noise (n, 4)."""
+    """Frequency bins of a transform: mean power (n,), count (n,), and mean variance for each unit noise (n, 4)."""
 
     hz: Array
     power: Array
@@ -155,7 +155,7 @@ def _variances(hz: Array, interval_s: float) -> Array:
 
 
 def _widest_band(bins: _Bins) -> tuple[_Bins, Array, Mask]:
-    """The band up to the highest frequency at which some model fits; all of it where none does.
+    """Find the band up to the highest frequency at which a model fits; the whole band if none fits.
 
     A sensor's own low-pass filter takes away noise near half the sampling rate; what is below it is the density that
     counts for an integral. Quantisation is what rises up to half the sampling rate; in a narrower band it has no place.
@@ -180,7 +180,7 @@ def _fits(bins: _Bins, squares: Array) -> bool:
 
 
 def _select(bins: _Bins, candidates: Sequence[str]) -> tuple[Array, Mask]:
-    """Squares of the coefficients (4,) and which of them the model has: one after the other as long as one shows."""
+    """Select noises stepwise by likelihood; return squared coefficients (4,) and the mask of noises in the model."""
     left = {NOISES.index(name) for name in candidates} - {_N}
     model = np.zeros(4, dtype=bool)
     model[_N] = True
@@ -203,13 +203,13 @@ def _select(bins: _Bins, candidates: Sequence[str]) -> tuple[Array, Mask]:
 
 
 def _likelihood(bins: _Bins, squares: Array) -> float:
-    """Twice its logarithm."""
+    """Twice the log likelihood of the bins' power under squared coefficients (4,)."""
     variance = bins.basis @ squares
     return -float(bins.count @ (np.log(variance) + bins.power / variance))
 
 
 def _maximise(bins: _Bins, model: Mask, fixed: tuple[int, float] | None = None) -> Array:
-    """Squares (4,) of the largest likelihood, zero outside the model; `fixed` is one of them and its fixed value.
+    """Maximum-likelihood squared coefficients (4,), zero outside the model; `fixed` gives an index and its value.
 
     Fisher scoring in the logarithms, which keeps variances positive; a noise that is not there goes to nearly zero.
     """
@@ -240,7 +240,7 @@ def _maximise(bins: _Bins, model: Mask, fixed: tuple[int, float] | None = None) 
 
 
 def _sigmas(bins: _Bins, squares: Array, model: Mask) -> Array:
-    """Sigmas (4,) of the squares in the model, from the information of all numbers of the transform."""
+    """Sigmas (4,) of the squared coefficients in the model, from the Fisher information of all bins."""
     relative = bins.basis[:, model] * squares[model] / (bins.basis @ squares)[:, None]
     information = 0.5 * relative.T @ (bins.count[:, None] * relative)
     out = np.zeros(4)
@@ -260,7 +260,7 @@ def _coefficient(i: int, bins: _Bins, squares: Array, model: Mask, samples: int,
 
 
 def _bound(i: int, bins: _Bins, squares: Array, model: Mask) -> float:
-    """What the square is below with 95 % confidence: where the likelihood, the others free, has fallen by so much."""
+    """Upper limit (95 %) of the squared coefficient i, by the profile likelihood."""
     with_it = model.copy()
     with_it[i] = True
     start = _maximise(bins, with_it)
@@ -284,7 +284,7 @@ def _bound(i: int, bins: _Bins, squares: Array, model: Mask) -> float:
 def _needed(
     i: int, bins: _Bins, squares: Array, model: Mask, square: float, samples: int, interval_s: float
 ) -> float | None:
-    """Length of one record, s, in which noise i of this square beside the others of the model would be determined."""
+    """Length, s, of one record that would determine noise i with this squared coefficient."""
     with_it = model.copy()
     with_it[i] = True
     there = np.where(np.arange(4) == i, square, squares)
@@ -304,7 +304,7 @@ def _needed(
 
 
 def _worst_octave(bins: _Bins, variance: Array) -> tuple[float, float]:
-    """Power found over that of the model in the octave where they differ most, 1 within chance; its middle, Hz."""
+    """Observed over modelled power in the octave of largest difference (1: not significant), and its centre, Hz."""
     edges = np.append(np.arange(len(bins.hz), 0, -_PER_OCTAVE), 0)[::-1]
     worst, where = 1.0, float(bins.hz[-1])
     for start, stop in pairwise(edges.tolist()):
@@ -319,7 +319,7 @@ def _worst_octave(bins: _Bins, variance: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class AxisNoise:
-    """Noise of one axis.
+    """Noise of one sensor axis: Allan deviation, noise coefficients, sinusoids.
 
     Attributes:
         curve: its Allan deviation, sinusoids included.
@@ -339,7 +339,7 @@ class AxisNoise:
 
 
 def axis_noise(pieces: Sequence[Array], interval_s: float) -> AxisNoise:
-    """The noise of one axis from pieces (n,) of a record at rest, each evenly spaced by interval_s."""
+    """Estimate one axis' noise from pieces (n,) of a record at rest, each evenly spaced by interval_s."""
     lines = find_lines(pieces, interval_s)
     steady = without_lines(pieces, interval_s, lines) if lines else pieces
     beside = _BESIDE / (interval_s * max(len(piece) for piece in pieces))
@@ -352,7 +352,7 @@ def axis_noise(pieces: Sequence[Array], interval_s: float) -> AxisNoise:
 
 
 def _coarse_step(pieces: Sequence[Array]) -> float | None:
-    """The smallest change of a reading, where it is no smaller than a couple of times the usual change."""
+    """Quantisation step of the readings where it hides the noise, else None."""
     change = np.concatenate([np.abs(np.diff(piece)) for piece in pieces])
     moved = change[change > 0.0]
     if not len(moved):

@@ -37,7 +37,7 @@ _DEFAULT_ADVICE = Motion("vary the motion while recording, record longer, or giv
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """A factor that numbers have in common with the strength of what a sensor measures, in the linear approximation.
+    """Factor common to a sensor's numbers and the strength of the measured field, linearised.
 
     A magnetometer's K and b, and the field, fit as well when all are multiplied by one factor, which only the prior of
     the field's strength determines. K and b in units of that strength, their shape, are what a recording determines.
@@ -56,7 +56,7 @@ class Scaling:
 
 
 def scalings(quantities: Sequence[Quantity], covariance: Array, values: Array) -> list[Scaling]:
-    """The common factors of quantities with this covariance (n, n) and these values (n,), SI."""
+    """Common factors of quantities, from their covariance (n, n) and values (n,), SI."""
     found = []
     for factor in dict.fromkeys(q.factor for q in quantities if q.factor is not None):
         of = np.array([q.factor == factor and q.assumed for q in quantities])
@@ -69,7 +69,7 @@ def scalings(quantities: Sequence[Quantity], covariance: Array, values: Array) -
 
 
 def verdict(quantity: Quantity, sigma: float) -> Verdict:
-    """The contract's verdict on a parameter with this posterior sigma, SI."""
+    """Return the contract's verdict on a parameter with a given posterior sigma, SI."""
     if quantity.prior_sigma == 0.0:
         return "fixed"
     unchanged = sigma >= _UNCHANGED * quantity.scale
@@ -81,7 +81,7 @@ def verdict(quantity: Quantity, sigma: float) -> Verdict:
 def verdicts(
     quantities: Sequence[Quantity], covariance: Array, findings: Sequence[Finding], values: Array
 ) -> dict[str, Verdict]:
-    """Parameter -> verdict, of those with a required accuracy, and of a shape where that is required instead.
+    """Verdict of each parameter with a required accuracy, or of the sensor's shape where that is required instead.
 
     Of a solution that rejected more than a quarter of a family, as its findings have it, nothing is `observable`: what
     is left are the measurements that agree with it.
@@ -102,7 +102,7 @@ def verdicts(
 
 
 def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
-    """A verdict on a number of a solution with these findings: of one that rejects many none is `observable`.
+    """Downgrade a verdict by the findings: no solution, or a solution that rejects many measurements.
 
     Where there is no solution nothing is determined.
     """
@@ -112,12 +112,12 @@ def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
 
 
 def has_no_solution(findings: Sequence[Finding]) -> bool:
-    """Whether a solver whose values are to be used found none."""
+    """Whether the findings say that the solver found no solution."""
     return any(each.kind == "not_converged" and each.severity > Severity.NOTE for each in findings)
 
 
 class DerivedNumber(NamedTuple):
-    """SENSOR_scale, what the strength of what a sensor measures leaves open, or SENSOR_shape, K and b given that.
+    """Derived number: SENSOR_scale, the relative sigma of the strength, or SENSOR_shape, K and b given the strength.
 
     Attributes:
         name: as above.
@@ -135,7 +135,7 @@ class DerivedNumber(NamedTuple):
 def derived(
     quantities: Sequence[Quantity], covariance: Array, values: Array, findings: Sequence[Finding]
 ) -> list[DerivedNumber]:
-    """Scale and shape of the sensors whose scale no recording separates from the strength of what they measure.
+    """Compute scale and shape of sensors with a scale inseparable from the measured strength.
 
     Args:
         quantities: n of them.
@@ -148,7 +148,7 @@ def derived(
 
 
 def _scale(scaling: Scaling, quantities: Sequence[Quantity]) -> DerivedNumber:
-    """The strength is required to be so well known that no number judged by itself misses its accuracy for it."""
+    """Compute SENSOR_scale, with the strength accuracy at which no judged number misses its own requirement."""
     moved = zip(quantities, _moved(scaling, quantities).tolist(), strict=True)
     rows = [(q, m) for q, m in moved if m > 0.0 and q.factor == scaling.factor]
     require = min((scaling.sigma * q.require / m for q, m in rows), default=None)
@@ -165,7 +165,7 @@ def _shape(scaling: Scaling, quantities: Sequence[Quantity]) -> DerivedNumber:
 
 
 def _moved(scaling: Scaling, quantities: Sequence[Quantity]) -> Array:
-    """(n,) what one sigma of a strength moves the numbers by that are judged by themselves."""
+    """Shift (n,) of each judged number per sigma of a field's strength; 0 for the others."""
     return np.where([q.judged and q.prior_sigma != 0.0 for q in quantities], np.abs(scaling.moves), 0.0)
 
 
@@ -174,7 +174,7 @@ def _worst(found: Iterable[Verdict]) -> Verdict:
 
 
 def rejects_many(findings: Sequence[Finding]) -> bool:
-    """Whether so much of a family is rejected, in one of the recordings, that these are no outliers."""
+    """Whether any recording's findings reject more of a family than outliers explain."""
     return any(
         rejects_many(each.evidence["findings"])
         if each.kind == "recording"
@@ -184,7 +184,7 @@ def rejects_many(findings: Sequence[Finding]) -> bool:
 
 
 def finite_covariance(quantities: Sequence[Quantity], covariance: Array) -> Array:
-    """Covariance (n, n), symmetric and finite: fixed quantities at zero, invalid variances very wide, uncorrelated."""
+    """Make a covariance (n, n) symmetric and finite: fixed quantities 0, invalid variances very wide, uncorrelated."""
     covariance = np.asarray(covariance, dtype=float).reshape(len(quantities), len(quantities))
     covariance = 0.5 * (covariance + covariance.T)
     fixed = np.array([q.prior_sigma == 0.0 for q in quantities], dtype=bool)
@@ -250,14 +250,14 @@ def _direction(severity: Severity, weights: Mapping[str, float], ratio: float, a
 
 
 def _degenerate(ratios: Array) -> list[Index]:
-    """Indices of falling ratios in runs of nearly equal ones of one verdict each: their eigenvectors are arbitrary."""
+    """Runs of nearly equal decreasing ratios with one verdict, as indices: their eigenvectors are arbitrary."""
     falls = ratios[1:] < _DEGENERATE * ratios[:-1]
     changes = (ratios[1:] >= _UNCHANGED) != (ratios[:-1] >= _UNCHANGED)
     return [run for run in np.split(np.arange(len(ratios)), np.flatnonzero(falls | changes) + 1) if len(run)]
 
 
 def _simplest_basis(basis: Array) -> Array:
-    """Orthonormal basis (n, k) of the same space with as few large components as can be.
+    """Rotate an orthonormal basis (n, k) of a space to as few large components as possible.
 
     Quartimax rotation (Neuhaus, Wrigley 1954): maximises the sum of the fourth powers of the components.
     """
@@ -270,7 +270,7 @@ def _simplest_basis(basis: Array) -> Array:
 
 
 def _weights(names: Sequence[str], vector: Array) -> dict[str, float]:
-    """The components worth naming, strongest first and that one positive."""
+    """Components of a direction worth naming, the strongest first and positive."""
     order = np.argsort(-np.abs(vector), kind="stable")
     sign = 1.0 if vector[order[0]] >= 0.0 else -1.0
     return {names[i]: sign * float(vector[i]) for i in order if abs(vector[i]) >= _MIN_WEIGHT}
@@ -278,7 +278,7 @@ def _weights(names: Sequence[str], vector: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class TimeToAccuracy:
-    """When a parameter reached its required accuracy, and when the recording was most informative about it.
+    """Time when a parameter reached its required accuracy, and time of largest information gain.
 
     Attributes:
         met_s: time from which on its sigma was as required, s; None: never.
@@ -294,7 +294,7 @@ class TimeToAccuracy:
 def time_to_accuracy(
     history: History, names: Sequence[str], quantities: Sequence[Quantity]
 ) -> dict[str, TimeToAccuracy]:
-    """Parameter -> time to its required accuracy, of those estimated, from the history of a filter.
+    """Time to the required accuracy of each estimated parameter, from the history of a filter.
 
     Information is the inverse of the variance less that of the prior; what a walking parameter loses counts as none
     gained.

@@ -34,7 +34,7 @@ _REFINED = 8
 
 @dataclass(frozen=True)
 class Line:
-    """A sinusoid: frequency, Hz, known to resolution_hz; amplitude (peak) in the sensor's unit; band_hz it spoils."""
+    """A sinusoid: frequency hz with resolution_hz, peak amplitude in the sensor's unit, disturbed band_hz."""
 
     hz: float
     amplitude: float
@@ -43,7 +43,7 @@ class Line:
 
 
 def find_lines(pieces: Sequence[Array], interval_s: float) -> tuple[Line, ...]:
-    """The strongest sinusoids in pieces of a record at rest, by amplitude; none where the record is too short.
+    """Find the strongest sinusoids in pieces of a record at rest, by amplitude; none if the record is too short.
 
     Args:
         pieces: samples, each piece evenly spaced by interval_s.
@@ -76,7 +76,7 @@ def find_lines(pieces: Sequence[Array], interval_s: float) -> tuple[Line, ...]:
 
 
 def without_lines(pieces: Sequence[Array], interval_s: float, lines: Sequence[Line]) -> list[Array]:
-    """The pieces less the steady part of each sinusoid: what keeps its frequency, phase and amplitude over a piece."""
+    """Subtract from each piece the sinusoids' steady part, of constant frequency, phase and amplitude."""
     out = []
     for piece in pieces:
         left = piece - piece.mean()
@@ -87,7 +87,7 @@ def without_lines(pieces: Sequence[Array], interval_s: float, lines: Sequence[Li
 
 
 def _less(x: Array, rate: float, resolution: float) -> Array:
-    """x less the sinusoid that fits it best near a rate, all in rad a sample."""
+    """Subtract the best-fitting sinusoid near a rate from x; rate and resolution in rad per sample."""
     # Turned down to nearly zero and averaged in blocks, the line is the peak of a short spectrum.
     block = max(1, int(np.pi / (4.0 * resolution)))
     count = -(-len(x) // block)
@@ -113,7 +113,7 @@ def _less(x: Array, rate: float, resolution: float) -> Array:
 
 
 def _welch(pieces: Sequence[Array], size: int) -> tuple[Array, int]:
-    """One-sided density (size/2 + 1,), squares per cycle a sample, and the number of windows."""
+    """Welch's one-sided density (size/2 + 1,), squares per cycle per sample, and the number of windows."""
     window = np.hanning(size + 1)[:-1]
     total, windows = np.zeros(size // 2 + 1), 0
     for piece in pieces:
@@ -125,7 +125,7 @@ def _welch(pieces: Sequence[Array], size: int) -> tuple[Array, int]:
 
 
 def _floor(power: Array) -> Array:
-    """Median of the neighbours; fewer of them at both ends, so that a slope in frequency does not bias it."""
+    """Noise floor of a power spectrum: running median, of a shorter symmetric window at both ends."""
     half = _NEIGHBOURS // 2
     out = np.empty(len(power))
     out[half : len(power) - half] = np.median(np.lib.stride_tricks.sliding_window_view(power, 2 * half + 1), axis=1)
@@ -136,7 +136,7 @@ def _floor(power: Array) -> Array:
 
 
 def _merged(edges: Index) -> Index:
-    """Ranges [start, stop) with those joined that a window's spread parts."""
+    """Merge ranges [start, stop) nearer to each other than the spread of a window."""
     if not len(edges):
         return edges
     apart = edges[1:, 0] - edges[:-1, 1] > 2 * _SPREAD

@@ -23,7 +23,7 @@ from alidade.pipelines.settings import Config
 
 
 def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | None:
-    """The config with everything free that it fixes, and parameters that it states tightly; None: it fixes nothing.
+    """Return the config with all fixed and tightly stated parameters free; None if it fixes nothing.
 
     Args:
         config: in force.
@@ -50,7 +50,7 @@ def contradictions(
     quantities: Sequence[Quantity],
     ratio: float,
 ) -> tuple[Finding, ...]:
-    """Findings of kind `contradiction`, the worst first: fixed numbers that the recording contradicts.
+    """Findings of kind `contradiction`: fixed numbers that the recording contradicts, the worst first.
 
     INCONSISTENT where freeing it shifts a required parameter by half of what is required, else a NOTE.
 
@@ -95,7 +95,7 @@ def contradictions(
 
 
 def _each_freed(sqrt_info: SqrtInformation, inside: Mask) -> tuple[Array, Array, Array, Array]:
-    """Solution with each of f fixed numbers freed, scaled: H_AA^-1 H_AF (a, f), x (f,), I (f,), correlations (f, f)."""
+    """Free each of f fixed numbers by itself: gain (a, f), value (f,), information (f,), correlations (f, f)."""
     R, a = sqrt_info.R * sqrt_info.scales, int(inside.sum())
     rows = np.column_stack([R[:, inside], R[:, ~inside], sqrt_info.d])
     T = np.asarray(np.linalg.qr(rows, mode="r"), dtype=float)

@@ -35,7 +35,7 @@ _STEADY, _LARGEST_BIAS = 0.01, 0.2
 
 
 def stretches_at_rest(t: Array, sensors: Sequence[Array], gyro: Array | None = None) -> Array:
-    """Beginnings and ends (P, 2), s, of the static intervals, each at a sample; P = 0 where there is none.
+    """Find static intervals: start and end (P, 2), s, each at a sample; P = 0 where there is none.
 
     Args:
         t: (N,) s, increasing; a pause of the recorder ends an interval.
@@ -60,7 +60,7 @@ def stretches_at_rest(t: Array, sensors: Sequence[Array], gyro: Array | None = N
 
 
 def _quiet(blocks: Array) -> Mask:
-    """Mask of blocks (count, size, k) in which one sensor is at rest."""
+    """Mask of blocks (count, size, k) during which one sensor is at rest."""
     blocks = blocks - blocks[0, 0]  # readings that never change are exactly zero then
     means = blocks.mean(axis=1)
     variance = ((blocks - means[:, None]) ** 2).mean(axis=(1, 2))
@@ -80,7 +80,7 @@ def _quiet(blocks: Array) -> Mask:
 
 
 def _not_turning(gyro: Array, spans: Index) -> Mask:
-    """Mask of spans with the mean rate of a rest."""
+    """Mask of spans with a mean rate that is one constant bias, without a steady rotation."""
     means = np.array([gyro[start : stop + 1].mean(axis=0) for start, stop in spans])
     rate = np.linalg.norm(means, axis=1)
     same = np.linalg.norm(means - means[np.argmin(rate)], axis=1) < _STEADY

@@ -22,7 +22,7 @@ _FIRST_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 0.01, 5e-3, 4
 
 @dataclass(frozen=True)
 class TrialCase:
-    """Changed data and config, and the fault that they correct, in words."""
+    """A fault, in words, with the data and config that correct the fault."""
 
     label: str
     data: Any
@@ -30,7 +30,7 @@ class TrialCase:
 
 
 def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """All faults to test, except those that count only where no other fits."""
+    """Yield all faults to test, except those that count only where no other fits."""
     yield from data_faults(model, data, config)
     yield from inverted_signs(model, data, config)
     yield from axis_orders(model, data, config)
@@ -40,21 +40,21 @@ def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> I
 
 
 def data_faults(model: FaultModel, data: Any, config: Config, role: str = "usual") -> Iterator[TrialCase]:
-    """Trial cases of the method's own faults of a role."""
+    """Yield trial cases of the method's own faults of one role."""
     for fault in model.faults:
         if fault.role == role and (corrected := fault.corrected(data, config)) is not None:
             yield TrialCase(fault.label, *corrected)
 
 
 def _readings(model: FaultModel, data: Any) -> Iterator[tuple[str, str, Sequence[str], Array]]:
-    """Field, sensor, columns and readings of the sensors whose axes may be wrong, as far as they are there."""
+    """Yield field, sensor, columns and readings of the present sensors with possibly wrong axes."""
     for name, (sensor, columns) in model.signs.items():
         if (values := getattr(data, name)) is not None:
             yield name, sensor, columns, values
 
 
 def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """Trial cases of every choice of inverted axes of a sensor."""
+    """Yield trial cases for every combination of inverted axes of a sensor."""
     for name, sensor, columns, values in _readings(model, data):
         for signs in product((1.0, -1.0), repeat=len(columns)):
             wrong = [column for column, sign in zip(columns, signs, strict=True) if sign < 0.0]
@@ -66,7 +66,7 @@ def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[Tri
 
 
 def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """Axes of a sensor in another order: two of them swapped, or turned by a right angle about the third."""
+    """Yield trial cases with a sensor's axes permuted: two swapped, or a right angle about the third."""
     for name, sensor, columns, values in _readings(model, data):
         if len(columns) < 3:
             continue
@@ -86,7 +86,7 @@ def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialC
 
 
 def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """Trial cases of rates in deg/s, or converted to rad/s twice."""
+    """Yield trial cases with rates in deg/s, or converted to rad/s twice."""
     for name, sensor, _, values in _readings(model, data):
         if "gyro" in name:
             for label, changed in {
@@ -97,7 +97,7 @@ def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
 
 
 def late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """The stamps that may be late moved to where residuals are smallest."""
+    """Yield a trial case with delayed stamps shifted to the smallest residuals."""
     if model.clock is None:
         return
     stamps, source = model.clock
@@ -112,7 +112,7 @@ def late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> I
 
 
 def scale_factors(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
-    """Numbers of the config multiplied by what makes residuals smallest."""
+    """Yield trial cases with config numbers multiplied by the factor of smallest residuals."""
     for factor in model.scalings:
         if factor.apply(data, config, 1.0) is None:
             continue
@@ -131,13 +131,13 @@ def scale_factors(build: Build, model: FaultModel, data: Any, config: Config) ->
 
 
 def _cost(build: Build, changed: Callable[[float], tuple[Any, Config]], size: float) -> float:
-    """Chi-square with a change of some size; infinite where there is no solution."""
+    """Cost of the solution after a change of some size; infinite without a solution."""
     found = solve_trial(build, *changed(size), label=f"change of {size:.3g}")
     return found.cost if found else np.inf
 
 
 def _lowest(cost: Callable[[float], float], step: float, start: float = 0.0) -> float | None:
-    """The size of a change that costs least, searched for from `start` on; None when there is none.
+    """Find the size of a change with the lowest cost, from `start` on; None if there is none.
 
     From the best so far a step to either side, and to the bottom of the parabola through the three.
     """

@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrialFit:
-    """Fit of a recording after a change: the solution, and the loss of the measurements it rejected.
+    """Fit of a recording after a change: the solution, and the loss of the rejected measurements.
 
     Attributes:
         quantities: of the problem.
@@ -65,7 +65,7 @@ class TrialFit:
 
     @classmethod
     def of(cls, problem: Problem, estimate: Estimate) -> TrialFit | None:
-        """Fit of an estimate; None where it has no chi-square."""
+        """Build the fit of an estimate; None if the estimate has no chi-square."""
         if estimate.chi_square is None or not np.isfinite(estimate.chi_square.value):
             return None
         rejected = {f: int((~r.used).sum()) for f, r in estimate.residuals.items()}
@@ -76,7 +76,7 @@ class TrialFit:
 
     @property
     def cost(self) -> float:
-        """Chi-square, the rejected measurements and the priors of assumed errors included.
+        """Chi-square, including the rejected measurements and the priors of nuisance parameters.
 
         A gyro whose scale is -1 fits where an axis has the wrong sign.
         """
@@ -94,25 +94,25 @@ class TrialFit:
 
     @property
     def factor(self) -> float:
-        """Factor on the noise used with which the recording would fit."""
+        """Noise factor with which the recording would fit."""
         return float(np.sqrt(self.cost / max(self.dof, 1.0)))
 
     @property
     def fits(self) -> bool:
-        """Whether chi-square, and that of the assumed errors, lie within, with no more than a few outliers rejected."""
+        """Whether chi-square and nuisance parameters lie within their intervals, with few outliers rejected."""
         few, priors = self.chi_square.dof > (1.0 - _MAX_OUTLIERS) * self.dof, self._assumed
         within = not priors or sum(priors) <= Fit.of(0.0, float(len(priors))).high
         return few and within and self.chi_square.value <= Fit.of(0.0, self.chi_square.dof).high
 
 
 def _from_priors(quantities: Sequence[Quantity], values: Array) -> list[float]:
-    """Squares of how far values (n,) are from their priors, in the priors' sigmas."""
+    """Squared distances of values (n,) from their priors, in the priors' sigmas."""
     found = zip(quantities, values.tolist(), strict=True)
     return [((x - q.prior_mean) / q.prior_sigma) ** 2 for q, x in found if q.prior_sigma]
 
 
 def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> TrialFit | None:
-    """The batch solution of changed data; None when there is none.
+    """Solve changed data in batch; None if there is no solution.
 
     A trial has data and noise that nobody recorded: what it raises ends the trial alone, and is logged. A worker
     process that is lost says nothing of the trial, and is raised.
@@ -121,7 +121,7 @@ def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> Tri
 
 
 def score_trial(build: Build, data: Any, config: Config, label: str = "") -> tuple[float, float]:
-    """Median whitened residual of measurements plus that of processes near the least-squares solution, and its priors.
+    """Median whitened residual of measurements plus that of processes after few steps, and the prior cost.
 
     Infinite when there is no solution; exceptions as of `solve_trial`.
     """
@@ -130,7 +130,7 @@ def score_trial(build: Build, data: Any, config: Config, label: str = "") -> tup
 
 
 def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
-    """The result of a trial; None without time left, or where it raises: logged, a program's defect as a warning."""
+    """Run a trial; None past the deadline or after an exception, which is logged (a defect as a warning)."""
     from alidade.pipelines.solvers.chain import IndeterminateError
 
     if deadline.passed():
@@ -155,7 +155,7 @@ def _solution(build: Build, data: Any, config: Config) -> TrialFit | None:
 
 
 def max_concurrent(times: Sequence[Array]) -> int:
-    """Trials solved at the same time, by memory: each holds a graph of samples with these stamps."""
+    """Number of trials to solve at once, limited by memory, for graphs with these stamps."""
     return max(_MAX_SAMPLES // max((len(time) for time in times), default=1), 1)
 
 
@@ -178,7 +178,7 @@ def _score(problem: Problem) -> tuple[float, float]:
 
 
 def held_out_residuals(problem: Problem) -> dict[str, float]:
-    """Family -> robust standard deviation of held-out measurements, over that of noise and prediction together.
+    """Robust standard deviation of held-out measurements over that of noise and prediction, by family.
 
     One chunk in five is held out, a pose of a cube with all that was seen in it. Expected is 1.
     """
@@ -206,7 +206,7 @@ def held_out_residuals(problem: Problem) -> dict[str, float]:
 
 
 def _normalised(residuals: Array, predicted: Array) -> Array:
-    """Whitened residuals (n, m) in units of noise and prediction, drawn (n, m, k), along the axes of their covariance.
+    """Residuals (n, m) whitened by noise and prediction (draws (n, m, k)), along the covariance's axes.
 
     Without those that the prediction leaves open, as the place of a cube that nothing else measures.
     """
@@ -217,7 +217,7 @@ def _normalised(residuals: Array, predicted: Array) -> Array:
 
 
 def _without(group: Group, out: Mask) -> Group:
-    """A group without the measurements that are held out; processes and priors stay."""
+    """Remove the held-out measurements from a group; processes and priors stay."""
     if not group.is_measurement:
         return group
     return replace(group, weights=group.all_weights * ~out[:, None])

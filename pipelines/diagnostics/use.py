@@ -36,7 +36,7 @@ _STEP = 0.1
 
 
 class Truth:
-    """Parameter values (..., n) by name, as many sets as wanted; what is not known is 0."""
+    """Sets of true parameter values (..., n) by name; unknown parameters are 0."""
 
     def __init__(self, names: Sequence[str], values: Array) -> None:
         self.index = {name: i for i, name in enumerate(names)}
@@ -60,25 +60,25 @@ class Truth:
         return self.vector(*(f"{stem}_{axis}" for axis in "xyz"))
 
     def matrix(self, rows: Sequence[Sequence[str]], diagonal: float = 0.0) -> Array:
-        """Values (..., 3, 3); entries on the diagonal that are not known are `diagonal`."""
+        """Matrix (..., 3, 3) of parameters; unknown entries on the diagonal are `diagonal`."""
         each = [[self.get(n, diagonal * (i == j)) for j, n in enumerate(row)] for i, row in enumerate(rows)]
         return np.stack([np.stack(row, axis=-1) for row in each], axis=-2)
 
 
 class Applied(Protocol):
-    """The formulas of a calibration with values in them."""
+    """Formulas of a calibration with values inserted."""
 
     @property
     def values(self) -> Mapping[str, float]:
-        """Values that are applied, by parameter."""
+        """Applied values, by parameter."""
 
     def __call__(self, **measured: Array) -> Mapping[str, Array]:
-        """Results of applying the calibration to measurements, by name."""
+        """Apply the calibration to measurements; return the results by name."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A curve: error(applied, true) is (..., U), or (..., U, d) of a vector whose length is shown.
+    """A curve of errors over operating points: `error(applied, true)` (..., U), or vectors (..., U, d) for lengths.
 
     `noise` is a variance per component, (U,); `color` from the palette, and `dash` as figures have it.
     """
@@ -100,7 +100,7 @@ class Coefficients:
 
 @dataclass(frozen=True)
 class Use:
-    """Application of a calibration, and the error that it leaves there.
+    """An application of a calibration, with the error that remains there.
 
     Attributes:
         name: for programs.
@@ -133,7 +133,7 @@ class Use:
 
 @dataclass(frozen=True)
 class Posterior:
-    """An estimate with what is applied of it.
+    """An estimate, with the part of it that the application applies.
 
     Attributes:
         names, x, P: of the parameters.
@@ -154,7 +154,7 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Band:
-    """Errors over the operating points, (U,), SI; of a vector its length.
+    """Error band over the operating points, (U,), SI; for a vector, of its length.
 
     Attributes:
         before, before_bounds: nominal values applied: error with its lower and upper bound.
@@ -190,7 +190,7 @@ class UseBands:
     drawn: bool = False
 
     def figure(self, values: Callable[[Band], Array]) -> float:
-        """The headline figure of a value of the bands, in the use's unit; of an angle half a turn at most."""
+        """Largest value of the bands, or that at the operating point `at`, in the use's unit; at most half a turn."""
         at, most = self.use.at, _LARGEST.get(self.use.unit, np.inf)
         found = max(float(v.max() if at is None else v[at]) for v in map(values, self.bands.values()))
         return float(min(self.use.factor * found, most))
@@ -222,7 +222,7 @@ class UseBands:
 
 
 def use_bands(use: Use, posterior: Posterior) -> UseBands:
-    """Error bands of a use, linear ones checked by draws."""
+    """Compute the error bands of a use; linearised bounds are checked by draws and replaced if inaccurate."""
     found = UseBands(use, {line.name: _band(use, line, posterior) for line in use.lines})
     shares = coverage(found, posterior, _TEST_DRAWS, seed=1)
     low, high = _COVERAGE
@@ -233,7 +233,7 @@ def use_bands(use: Use, posterior: Posterior) -> UseBands:
 
 
 def coverage(found: UseBands, posterior: Posterior, draws: int = 10_000, seed: int = 0) -> dict[str, Array]:
-    """Share of exact errors of drawn calibrations within the band, (U,) per line; nan where nothing is uncertain."""
+    """Share (U,) of drawn calibrations with exact error within the band, by line; nan where nothing is uncertain."""
     shares = {}
     for name, errors in _draws(found, posterior, draws, seed).items():
         bound = found.bands[name].bound
@@ -242,7 +242,7 @@ def coverage(found: UseBands, posterior: Posterior, draws: int = 10_000, seed: i
 
 
 def _draws(found: UseBands, posterior: Posterior, draws: int, seed: int) -> dict[str, Array]:
-    """|e - m| of a scalar, |e| of a vector, (draws, U), of truths drawn from N(x, P), without linearising."""
+    """Errors (draws, U) without linearisation for truths drawn from N(x, P): |e - m| of scalars, |e| of vectors."""
     values, vectors = np.linalg.eigh(posterior.P)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     rng = np.random.default_rng(seed)
@@ -292,7 +292,7 @@ def _band(use: Use, line: Line, posterior: Posterior) -> Band:
 
 
 def _coefficients(coefficients: Coefficients, line: Line, posterior: Posterior) -> Array:
-    """(k, 4) of a line: values with nominal parameters applied, sigmas, and both with the estimated ones."""
+    """Coefficients (k, 4) of a line: value and sigma with nominal parameters applied, then with estimated ones."""
     columns = []
     for applied in (posterior.nominal, posterior.applied):
 
@@ -305,7 +305,7 @@ def _coefficients(coefficients: Coefficients, line: Line, posterior: Posterior) 
 
 
 def _linearised(error: Callable[[Array], Array], posterior: Posterior) -> tuple[Array, Array]:
-    """Mean (U, d), and its Jacobian (U, d, n) by the true parameters, at the estimate."""
+    """Mean error (U, d), and its Jacobian (U, d, n) by the true parameters, at the estimate."""
     x, step = posterior.x, _STEP * np.sqrt(np.diag(posterior.P))
     free = np.flatnonzero(step > 0.0)
     mean = error(x)

@@ -21,5 +21,5 @@ class Motion:
 
     @property
     def advice(self) -> str:
-        """Sentence: the motion, and what it improves."""
+        """Advice as a sentence: why, and which motion."""
         return f"{self.why}: {self.words}" if self.why else self.words

@@ -30,7 +30,7 @@ Miss = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Clock:
-    """Pictures were taken at stamp + offset - skew * (stamp - begun).
+    """Camera clock: a picture with a stamp was exposed at stamp + offset - skew * (stamp - begun), s.
 
     Attributes:
         begun: the recording's first stamp, s.
@@ -43,25 +43,25 @@ class Clock:
     skew: float = 0.0
 
     def late(self, elapsed: Array) -> Array:
-        """Delay (n,) of exposures after their stamps, s, at times (n,) since the first, s."""
+        """Delay (n,), s, of exposures after their stamps, at times (n,), s, since the first stamp."""
         return np.asarray(self.offset - self.skew * elapsed)
 
     def taken(self, elapsed: Array) -> Array:
-        """Times (n,), s, at which pictures were taken, by their stamps since the first, s."""
+        """Exposure times (n,), s, of pictures, from their stamps (n,) since the first stamp, s."""
         return np.asarray(self.begun + elapsed + self.late(elapsed))
 
     def exposed(self, stamps: Array) -> Array:
-        """Times (n,), s, at which pictures with the stamps (n,), s, were taken."""
+        """Exposure times (n,), s, of pictures with stamps (n,), s."""
         return np.asarray(stamps + self.offset - self.skew * (stamps - self.begun))
 
     def elapsed(self, taken: Array) -> Array:
-        """Stamps (n,) of pictures taken at these times, s, since the first."""
+        """Stamps (n,), s, since the first one, of pictures exposed at times (n,), s."""
         return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))
 
 
 @dataclass(frozen=True)
 class Keyframes:
-    """Times of a graph's keyframes: exposures by the camera's clock, at its initial guess.
+    """Keyframe times of a graph: the exposures by the initial guess of the camera's clock.
 
     Attributes:
         clock: that clock.
@@ -72,9 +72,9 @@ class Keyframes:
     near: float
 
     def are_far(self, clock: Clock, time: float, covariance: Array | None = None) -> bool:
-        """Whether pictures at the beginning or by some time, s, were taken elsewhere by another clock.
+        """Whether another clock moves exposures at the beginning or at a time, s, by more than `near`.
 
-        With a covariance (2, 2) of that clock's offset and skew: whether they certainly were.
+        With a covariance (2, 2) of that clock's offset and skew: whether it certainly does.
         """
         elapsed = np.array([0.0, time - self.clock.begun])
         sigmas = np.zeros(2) if covariance is None else _sigmas_at(elapsed, covariance)
@@ -82,12 +82,12 @@ class Keyframes:
 
 
 def first_span(skew_sigma: float) -> float:
-    """Length, s, of the beginning over which no clock goes wrong by much."""
+    """Length, s, of the first span of a recording, over which the clock's drift is negligible."""
     return _WRONG_AT_FIRST / skew_sigma
 
 
 def turns_near(gyro: GyroPath, start: Array, stop: Array) -> Callable[[Array, Array], Increments]:
-    """Function that gives a gyro's rotations over windows whose ends (n,), s, are near the given ones.
+    """Return a function that integrates a gyro over windows whose ends (n,), s, are near given ones.
 
     A stream longer than what is kept of it is integrated anew for every look.
     """
@@ -111,7 +111,7 @@ def guess_clock(
     missing: Callable[[float], Callable[[Array], Miss] | None],
     repeated: float = 1.0,
 ) -> tuple[Clock, Array]:
-    """The clock with which a recording's pictures are explained best, and all numbers (d,) that explain them so.
+    """Find the clock that explains a recording's pictures best, and the other numbers (d,) that go with the clock.
 
     It is that of the stamps unless pictures at one end of the recording were certainly taken at another time.
 
@@ -139,6 +139,6 @@ def guess_clock(
 
 
 def _sigmas_at(elapsed: Array, covariance: Array) -> Array:
-    """Sigmas (n,), s, of how late pictures are so long after the first stamp, s, by those of offset and skew (2, 2)."""
+    """Sigmas (n,), s, of the exposure delay at times since the first stamp, by (2, 2) of offset and skew."""
     rows = np.stack([np.ones_like(elapsed), -elapsed], axis=1)
     return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", rows, covariance, rows)))

@@ -18,7 +18,7 @@ _SMOOTH = 0.5
 
 
 def intervals(rejected: Mask) -> list[tuple[int, int]]:
-    """Disturbed intervals of measurements (n,) in time order: index of the first of each, and one past the last.
+    """Find disturbed intervals among measurements (n,) in time order: first index and one past the last of each.
 
     An interval maximises the sum of log likelihood ratios of its measurements, outliers with a share of `_WITHIN`
     against outliers with the recording's share; with n measurements that sum exceeds log(n / p) with a probability of
@@ -41,7 +41,7 @@ def intervals(rejected: Mask) -> list[tuple[int, int]]:
 
 
 def onsets(time: Array, norms: Array, rejected: Mask) -> Mask:
-    """Which measurements (n,) lie within half an interval's duration of its smooth ends, or in it.
+    """Mask (n,) of measurements in a disturbed interval or within half its duration of its smooth ends.
 
     Outliers are rejected where a disturbance exceeds the gate. That of a dipole falls with the cube of the distance: at
     twice the distance it is an eighth of the gate, half a sigma.
@@ -68,7 +68,7 @@ def _outer(first: int, last: int, quarter: int) -> tuple[slice, slice]:
 
 
 def _best(scores: Array) -> tuple[int, int, float]:
-    """First, one past the last, and sum of the interval of scores (n,) with the largest sum; 0 where n is 0."""
+    """First index, one past the last, and sum of the interval of scores (n,) with the largest sum; zeros if n is 0."""
     if not len(scores):
         return 0, 0, 0.0
     sums = np.append(0.0, np.cumsum(scores))

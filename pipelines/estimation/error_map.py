@@ -43,7 +43,7 @@ SOURCE = "errors by where measurements are made"
 
 @dataclass(frozen=True, eq=False)
 class ErrorMap:
-    """A map that measurements of some families may have.
+    """Smooth map of systematic errors over position, which measurements of some families may share.
 
     Attributes:
         name, axes: its parameters are named after it and the axes, a letter each.
@@ -82,7 +82,7 @@ class ErrorMap:
         moves: bool = True,
         slopes: Array | None = None,
     ) -> ErrorMap | None:
-        """The map over measurements with harmonics (n, h), and slopes (n, h, places) of these.
+        """Build the map's functions from harmonics (n, h) at the measurements, and slopes (n, h, places).
 
         None where it is fixed, or nothing varies.
         """
@@ -99,18 +99,18 @@ class ErrorMap:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of its parameters, function by function."""
+        """Names of the map's parameters, function by function."""
         return tuple(f"{self.name}_{axis}_{j + 1}" for j in range(self.functions.shape[1]) for axis in self.axes)
 
     @property
     def parameter(self) -> Parameter:
-        """Its variable."""
+        """Graph variable of the map's coefficients."""
         numbers = self.prior, self.stated, math.inf
         quantities = (Quantity(name, UNIT, *numbers, group="assumption", sheet=SHEET) for name in self.names)
         return Parameter(int(gtsam.symbol("M", 0)), tuple(quantities))
 
     def of_model(self, family: str, model: Any) -> Model | None:
-        """A family's model with the map among its variables; None where the map has no part in it."""
+        """Extend a family's model by the map as a variable; None where the map does not enter the model."""
         at = np.minimum(np.searchsorted(self.time, model.time), len(self.time) - 1)
         mapped = ErrorMapFactor(model, self.functions[at], len(self.axes)) if family in self.families else None
         if self.slopes is None or (mapped is None and family != "gyro"):
@@ -126,7 +126,7 @@ class ErrorMap:
         return np.asarray(self.functions @ c.reshape(self.functions.shape[1], -1))
 
     def added_to(self, problem: Problem) -> Problem:
-        """The problem with the map free, to be solved as a whole."""
+        """Return the problem with the map as a free parameter, to be solved as a whole."""
         parameter = self.parameter
         return replace(
             problem,
@@ -157,7 +157,7 @@ class ErrorMap:
 
 @dataclass(frozen=True, eq=False)
 class FoundMap:
-    """A map that measurements have, and what it does to an estimate of n numbers.
+    """A significant error map, with its effect on an estimate of n numbers.
 
     Attributes:
         map: with the prior in force, wider than its data sheet where that is too small.
@@ -178,11 +178,11 @@ class FoundMap:
 
     @property
     def rms(self) -> float:
-        """Of the errors about an axis, in the unit of the map."""
+        """Root mean square of the map's errors per axis, in the unit of the map."""
         return float(np.sqrt(np.square(self.error).mean()))
 
     def applied(self, estimate: Estimate) -> Estimate:
-        """The estimate, made without the map, with it."""
+        """Return the estimate, made without the map, with the map's shift and covariance applied."""
         out = widened(estimate, SOURCE, self.columns)
         if not self.map.moves:
             return out
@@ -190,7 +190,7 @@ class FoundMap:
         return replace(out, values=out.values + self.shift, sqrt_info=sqrt_info)
 
     def known(self, sqrt_info: SqrtInformation, inflations: Array) -> SqrtInformation:
-        """Information of a recording, made without the map, with it; inflations (n,) are those of its estimate."""
+        """Return a recording's information, made without the map, with the map's shift and uncertainty applied."""
         moved = self._moved(sqrt_info) if self.map.moves else sqrt_info
         return marginalised(moved, self.names, self.columns / inflations[:, None])
 

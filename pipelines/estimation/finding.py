@@ -73,7 +73,7 @@ class Finding:
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """The most severe first, equally severe ones in the order given."""
+    """Sort findings by severity, the most severe first, equally severe ones in the given order."""
     return tuple(sorted(findings, key=lambda finding: -finding.severity))
 
 

@@ -23,12 +23,12 @@ LAYOUT = ChainLayout(states="x", nodes=NODES)
 
 @lru_cache(maxsize=1000)
 def state(keyframe: int) -> int:
-    """Variable of the attitude at a keyframe, Rot3; the same number for all factors that hold it, for memory's sake."""
+    """Key of the attitude (Rot3) at a keyframe."""
     return int(gtsam.symbol("x", keyframe))
 
 
 def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float) -> tuple[Array, Index]:
-    """Times (K,) of keyframes and, (K + 1,), where the measurements of each begin; some, in gaps, have none.
+    """Times (K,) of keyframes, and index (K + 1,) of the first measurement of each; none in gaps.
 
     Measurements share one as long as they are within the same `shared` s, counted from `origin`; it is the one in their
     middle. None is farther than `longest`, s, from the next.
@@ -47,13 +47,13 @@ def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float
 
 
 def as_slice(of: Index) -> Index | slice:
-    """Indexes; consecutive ones as a slice, so that what they take of an array is no copy."""
+    """Convert consecutive indices to a slice, which indexes an array without a copy."""
     return slice(int(of[0]), int(of[-1]) + 1) if len(of) and (np.diff(of) == 1).all() else of
 
 
 @dataclass(frozen=True)
 class Trunk:
-    """State of a chain at a keyframe, from which a chain over the end of a growing recording continues.
+    """State of a chain at a keyframe, to continue the chain as a recording grows.
 
     Attributes:
         keyframe: number of its first keyframe in the recording.
@@ -70,7 +70,7 @@ ROOT = Trunk(0, np.empty(0))
 
 @dataclass(frozen=True)
 class GyroChain:
-    """Attitudes aRm at K keyframes: m the gyro, a a frame that a chain of increments holds on to.
+    """Attitudes aRm at K keyframes, joined by gyro increments; m: gyro frame, a: inertial or platform frame.
 
     That frame is inertial, or turns with a platform that has a gyro of its own.
 
@@ -123,7 +123,7 @@ class GyroChain:
         platform_errors: Parameter | None = None,
         trunk: Trunk | None = None,
     ) -> GyroChain:
-        """A chain over keyframes.
+        """Build a chain over keyframes, with integrated gyro increments and bias nodes.
 
         Args:
             time, starts, initial, gyro: as above.
@@ -162,33 +162,33 @@ class GyroChain:
         )
 
     def trunk(self, time: float) -> Trunk | None:
-        """State at a keyframe for a chain over the end of the recording; None where no keyframe has this time."""
+        """State at a keyframe, to continue the chain as the recording grows; None if no keyframe has this time."""
         k = int(np.searchsorted(self.time, time))
         if k == len(self.time) or self.time[k] != time:
             return None
         return Trunk(self.first + k, self.bias.edges[: self.nodes[k] + 1])
 
     def state(self, keyframe: int) -> int:
-        """Variable of the attitude at a keyframe, Rot3."""
+        """Key of the attitude (Rot3) at a keyframe."""
         return state(self.first + keyframe)
 
     def numbers(self, keyframes: range) -> range:
-        """The numbers of keyframes in the recording."""
+        """Convert keyframes of this chain to their numbers in the whole recording."""
         return range(self.first + keyframes.start, self.first + keyframes.stop)
 
     def bias_keys(self, keyframes: Sequence[int] | Index) -> list[int]:
-        """Variables of the bias in force up to keyframes."""
+        """Keys of the gyro bias in force up to each of the keyframes."""
         nodes = self.nodes[keyframes].tolist()
         keys = {n: self.bias.key(n) for n in set(nodes)}
         return [keys[n] for n in nodes]
 
     @property
     def error_keys(self) -> list[int]:
-        """Variables of the gyros' errors: the last blocks of factors that the gyros carry."""
+        """Keys of the gyros' error variables, the last blocks of every factor with gyro increments."""
         return [p.key for p in (self.errors, self.platform_errors) if p is not None]
 
     def add(self, step: Step, keyframes: range) -> None:
-        """The attitudes at keyframes, the increments that lead there, and the bias nodes that begin with them.
+        """Add the attitudes at keyframes, the increments to these, and the bias nodes that begin there.
 
         What determines the attitude at the start of a chain, and the first bias, is the caller's to add.
         """
@@ -212,14 +212,14 @@ class GyroChain:
             step.factors.extend(self._increments(after))
 
     def _new(self, keyframes: range) -> tuple[range, range]:
-        """The bias nodes that begin with keyframes, and those that end, so that the mean up to there is defined."""
+        """Bias nodes that begin at the keyframes, and bias nodes whose mean is complete with the keyframes."""
         first = 0 if keyframes.start == 0 else int(self.nodes[keyframes.start - 1]) + 1
         now = int(self.nodes[keyframes[-1]])
         last = keyframes.stop == len(self.time)
         return range(first, now + 1), range(max(first - 1, 1), now + 1 if last else now)
 
     def _increments(self, after: Index) -> list[Factor]:
-        """Factors that lead to keyframes."""
+        """Gyro increment factors from each keyframe's predecessor."""
         states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
         bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
         carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
@@ -256,7 +256,7 @@ class GyroChain:
         return out
 
     def _turned(self, keyframes: range, bias: Array, values: gtsam.Values) -> tuple[Array, Array]:
-        """Increments (n, 4) of the platform and of the gyro that lead to keyframes, at the values."""
+        """Corrected increments (n, 4) of platform and gyro, from each keyframe's predecessor, at the values."""
         n, rows = len(keyframes), slice(keyframes.start - 1, keyframes.stop - 1)
         errors, platform = self._errors(values, n)
         turned, _ = corrected(self.turns[rows], np.tile(bias - self.gyro.bias_hat, (n, 1)), errors)
@@ -266,7 +266,7 @@ class GyroChain:
         return corrected(self.platform_turns[rows], platform_bias - self.platform.bias_hat, scale)[0], turned
 
     def _errors(self, values: gtsam.Values, n: int) -> tuple[Array | None, Array | None]:
-        """Errors of the gyro and of the platform's, n equal rows; None for perfect ones."""
+        """Error parameters (n, .) of gyro and platform gyro, in n equal rows; None for an ideal gyro."""
         own, platform = (
             None if p is None else np.broadcast_to(values.atVector(p.key), (n, len(p.quantities)))
             for p in (self.errors, self.platform_errors)
@@ -274,7 +274,7 @@ class GyroChain:
         return own, platform
 
     def attitudes(self, keyframes: Index, stamps: Array, at: Array, values: gtsam.Values) -> Array:
-        """Attitudes (n, 4) at times near keyframes, where the values hold those of the keyframes.
+        """Attitudes (n, 4) at times near keyframes, propagated from the keyframes' values.
 
         Args:
             keyframes: (n,) whose attitude is carried to each time.

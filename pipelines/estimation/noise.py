@@ -19,7 +19,7 @@ ROUGHLY, _APART = 1.0, 3.0
 
 @dataclass(frozen=True)
 class Noise:
-    """A noise of a problem, with the figure that was stated.
+    """A noise of a problem, with its stated figure.
 
     Attributes:
         name: as in the config's section `noise`, where it is there.
@@ -49,7 +49,7 @@ class Noise:
 
     @property
     def spec(self) -> NoiseSpec:
-        """Declaration of the noise."""
+        """Declaration of the noise: name, unit, description."""
         return self.own or NOISES.get(self.name) or NoiseSpec(self.name, "", "")
 
     @property
@@ -59,7 +59,7 @@ class Noise:
 
     @property
     def estimated(self) -> bool:
-        """Whether residuals are asked."""
+        """Whether the level of the noise is estimated from residuals."""
         return self.known > 0.0 and bool(self.families) and self.stated > 0.0
 
 
@@ -88,14 +88,14 @@ class Level:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the recording says something else than was stated."""
+        """Whether the estimated level differs significantly from the stated one."""
         if self.found is None or self.sigma is None:
             return False
         return abs(float(np.log(self.found))) > _APART * float(np.hypot(self.noise.known, self.sigma / self.found))
 
     @property
     def together(self) -> Level:
-        """The level of all noises that are beside it, as one."""
+        """Level of this noise and all additional noises of the same rows, as one."""
         if self.effective is None:
             return self
         size, sigma = self.effective
@@ -103,10 +103,10 @@ class Level:
 
     @property
     def known(self) -> float:
-        """Sigma of the stated noise's logarithm: wide when the recording contradicts it."""
+        """Sigma of the logarithm of the stated noise; wide when the recording contradicts the statement."""
         return max(self.noise.known, ROUGHLY) if self.contradicted else self.noise.known
 
     @property
     def used(self) -> float:
-        """The noise as used, in its unit."""
+        """Noise level in use, in the unit of the noise."""
         return self.scale * self.noise.stated

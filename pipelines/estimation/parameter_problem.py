@@ -36,7 +36,7 @@ def parameter_problem(
     model: Any,
     **fields: Any,
 ) -> Problem:
-    """The graph of one measurement model over shared parameters, a variable for each spec, with their priors.
+    """Build the graph of one measurement model over shared parameters, one variable and prior for each spec.
 
     Args:
         method: its name.

@@ -38,7 +38,7 @@ SENSOR_NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """Declaration of parameters that differ by their axis.
+    """Declaration of a group of parameters that differ by their axis.
 
     Attributes:
         name: what their names begin with, before _AXIS; or with {} where the axis stands.
@@ -64,22 +64,22 @@ class ParameterSpec:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters, * where any number may stand."""
+        """Names of the parameters, with * in place of any number."""
         stem = self.name if "{}" in self.name else f"{self.name}_{{}}"
         return tuple(map(stem.format, self.axes)) or (self.name,)
 
     @property
     def sheet(self) -> str:
-        """The sensor's key under `sensors` in the config."""
+        """Key of the sensor under `sensors` in the config."""
         return self.data_sheet.partition(".")[0]
 
     @property
     def figure(self) -> str:
-        """The key of the sensor's figure."""
+        """Key of the sensor's data-sheet figure."""
         return self.data_sheet.partition(".")[2]
 
     def describe(self, name: str) -> str:
-        """The sentence about one of the parameters."""
+        """Description of one of the parameters, as a sentence."""
         axis = name.removeprefix(self.name.partition("{}")[0]).removeprefix("_") if self.axes else ""
         parts = axis.split("_") if "_" in axis else list(axis)
         words = [_WORDS.get(part, part) for part in parts] or [""]
@@ -92,7 +92,7 @@ scalar = partial(ParameterSpec, axes="")
 
 
 def spec_of(specs: Iterable[ParameterSpec], name: str) -> ParameterSpec | None:
-    """Declaration of a parameter; None where there is none."""
+    """Find the declaration of a parameter; None where there is none."""
     return next((spec for spec in specs if any(fnmatchcase(name, each) for each in spec.names)), None)
 
 
@@ -175,14 +175,14 @@ def accel_square(sigma: float) -> ParameterSpec:
 
 
 def error_map(name: str, axes: str, sigma: float, description: str) -> ParameterSpec:
-    """Numbers of an error map of measurements, see estimation.error_map: of each axis one a harmonic."""
+    """Declare the coefficients of an error map of measurements: one for each axis and harmonic, rad."""
     return ParameterSpec(
         name, "rad", sigma, description, "camera.map", axes=[f"{axis}_*" for axis in axes], per_recording=True
     )
 
 
 def encoder_errors(joints: Sequence[str], once_per_turn: float, delay: float) -> tuple[ParameterSpec, ParameterSpec]:
-    """Sine and cosine of each encoder's error once a turn, rad, and the delay of their readings, s; one sigma."""
+    """Declare encoder errors: once-per-turn sine and cosine of each joint, rad, and time delay, s, one sigma."""
     return (
         ParameterSpec(
             "encoder",
@@ -228,7 +228,7 @@ def quantities(
 
 
 def parameter(key: int, specs: Sequence[ParameterSpec], config: Config) -> Parameter | None:
-    """Variable of several specs; None if all are fixed, so that the graph can do without."""
+    """Build the graph variable of several specs; None if all their parameters are fixed."""
     all_of_them = tuple(q for spec in specs for q in quantities(spec, config))
     return Parameter(key, all_of_them) if any(q.prior_sigma for q in all_of_them) else None
 
@@ -236,12 +236,12 @@ def parameter(key: int, specs: Sequence[ParameterSpec], config: Config) -> Param
 def gyro_errors(
     key: int, scale: Sequence[ParameterSpec], drivers: Sequence[ParameterSpec], config: Config
 ) -> Parameter | None:
-    """One variable of a gyro's errors, see factors.gyro: S and, in this order, what of its drivers is not all fixed."""
+    """Build the variable of a gyro's errors, see factors.gyro: S, then every driver that is not entirely fixed."""
     return parameter(key, (*scale, *(each for each in drivers if parameter(key, (each,), config))), config)
 
 
 def acting(errors: Parameter | None, drivers: Mapping[ParameterSpec, Array | None]) -> Array | None:
-    """Drivers (N, d) of a gyro that its errors depend on, as columns; None without any."""
+    """Columns (N, d) of the nuisance inputs that a gyro's errors depend on; None if there are none."""
     names = {q.name for q in errors.quantities} if errors else set()
     found = [driver for each, driver in drivers.items() if driver is not None and each.names[0] in names]
     alone = len(found) == 1 and found[0].ndim == 2
@@ -249,7 +249,7 @@ def acting(errors: Parameter | None, drivers: Mapping[ParameterSpec, Array | Non
 
 
 def stamped(parameter: Parameter | None, name: str, sigma: float) -> Parameter | None:
-    """The variable with the sigma of replaced stamps, s, added to one of its numbers, a delay.
+    """Add the sigma of replaced stamps, s, to the prior and the final sigma of a delay parameter.
 
     The lateness of log times is unknown: it widens the prior of the delay and its final sigma.
     """
@@ -263,7 +263,7 @@ def stamped(parameter: Parameter | None, name: str, sigma: float) -> Parameter |
 
 
 def fixed_without_force(spec: ParameterSpec, config: Config, topic: str) -> Findings:
-    """The row of `fixed_assumptions` of a g-sensitivity that an Imu without acceleration gives no hold on."""
+    """`fixed_assumptions` row for a g-sensitivity if the Imu stream has no acceleration to determine it."""
     if parameter(0, (spec,), config) is None:
         return {}
     names = f"{spec.names[0]} to {spec.names[-1]}"
@@ -271,7 +271,7 @@ def fixed_without_force(spec: ParameterSpec, config: Config, topic: str) -> Find
 
 
 def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: float = 1.0) -> float | None:
-    """Shift of an assumption from its prior by the recording, in sigmas of that shift; None if it is not determined.
+    """Shift of a nuisance parameter from its prior, in sigmas of that shift; None if not determined.
 
     With s = sigma / inflation, p the prior's sigma and V = sigma^2 - (s^2 / p)^2 what comes from elsewhere than from
     the prior, the estimate's change from the prior has the variance (p - s^2 / p)^2 + V; for white noise p^2 - s^2.
@@ -289,7 +289,7 @@ def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: flo
 
 
 def stated(config: Config, spec: ParameterSpec) -> float:
-    """The figure in force, one sigma: the config's `sensors`, else the usual grade's."""
+    """Prior sigma in force: the config's `sensors` figure, else that of the usual grade."""
     sheet = getattr(config.sensors, spec.sheet, None)
     if sheet is None or spec.figure not in sheet.model_fields_set:
         return spec.prior

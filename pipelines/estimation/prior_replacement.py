@@ -66,13 +66,13 @@ def _about_alone(
 
 
 def _by_key(A: Array, keys: Sequence[int], values: gtsam.Values) -> list[Array]:
-    """A Jacobian's columns for each of its variables."""
+    """Split a Jacobian into the columns of each variable."""
     dims = values.dims()
     return np.split(A, np.cumsum([dims[key] for key in keys])[:-1], axis=1)
 
 
 def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier = tuple) -> Problem:
-    """Replace priors by one Gaussian prior; `before` are the steps before its own, of a recording that grows."""
+    """Replace a problem's priors by one Gaussian prior; `before` yields the earlier steps of a growing recording."""
     own = {q.name: q for q in problem.quantities}
     for name, mean, sigma in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True):
         if name not in own and sigma == 0.0 and mean != 0.0:
@@ -116,7 +116,7 @@ def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier
 
 
 def _require_sense(gaussian_prior: GaussianPrior, own: Mapping[str, Quantity]) -> None:
-    """Raise InputError for a mean, a sigma or a covariance of which no solution can be made."""
+    """Raise InputError for a prior mean, sigma or covariance that makes the problem unsolvable."""
     where = gaussian_prior.source or "priors"
     for name, mean, sigma in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True):
         scale, unit = own[name].prior_scale, own[name].unit
@@ -134,13 +134,13 @@ def _require_sense(gaussian_prior: GaussianPrior, own: Mapping[str, Quantity]) -
 
 
 def _until(steps: Callable[[int], Iterator[Step]], time: float) -> Iterator[Step]:
-    """The steps up to a time, s."""
+    """Yield the steps up to a time, s."""
     return takewhile(lambda step: step.time <= time, steps(1) if np.isfinite(time) else ())
 
 
 @dataclass(frozen=True, eq=False)
 class _PriorFactors:
-    """A Gaussian prior as factors of steps: each variable's conditional on the variables that begin before it.
+    """Gaussian prior in conditional factors: each variable given the variables that begin before it.
 
     Attributes:
         parameters: of the problem, with the priors now in force.
@@ -153,7 +153,7 @@ class _PriorFactors:
     replaced: Collection[str]
 
     def steps(self, steps: Iterable[Step], before: Earlier = tuple) -> Iterator[Step]:
-        """The steps, with the Gaussian prior in place of priors where its variables begin.
+        """Yield the steps, with the Gaussian prior in place of other priors where its variables begin.
 
         Args:
             steps: in time order.
@@ -172,11 +172,11 @@ class _PriorFactors:
 
     @cached_property
     def _concerned(self) -> list[Parameter]:
-        """The parameters that the Gaussian prior is about."""
+        """Parameters with numbers in the Gaussian prior."""
         return [p for p in self.parameters if any(q.name in self.gaussian_prior.names for q in p.quantities)]
 
     def _begin(self, step: Step, begun: gtsam.Values) -> list[Parameter]:
-        """Add the parameters that begin in a step to those that have begun, at the prior mean; returns these."""
+        """Add the parameters that begin in a step to `begun`, moved to the prior mean; return these parameters."""
         new = [p for p in self.parameters if step.initial.exists(p.key)]
         for p in new:
             begun.insert(p.key, value_at(step.initial, p.key))
@@ -185,7 +185,7 @@ class _PriorFactors:
         return new
 
     def _changed(self, step: Step, begun: gtsam.Values) -> Step:
-        """A step in which parameters begin, with the Gaussian prior of them in place of others."""
+        """Return a step, in which parameters begin, with their priors replaced by the Gaussian prior."""
         earlier = [p for p in self._concerned if begun.exists(p.key)]
         new = self._begin(step, begun)
         initial = gtsam.Values(step.initial)
@@ -202,14 +202,14 @@ class _PriorFactors:
         return replace(step, factors=factors, initial=initial)
 
     def _rest(self, prior: Factor, values: gtsam.Values) -> list[Factor]:
-        """Factors of the part of a prior that is not replaced."""
+        """Factors of the rows of a prior that the Gaussian prior does not replace."""
         kept = ~_about_alone(prior.factor.linearize(values), self.parameters, values, self.replaced)
         if kept.all():
             return [prior]
         return [Factor("prior", _rows_of(prior.factor, np.flatnonzero(kept), values))] if kept.any() else []
 
     def _move(self, parameter: Parameter, values: gtsam.Values) -> None:
-        """Move a first value that contradicts the Gaussian prior to its mean."""
+        """Move an initial value that contradicts the Gaussian prior to the prior mean."""
         rows, places = self._places(parameter)
         mean, sigmas = self.gaussian_prior.mean[places], self.gaussian_prior.sigmas[places]
         for _ in range(_MOVES):
@@ -223,13 +223,13 @@ class _PriorFactors:
             values.update(values.retract(move))
 
     def _places(self, parameter: Parameter) -> tuple[list[int], list[int]]:
-        """Rows of a parameter's numbers that the Gaussian prior has, and their places in it."""
+        """Rows of a parameter's numbers that the Gaussian prior covers, and their positions in that prior."""
         names = [q.name for q in parameter.quantities]
         rows = [i for i, name in enumerate(names) if name in self.gaussian_prior.names]
         return rows, [self.gaussian_prior.names.index(names[i]) for i in rows]
 
     def _factor(self, earlier: Sequence[Parameter], new: Sequence[Parameter]) -> Factor:
-        """The whitened factor of parameters that begin, given those that have begun."""
+        """Whitened conditional factor of the parameters that begin, given those that began earlier."""
         concerned = [*earlier, *new]
         places = [self._places(p) for p in concerned]
         order = [place for _, own in places for place in own]
@@ -277,7 +277,7 @@ def conditional_root(covariance: Array, sigmas: Array) -> Array:
 
 
 def _rows_of(factor: gtsam.NonlinearFactor, rows: Index, at: gtsam.Values) -> gtsam.CustomFactor:
-    """A factor with selected rows of another; its variables are among the values."""
+    """Build a gtsam factor from selected rows of another; `at` has values of its variables."""
     keys = factor.keys()
 
     def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:

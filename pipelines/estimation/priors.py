@@ -22,7 +22,7 @@ _FREE = 10.0
 
 @dataclass(frozen=True)
 class LinearModel(Model):
-    """n measurements of m whitened rows each, linear in one to three vectors. Blocks: the vectors.
+    """Measurement model linear in one to three vectors: n measurements of m whitened rows.
 
     Attributes:
         time: (n,) s; 0 of what is known beforehand.
@@ -44,23 +44,23 @@ class LinearModel(Model):
 
     @property
     def rows(self) -> int:
-        """Numbers m of a residual."""
+        """Number m of rows of a residual."""
         return int(self.right.shape[1])
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Sizes of the vectors."""
+        """Sizes of the vector variables."""
         return tuple(int(each.shape[2]) for each in self.coefficients)
 
     def __call__(self, *vectors: Array) -> Residuals:
-        """Residual sum of A_i x_i less the right side, (n, m)."""
+        """Evaluate the residuals, sum of A_i x_i minus the right side, (n, m)."""
         parts = [np.einsum("nij,nj->ni", A, x) for A, x in zip(self.coefficients, vectors, strict=True)]
         return sum(parts, start=-self.right), lambda: self.coefficients
 
 
 @dataclass(frozen=True)
 class RotationPrior(Model):
-    """Prior of rotations: R Log(mean^-1 x) is white noise. Block: a rotation.
+    """Prior of a rotation with white residual R Log(mean^-1 x), where R is square-root information.
 
     Attributes:
         time: (n,) s.
@@ -76,7 +76,7 @@ class RotationPrior(Model):
     stacked: ClassVar = ("time", "mean", "sqrt_information")
 
     def __call__(self, rotation: Array) -> Residuals:
-        """Residual (n, 3)."""
+        """Evaluate the residuals R Log(mean^-1 x), (n, 3)."""
         error = so3.log(so3.multiply(so3.inverse(self.mean), rotation))
         return (
             np.einsum("nij,nj->ni", self.sqrt_information, error),
@@ -92,7 +92,7 @@ def prior_sigmas(parameter: Parameter) -> Array:
 
 
 def pinned(quantity: Quantity) -> float:
-    """Sigma of the prior that fixes a quantity."""
+    """Sigma of the tight prior that stands for a fixed quantity, in the quantity's unit."""
     return _PINNED * min(quantity.require, quantity.prior_scale)
 
 
@@ -113,18 +113,18 @@ def vector_about(key: int, mean: Array, sigmas: Array | float, family: str = "pr
 
 
 def gaussian_about(key: int, mean: Array, sqrt_information: Array, family: str = "prior") -> Factor:
-    """Prior on a vector variable (d,) about `mean`, with the square root (m, d) of its information."""
+    """Prior on a vector variable (d,) about `mean`, with square-root information (m, d)."""
     model = LinearModel(np.zeros(1), (sqrt_information @ mean)[None], sqrt_information[None])
     return Factor.process_of(family, model.on(key))
 
 
 def rotation_about(key: int, mean: Array, sqrt_information: Array, family: str = "prior") -> Factor:
-    """Prior on a Rot3 variable about `mean` (4,), with the square root (3, 3) of its information in its own frame."""
+    """Prior on a Rot3 variable about `mean` (4,), with square-root information (3, 3) in its own frame."""
     return Factor.process_of(family, RotationPrior(np.zeros(1), mean[None], sqrt_information[None]).on(key))
 
 
 def linear_factor(blocks: Mapping[int, Array], sigma: float) -> BoundModel:
-    """The measurement 0 = sum of blocks[key] x[key], up to three of (m, d), with `sigma` in each of its m rows.
+    """Factor 0 = sum of blocks[key] x[key], up to three blocks (m, d), with `sigma` in each of m rows.
 
     The rows are divided by sigma here. With a noise model beside them gtsam's elimination would take any row whose
     sigma is below 1e-8, in whatever unit, for an exact constraint, which later steps then cannot handle.

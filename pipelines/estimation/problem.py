@@ -59,7 +59,7 @@ def rotation_vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, 
 
 @dataclass(frozen=True)
 class NearRotationVector:
-    """Coordinates of a Rot3 variable: of the vectors of its rotation, a turn apart from each other, the nearest one.
+    """Coordinates of a Rot3 variable: its rotation vector nearest to a given one, modulo full turns, rad.
 
     Half a turn is +pi in one recording and -pi in the next; compared, joined or given a prior, both have to be one.
 
@@ -82,7 +82,7 @@ class NearRotationVector:
 
 @dataclass(frozen=True)
 class CommonFactor:
-    """A factor that K and b of a sensor have in common, which no recording separates from the strength it measures.
+    """Common factor of a sensor's K and b, inseparable from the strength of the measured field.
 
     What is left is the sensor's shape: K and b in units of that strength.
 
@@ -96,12 +96,12 @@ class CommonFactor:
 
     @property
     def scale(self) -> str:
-        """Name of the common factor."""
+        """Name of the derived number for the common factor, SENSOR_scale."""
         return f"{self.sensor}_scale"
 
     @property
     def shape(self) -> str:
-        """Name of what is left, as it may be required."""
+        """Name of the derived number for K and b without the common factor, SENSOR_shape."""
         return f"{self.sensor}_shape"
 
 
@@ -111,7 +111,7 @@ _DETERMINED = 0.5
 
 @dataclass(frozen=True)
 class Quantity:
-    """Calibrated number as the result lists it.
+    """Calibrated number as listed in the result.
 
     Attributes:
         name: as in result.json.
@@ -144,37 +144,37 @@ class Quantity:
 
     @property
     def assumed(self) -> bool:
-        """Whether its prior is what it is, not where it is to be looked for."""
+        """Whether the quantity is a nuisance parameter, with a prior from a data sheet or an assumption."""
         return self.nuisance or self.group is not None
 
     @property
     def tight(self) -> bool:
-        """Whether its prior is tighter than the usual one, so that somebody states it."""
+        """Whether the prior is tighter than the default one, and so is an explicit statement."""
         return 0.0 < (self.prior_sigma or 0.0) < self.prior_scale
 
     @property
     def required(self) -> bool:
-        """Whether an accuracy is wanted of it."""
+        """Whether the quantity has a required accuracy."""
         return math.isfinite(self.require)
 
     @property
     def judged(self) -> bool:
-        """Whether an accuracy is wanted of it by itself, so that there is a verdict."""
+        """Whether the quantity has a required accuracy of its own, and so a verdict."""
         return self.required and not self.relative
 
     @property
     def scale(self) -> float:
-        """Reference for this quantity's sigma: its prior's, or the usual one."""
+        """Reference for the quantity's sigma: the sigma of its prior, or of the default prior."""
         return self.prior_sigma or self.prior_scale
 
     def determined(self, sigma: float) -> bool:
-        """Whether the recording, not the prior, determines this quantity, given its posterior sigma."""
+        """Whether the recording rather than the prior determines the quantity, by its posterior sigma."""
         return self.prior_sigma != 0.0 and sigma < _DETERMINED * self.scale
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A calibration variable of the graph and the numbers it is reported as."""
+    """A calibration variable of the graph, with the numbers that report its value."""
 
     key: int
     quantities: tuple[Quantity, ...]
@@ -182,11 +182,11 @@ class Parameter:
 
     @property
     def is_rotation(self) -> bool:
-        """Whether it is a rotation, reported as a rotation vector."""
+        """Whether the parameter is a rotation, reported as a rotation vector."""
         return self.coordinates is rotation_vector_coordinates or isinstance(self.coordinates, NearRotationVector)
 
     def near(self, numbers: Mapping[str, float]) -> Parameter:
-        """The parameter with complete rotations reported by the rotation vector nearest to these numbers."""
+        """Return the parameter with rotations reported by the rotation vector nearest to given numbers."""
         names = [q.name for q in self.quantities]
         if not self.is_rotation or any(name not in numbers for name in names):
             return self
@@ -196,7 +196,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Factor:
-    """A factor of the graph with the family it is accounted under in chi-square.
+    """A factor of the graph, with the family that accounts for its chi-square.
 
     Attributes:
         family: "vision", "gyro", "prior", ...
@@ -217,19 +217,19 @@ class Factor:
 
     @classmethod
     def of(cls, family: str, measurement: BoundModel, beside: Array | None = None) -> Factor:
-        """Factor of a measurement that may be an outlier."""
+        """Build the factor of a measurement, which may be an outlier."""
         return cls(family, measurement=measurement, beside=beside)
 
     @classmethod
     def process_of(
         cls, family: str, process: BoundModel, beside: Array | None = None, fixed: Array | None = None
     ) -> Factor:
-        """Factor of a process that joins variables and is never an outlier."""
+        """Build the factor of a process, which joins variables and is never an outlier."""
         return cls(family, process=process, beside=beside, fixed=fixed)
 
     @property
     def factor(self) -> gtsam.NonlinearFactor:
-        """The gtsam factor; of a vectorised factor a new one at every call."""
+        """The gtsam factor; a vectorised factor builds a new one at every call."""
         if self.native is not None:
             return self.native
         bound = self.bound
@@ -247,11 +247,11 @@ class Factor:
         return self.measurement or self.process
 
     def rebound(self, bound: BoundModel) -> Factor:
-        """The factor with another vectorised model behind it."""
+        """Return the factor with another vectorised model."""
         return replace(self, process=bound) if self.measurement is None else replace(self, measurement=bound)
 
     def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
-        """The factor linearised about the values."""
+        """Linearise the factor about the values."""
         return self.factor.linearize(values) if self.bound is None else self.bound.linearized(values)
 
 
@@ -365,7 +365,7 @@ class Problem:
     gaussian_priors: tuple[GaussianPrior, ...] = ()
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
-        """The problem with rotations reported by the rotation vectors nearest to these numbers (rad, by name)."""
+        """Return the problem with rotations reported by the rotation vectors nearest to given ones (rad, by name)."""
         return replace(
             self,
             parameters=tuple(parameter.near(numbers) for parameter in self.parameters),
@@ -374,11 +374,11 @@ class Problem:
         )
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
-        """Inputs of formulas by name: an estimate's values and the constants."""
+        """Inputs of formulas by name: an estimate's values, and the constants."""
         return {**self.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
 
     def graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """The problem as gtsam has it, for its own optimizers, Marginals and ISAM2: factors and first values."""
+        """Build the gtsam graph and initial values, for gtsam's optimizers, Marginals and ISAM2."""
         graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for step in self.steps(CHUNK):
             initial.insert(step.initial)
@@ -392,7 +392,7 @@ class Problem:
         return tuple(q for p in self.parameters for q in p.quantities)
 
     def prior_covariance(self, names: Sequence[str], sigmas: Array) -> Array:
-        """Prior covariance (m, m) of some numbers: their sigmas (m,) with the correlations of `gaussian_priors`."""
+        """Prior covariance (m, m) of named numbers, from sigmas (m,) and the correlations of `gaussian_priors`."""
         covariance = np.diag(np.square(sigmas))
         for gaussian_prior in self.gaussian_priors:
             known = gaussian_prior.of(names)
@@ -405,7 +405,7 @@ class Problem:
 def changed(
     make: Callable[Arguments, Problem | None] | None, change: Callable[[Problem], Problem]
 ) -> Callable[Arguments, Problem | None] | None:
-    """Compose a function that makes a problem (or None) with a change of what it makes."""
+    """Compose a function that makes a problem (or None) with a change of that problem."""
     if make is None:
         return None
 
@@ -433,7 +433,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class ChiSquare:
-    """Sum of squared whitened residuals, its degrees of freedom and, per family, the same two."""
+    """Sum of squared whitened residuals with its degrees of freedom, in total and by family."""
 
     value: float
     dof: float
@@ -455,7 +455,7 @@ class History:
 
 @dataclass(frozen=True)
 class PosteriorHistory:
-    """Joint posterior at moments, given all before each, with the same noise levels at all.
+    """Joint posterior at moments, each given all data before, all with the same noise levels.
 
     Attributes:
         time: (k,), s.
@@ -495,7 +495,7 @@ class InfluentialMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class SqrtInformation:
-    """Information of a recording about the free reported numbers: R (x - at) = d, rows of unit variance.
+    """Square-root information of a recording about its free numbers: R (x - at) = d, rows of unit variance.
 
     It is linear about the estimate.
 
@@ -518,13 +518,13 @@ class SqrtInformation:
     scales: Array
 
     def with_priors_of(self, other: SqrtInformation) -> SqrtInformation:
-        """This information with the device's priors linearised as in another one of the same graph."""
+        """Replace the device's priors by those of another information of the same graph, relinearised here."""
         return replace(self, prior_R=other.prior_R, prior_d=other.prior_d + other.prior_R @ (other.at - self.at))
 
 
 @dataclass(frozen=True)
 class Minimum:
-    """Another solution: reported values (n,), and by how much its chi-square, priors included, is larger."""
+    """An alternative solution: reported values (n,), and the excess of its chi-square, priors included."""
 
     values: Array
     chi_square: float
@@ -536,7 +536,7 @@ APART = 11.345
 
 @dataclass(frozen=True)
 class StepEstimate:
-    """A step of some parameters, at one moment of a recording, that explains it.
+    """Estimated step of a parameter at one moment of a recording, with its test statistics.
 
     Attributes:
         time_s, since_s: of the first measurement after it, and of the last one before, s.
@@ -564,7 +564,7 @@ class StepEstimate:
 
     @property
     def agrees(self) -> bool:
-        """Whether both are the same step: but for chance, or by more than half of what motion alone shows.
+        """Whether the step from all data agrees with the step from motion alone.
 
         What the reference errs slowly moves both, and is more than chance where the step itself is large.
         """
@@ -572,7 +572,7 @@ class StepEstimate:
 
     @property
     def statistic(self) -> float:
-        """Chi-square: the smaller of both tests where they agree."""
+        """Chi-square of the step: the smaller of both tests if these agree, else 0."""
         return min(self.fall, self.by_motion) / self.ratio**2 if self.agrees else 0.0
 
 
@@ -582,7 +582,7 @@ SLOW_ERROR = 1.3
 
 @dataclass(frozen=True)
 class Estimate:
-    """A calibration by one solver; `names`, `values` (n,) and `covariance` (n, n) belong together.
+    """Calibration result of one solver; `names`, `values` (n,) and `covariance` (n, n) are in one order.
 
     Attributes:
         solver: "batch", "incremental" or "published".
@@ -647,17 +647,17 @@ class Estimate:
 
     @property
     def sigmas(self) -> Array:
-        """Standard deviations (n,)."""
+        """Standard deviations (n,) of the values."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def has_innovations(self) -> bool:
-        """Whether residuals are those of measurements against what was predicted before them."""
+        """Whether the residuals are innovations: measured minus predicted from earlier data."""
         return self.solver == "incremental" and not self.concluded
 
     @property
     def sensitivities(self) -> Array:
-        """Shift (n, n) of each number, a row, per unit by which another, a column, is shifted; 0 for fixed ones.
+        """Shift (n, n) of each number (row) per unit shift of another (column); 0 for fixed columns.
 
         Of the covariance without what only widens sigmas: slow errors, and a map of errors that moves nothing.
         """
@@ -671,15 +671,15 @@ class Estimate:
 
     @property
     def inflations(self) -> Array:
-        """Inflation (n,), ones where `inflation` is None."""
+        """Inflation factors (n,) of the sigmas; ones where `inflation` is None."""
         return np.ones(len(self.values)) if self.inflation is None else self.inflation
 
     def widest(self, quantities: Sequence[Quantity]) -> float:
-        """Largest ratio, at least 1, of a judged quantity's sigma by correlated residuals to that by white noise."""
+        """Largest inflation, at least 1, of a judged quantity's sigma by correlated residuals and slow errors."""
         ratios = self.inflations if self.sandwich is None else self.inflations * self.sandwich
         return float(ratios[[q.judged for q in quantities]].max(initial=1.0))
 
 
 def slow_widening(sandwich: Array | None, n: int) -> Array:
-    """Factor (n,) of sigmas for slow errors, given ratios of sandwich to nominal sigma; None: not looked for."""
+    """Factors (n,) on sigmas for slow errors, from ratios of sandwich to nominal sigma; None: ones."""
     return np.ones(n) if sandwich is None else np.where(sandwich > SLOW_ERROR, sandwich, 1.0)

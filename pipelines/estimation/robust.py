@@ -15,14 +15,14 @@ _SETTLED = 0.05
 
 
 def robust_sigma(values: Array) -> float:
-    """Standard deviation of zero-mean normal numbers by their median absolute value, which outliers do not move."""
+    """Standard deviation of zero-mean normal numbers, estimated from the median absolute value."""
     return float(np.median(np.abs(values), overwrite_input=True)) / 0.6745 if values.size else 0.0
 
 
 def fitted(
     near: Callable[[Array], Callable[[Array], Array]], x: Array, prior: Array, sigma: float, most: int
 ) -> tuple[Array, Array]:
-    """x (m,) after robust least-squares steps, and its covariance (m, m); there are no more where one moves it no more.
+    """Iterate robust least-squares steps until convergence; return x (m,) and its covariance (m, m).
 
     Args:
         near: what misses, as `improved` has it, near some x.
@@ -39,7 +39,7 @@ def fitted(
 
 
 def improved(miss: Callable[[Array], Array], x: Array, prior: Array, sigma: float) -> tuple[Array, Array]:
-    """x (m,) after a robust least-squares step on what misses, and its covariance (m, m).
+    """Improve x (m,) by one robust least-squares step; return x and its covariance (m, m).
 
     Args:
         miss: what misses (n, d) at some x.

@@ -37,7 +37,7 @@ NODES = "bm"
 
 @dataclass(frozen=True)
 class WalkingBias:
-    """Random walk of a bias as nodes over [0, duration].
+    """Random walk of a gyro bias, piecewise constant: one node for each segment.
 
     Attributes:
         edges: (J + 1,) s, ends of the segments.
@@ -55,7 +55,7 @@ class WalkingBias:
     def over(
         cls, start: float, stop: float, middles: Array, walk: float, density: float, begun: Array | None = None
     ) -> WalkingBias:
-        """Segments short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz)).
+        """Divide a recording into segments short enough for the walk to stay below the gyro noise.
 
         All are of one length, so that those behind stay as they are while a recording grows; but one that holds none
         of the times at which the bias is asked for is part of the segment before it.
@@ -83,15 +83,15 @@ class WalkingBias:
         return len(self.edges) - 1
 
     def node_at(self, time: Array) -> Index:
-        """Index of the node in force at the times."""
+        """Index of the node in force at given times."""
         return np.clip(np.searchsorted(self.edges, time, side="right") - 1, 0, self.nodes - 1)
 
     def key(self, node: int) -> int:
-        """Variable of a node, (3,) rad/s."""
+        """Key of the variable of a node, (3,) rad/s."""
         return int(gtsam.symbol("b", node))
 
     def mean_key(self, node: int) -> int:
-        """Variable of the mean up to the end of a node's segment; the first segment's mean is its node."""
+        """Key of the mean bias up to the end of a node's segment; the first node is its own mean."""
         return self.key(0) if node == 0 else int(gtsam.symbol("m", node))
 
     def begin(self, step: Step, node: int, guess: Array) -> None:
@@ -101,19 +101,19 @@ class WalkingBias:
             step.factors.append(self._walk_factor(node))
 
     def end(self, step: Step, node: int, guess: Array) -> None:
-        """Add the mean up to the end of a node's segment to a step; the first segment's mean is its node."""
+        """Add the mean bias up to the end of a node's segment to a step; the first node is its own mean."""
         if node > 0:
             step.initial.insert(self.mean_key(node), guess)
             step.factors.append(self._mean_factor(node))
 
     def keep(self, step: Step, nodes: range, means: range) -> None:
-        """Keep nodes, and means up to the end of segments, alive until the step; a bias of one node never ages."""
+        """Keep nodes and means in a smoother's window until the step's time; a single node never leaves it."""
         if self.nodes > 1:
             keys = [*map(self.key, nodes), *map(self.mean_key, means)]
             step.timestamps.update(dict.fromkeys(keys, step.time))
 
     def _walk_factor(self, node: int) -> Factor:
-        """Joins a node to the one before it."""
+        """Random-walk factor between a node and its predecessor."""
         spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
         step = self.walk * np.sqrt(spacing)
         sigma = float(np.hypot(step, _SLACK * self._unknown(spacing)))
@@ -121,11 +121,11 @@ class WalkingBias:
         return Factor.process_of("bias walk", linear_factor(blocks, sigma))
 
     def _unknown(self, segment: float) -> float:
-        """Sigma that gyro noise leaves to the bias of a segment (s), rad/s."""
+        """Sigma of a segment's mean bias by gyro noise alone, rad/s; `segment` in s."""
         return self.density / float(np.sqrt(segment))
 
     def _mean_factor(self, node: int) -> Factor:
-        """Defines the mean at the end of a node's segment from the one before and the node."""
+        """Factor that defines the mean bias at the end of a node's segment, from the previous mean and the node."""
         end = self.stop if node == self.nodes - 1 else self.edges[node + 1]
         whole, segment = end - self.edges[0], end - self.edges[node]
         share = float(segment / whole)

@@ -11,7 +11,7 @@ from alidade.pipelines.estimation.problem import Array, Estimate, SqrtInformatio
 
 
 def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.inf) -> Estimate:
-    """The estimate with covariance P + S S'.
+    """Add a source of error to an estimate: its covariance becomes P + S S'.
 
     Whoever reads the estimate reads that covariance: its history from a time on, the budget, and the square-root
     information from which a joint calibration is made.
@@ -38,7 +38,7 @@ def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.
 
 
 def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[str, float]:
-    """Shares of a variance with that of one more source, the largest first."""
+    """Add one source to the shares of a variance and sort, the largest first."""
     if share == 0.0:
         return dict(shares)
     whole = {**{name: (1.0 - share) * each for name, each in shares.items()}, source: share}
@@ -46,7 +46,7 @@ def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[
 
 
 def marginalised(sqrt_info: SqrtInformation, names: Sequence[str], columns: Array) -> SqrtInformation:
-    """R (x - S a - at) = d with a unit normal a (m,) marginalised out; `columns` S (n, m) are of the numbers named.
+    """Marginalise a unit normal a (m,) out of R (x - S a - at) = d, with S `columns` (n, m) of the names.
 
     Column by column: rows whitened by (I + r r')^-1/2, r = R s.
     """
