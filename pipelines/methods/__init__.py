@@ -54,7 +54,7 @@ def _not_offered(*_: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Method:
-    """One calibration method; `Any` stands for its data, whose class only the method knows.
+    """One calibration method; `Any` stands for the class of its data.
 
     Attributes:
         name, title: as in the config and on the command line; as shown to people.
@@ -102,7 +102,7 @@ class Method:
 
     @property
     def data_sheets(self) -> dict[str, list[str]]:
-        """Sensor, as under `sensors` in the config -> figures that are used."""
+        """Data-sheet figures that the method uses, by sensor as under `sensors` in the config."""
         found: dict[str, list[str]] = {}
         for spec in self.parameters:
             if spec.data_sheet and spec.figure not in found.setdefault(spec.sheet, []):
@@ -110,30 +110,30 @@ class Method:
         return found
 
     def is_per_recording(self, parameter: str) -> bool:
-        """Whether a parameter belongs to a recording, not to the device."""
+        """Whether a parameter belongs to a recording rather than to the device."""
         spec = self.spec(parameter)
         return spec is not None and spec.per_recording
 
     def describe(self, parameter: str) -> str:
-        """A sentence about a parameter; empty for an unknown one."""
+        """Description of a parameter as a sentence; empty for an unknown one."""
         spec = self.spec(parameter)
         text = "" if spec is None else spec.describe(parameter)
         return text[:1].upper() + text[1:]
 
     def spec(self, parameter: str) -> ParameterSpec | None:
-        """The declaration of a parameter; None for an unknown one."""
+        """Declaration of a parameter; None for an unknown one."""
         from alidade.pipelines.estimation.parameters import spec_of
 
         return spec_of(self.parameters, parameter)
 
     def graph(self, data: Any, config: Config) -> Problem:
-        """The factor graph with the config's prior means and covariances applied. Raises as `problem` does."""
+        """Build the factor graph with the config's prior means and covariances. Raises as `problem` does."""
         from alidade.pipelines.estimation.prior_replacement import with_priors
 
         return with_priors(self.problem(data, config), config.gaussian_priors)
 
     def simulate(self, scenario: Any, seed: int, images: bool = False) -> Simulated:
-        """Data and truth in memory of a scenario. Raises InputError when there is no simulator, or it refuses."""
+        """Simulate data and truth of a scenario in memory. Raises InputError without a simulator or if it refuses."""
         simulator = self.require_simulator()
         if images and not simulator.has_camera:
             raise InputError(f"{self.name} has no camera: leave out --images")
@@ -160,8 +160,8 @@ class Method:
         write_session(path, self.to_topics(data, pictures), attached(truth, config_yaml))
 
     def settings(self, scenario: str | None = None, images: bool = False) -> Any:
-        """The simulator's settings of a scenario, by name or file; None: the default scenario, or the
-        model's defaults where it has no file.
+        """Simulator settings of a scenario, by name or file; None: the default scenario, or the model's defaults
+        without one.
 
         Raises InputError when there is no such scenario, or when it does not fit the model.
         """
@@ -183,12 +183,12 @@ class Method:
         return self.require_simulator().scenario
 
     def default_scenario(self, images: bool = False) -> str:
-        """Name of the scenario that is simulated where none is named."""
+        """Name of the scenario to simulate by default."""
         simulator = self.require_simulator()
         return (simulator.default_with_images if images else "") or f"{self.name}_nominal"
 
     def require_simulator(self) -> Simulator:
-        """The simulator. Raises InputError when the method has none."""
+        """Return the simulator. Raises InputError when the method has none."""
         if self.simulator is None:
             raise InputError(f"method {self.name} has no simulator")
         return self.simulator
@@ -232,7 +232,7 @@ class Guidance:
 
 @dataclass(frozen=True, kw_only=True)
 class Correction:
-    """Results of formulas that are what an IMU or a magnetometer would have measured.
+    """Formulas whose results correct the measurements of an IMU or a magnetometer, for corrected topics.
 
     Attributes:
         topic: of the sensors.
@@ -253,7 +253,7 @@ class Correction:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Declaration of a method's results beside its parameters.
+    """Declaration of a method's results other than its parameters.
 
     Attributes:
         formulas: names of determined parameters, config -> how a result is applied, in order of evaluation.
@@ -281,7 +281,7 @@ class Report:
 
 
 class _Deferred:
-    """An object that is imported when it is first called or asked for an attribute."""
+    """Object that is imported at its first call or attribute access."""
 
     def __init__(self, reference: str) -> None:
         self._reference = reference
@@ -306,7 +306,7 @@ _BUILT_IN = ("los", "indexer", "head", "cube", "tumble")
 
 
 def names() -> tuple[str, ...]:
-    """Built-in methods, then those of other distributions that can be loaded; the others are logged once."""
+    """Names of the built-in methods and of loadable methods from other distributions; failures are logged once."""
     return (*_BUILT_IN, *(name for name in _plugins() if _is_sound(name)))
 
 
@@ -322,7 +322,7 @@ def _is_sound(name: str) -> bool:
 
 @cache
 def method(name: str) -> Method:
-    """The method of that name. Raises InputError when there is none, or when its distribution is broken."""
+    """Find a method by name. Raises InputError if there is none or its distribution is broken."""
     if name in _BUILT_IN:
         found = import_module(f"alidade.pipelines.methods.{name}").METHOD
         assert isinstance(found, Method)
@@ -340,12 +340,12 @@ def method(name: str) -> Method:
 
 
 def prefer_specific(able: Sequence[str]) -> list[str]:
-    """Names of methods without the fallback ones, unless there are no others."""
+    """Remove the fallback methods from names, unless there are no others."""
     return [name for name in able if not method(name).fallback] or list(able)
 
 
 def commands() -> dict[str, Callable[..., None]]:
-    """Word -> command of another distribution, a function as typer takes it; one that cannot be loaded is logged."""
+    """Commands of other distributions by name, as typer functions; load failures are logged."""
     found: dict[str, Callable[..., None]] = {}
     for entry in entry_points(group=COMMANDS):
         try:

@@ -39,7 +39,7 @@ AXES = {"ex": np.eye(3)[0], "ey": np.eye(3)[1], "ez": np.eye(3)[2]}
 
 @dataclass(frozen=True)
 class Formula:
-    """One quantity that follows from a calibration and, maybe, from measurements.
+    """Formula of one quantity, from a calibration and optionally from measurements.
 
     Attributes:
         description: what it is, with unit and frame.
@@ -66,7 +66,7 @@ class Formula:
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """Value of an expression with its kind, or many such values."""
+    """Value or values of an expression, with their kind."""
 
     kind: Kind
     array: Array
@@ -78,12 +78,12 @@ class Value:
 
 
 def input_kind(name: str) -> Kind:
-    """Whether an input of a formula is a rotation, a vector or a scalar, by its name."""
+    """Kind of a formula's input by its name: rotation, vector or scalar."""
     return "rotation" if _ROTATION.fullmatch(name) else "vector" if _VECTOR.fullmatch(name) else "scalar"
 
 
 def with_vectors(values: Mapping[str, float]) -> dict[str, Array]:
-    """Parameters by name, and three of them name_x, name_y, name_z as the vector `name` too."""
+    """Parameters by name; three named stem_x, stem_y, stem_z are also the vector `stem`."""
     known = {name: np.array(value, dtype=float) for name, value in values.items()}
     for stem in {name[:-2] for name in values if name.endswith("_x")}:
         if all(f"{stem}_{axis}" in values for axis in "xyz"):
@@ -92,7 +92,7 @@ def with_vectors(values: Mapping[str, float]) -> dict[str, Array]:
 
 
 def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Array]:
-    """Everything that follows from a calibration's values and measurements.
+    """Evaluate all formulas that the given measurements suffice for, with a calibration's values.
 
     Args:
         formulas: of the method, in order.
@@ -121,7 +121,7 @@ def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Ma
 
 
 def results(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Value]:
-    """Results of formulas with their kinds, as `apply`; measurements of no formula are ignored."""
+    """Evaluate formulas as `apply` does and return the results with their kinds; unused measurements are ignored."""
     space = {name: Value.constant(array) for name, array in (with_vectors(values) | AXES).items()}
     space |= {name: Value(input_kind(name), np.asarray(given, dtype=float)) for name, given in measured.items()}
     found: dict[str, Value] = {}
@@ -132,7 +132,7 @@ def results(formulas: Sequence[Formula], values: Mapping[str, float], measured: 
 
 
 def evaluate(tree: ast.expr, names: Mapping[str, Value]) -> Value:
-    """The value of a parsed expression; names without a value are 0. Raises ValueError for anything else."""
+    """Evaluate a parsed expression; names without a value are 0. Raises ValueError for unsupported syntax."""
     match tree:
         case ast.Constant(value=int() | float() as number):
             return Value("scalar", np.array(float(number)))
@@ -159,7 +159,7 @@ OPERATORS: Mapping[type[ast.operator], str] = {
 
 
 def operate(op: str, *parts: Value) -> Value:
-    """An operation of OPERATORS, "minus", or a function that expressions may call."""
+    """Evaluate an operation of OPERATORS, "minus", or a function that expressions may call."""
     kind, arrays = result_kind(op, [part.kind for part in parts]), [part.array for part in parts]
     if op == "inverse" and kind == "rotation":
         return Value(kind, so3.inverse(*arrays))
@@ -186,7 +186,7 @@ def _applied(left: Value, right: Value) -> Array:
 
 
 def passive(axis: int, angle: Any) -> Array:
-    """Rx, Ry or Rz (axis 0, 1, 2) of angles in rad, (..., 4): transpose(Exp(angle e_axis))."""
+    """Passive rotations Rx, Ry or Rz (axis 0, 1, 2) by angles in rad, (..., 4): transpose(Exp(angle e_axis))."""
     return so3.exp(-np.asarray(angle, dtype=float)[..., None] * np.eye(3)[axis])
 
 
@@ -208,30 +208,30 @@ _COMPUTED: Mapping[str, Callable[..., Array]] = {
 
 
 def matrix_text(rows: Sequence[Sequence[str]], known: Collection[str]) -> str:
-    """A matrix of parameters as an expression, with 0 for unknown names."""
+    """Expression of a matrix of parameters, with 0 for unknown names."""
     return f"[{', '.join(vector_text(row, known) for row in rows)}]"
 
 
 def vector_text(names: Sequence[str], known: Collection[str]) -> str:
-    """A vector of parameters as an expression, with 0 for unknown names."""
+    """Expression of a vector of parameters, with 0 for unknown names."""
     return f"[{', '.join(name if name in known else '0' for name in names)}]"
 
 
 def symmetric_text(names: Sequence[str], known: Collection[str]) -> str:
-    """I + S as an expression, S of the numbers xx yy zz xy xz yz, with 0 for unknown names."""
+    """Expression of I + S, with S of the numbers xx yy zz xy xz yz, and 0 for unknown names."""
     xx, yy, zz, xy, xz, yz = (name if name in known else "0" for name in names)
     return f"[[1 + {xx}, {xy}, {xz}], [{xy}, 1 + {yy}, {yz}], [{xz}, {yz}, 1 + {zz}]]"
 
 
 def temperature_text(names: Sequence[str], known: Collection[str]) -> str:
-    """Drift of a bias with temperature as an expression, by its slopes."""
+    """Expression of a bias drift with temperature, by its slopes."""
     return f"{vector_text(names, known)} * (temperature - first_temperature)"
 
 
 def gyro_rate(
     known: Collection[str], s: Sequence[str], g: Sequence[str], c: Sequence[str] = ()
 ) -> tuple[str, tuple[str, ...]]:
-    """The true rate w from a gyro's reading (I + S) w + G f + c (temperature - first_temperature) + gyro_bias.
+    """Expression of the rate w, from a gyro reading (I + S) w + G f + c (temperature - first_temperature) + gyro_bias.
 
     Args:
         known: parameters that are applied.
@@ -250,7 +250,7 @@ def gyro_rate(
 
 
 def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, known: Collection[str]) -> list[Formula]:
-    """The axes' angles from the readings of their encoders; none where no encoder error is applied.
+    """Formulas of axis angles from encoder readings; none if no encoder error is applied.
 
     Args:
         axes: names of the readings; the results have `_angle` added.
@@ -275,12 +275,12 @@ def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, k
 
 
 def picture_time(known: Collection[str]) -> str:
-    """Time of a picture on the gyro's clock by time_offset and clock_skew, as an expression of its stamp."""
+    """Expression of a picture's time on the gyro's clock, from its stamp, time_offset and clock_skew."""
     offset, skew = "time_offset" in known, "clock_skew" in known
     return f"stamp{' + time_offset' * offset}{' - clock_skew * (stamp - first_stamp)' * skew}"
 
 
 def clock_constants(clock: Parameter | None, first_stamp: float) -> dict[str, float]:
-    """The first stamp, s, where the formula of a picture's time needs it."""
+    """First stamp, s, as a constant of the formulas if the clock's skew is a parameter."""
     skewed = clock is not None and any(q.name == "clock_skew" for q in clock.quantities)
     return {"first_stamp": first_stamp} if skewed else {}

@@ -44,7 +44,7 @@ def stated(
     families: Sequence[str] = (),
     rows: Sequence[int] | None = None,
 ) -> Noise:
-    """A noise of the config's section `noise`: its figure, else what messages state, else the default.
+    """Read a noise of the config's section `noise`: its figure, else that of the messages, else the default.
 
     Args:
         spec: its key, or the declaration of a noise that only one method has.
@@ -68,7 +68,7 @@ def stated(
 
 
 def repeatability(sensor: str, config: Config, family: str) -> Level:
-    """Repeatability of a mean over a rest, or a turn, beside white noise: as stated, until residuals estimate it.
+    """Repeatability of a mean over a rest or turn, beside white noise: as stated, until estimated from residuals.
 
     Where nobody states it, it counts as hardly known, and as none where noise is said to be known exactly.
     """
@@ -80,7 +80,7 @@ def repeatability(sensor: str, config: Config, family: str) -> Level:
 def estimated(
     name: str, config: Config, families: Sequence[str], message: float | None = None, beside: bool = False
 ) -> Level:
-    """A noise whose level the marginal likelihood finds, its prior by what is stated; else within a factor seven."""
+    """Noise level for estimation by marginal likelihood, its prior the statement, else a default within a factor 7."""
     noise = replace(stated(name, config, message, families), beside=beside)
     if noise.source == "default" and noise.known:
         return Level(replace(noise, known=_HARDLY))
@@ -88,7 +88,7 @@ def estimated(
 
 
 def sampled(noise: Noise, time: Array, samples: Array) -> Level:
-    """The level of a sensor's white noise, from what was stated and from its own samples while it moves.
+    """Estimate a sensor's white noise level from its samples in motion, with the stated level as prior.
 
     What is stated larger than the samples have it may stand for more than white noise, so that residuals decide.
 
@@ -110,7 +110,7 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
 
 
 def at_least_at_rest(level: Level, time: Array, gyro: Array, force: Array | None) -> Level:
-    """The level of a gyro's white noise, bounded below by what the gyro itself shows at rest.
+    """Bound a gyro's white noise level below by the noise that the gyro shows at rest.
 
     Motion adds noise and takes none away. The bound is the least density of means over some times, less three of its
     sigmas; of a recording without rest there is none.
@@ -130,7 +130,7 @@ def at_least_at_rest(level: Level, time: Array, gyro: Array, force: Array | None
 
 
 def mean_at_rest(time: Array, gyro: Array, force: Array | None) -> Array:
-    """The rates (n, 3) of a gyro, those at rest by their mean over the interval at rest.
+    """Replace a gyro's rates (n, 3) at rest by their mean over each interval at rest.
 
     What a sensor turns within milliseconds at rest is not what its noise says. The same array of a recording without
     rest; arguments as `at_least_at_rest` has them.
@@ -143,13 +143,13 @@ def mean_at_rest(time: Array, gyro: Array, force: Array | None) -> Array:
 
 
 def _rests(time: Array, gyro: Array, force: Array | None) -> list[slice]:
-    """Samples of each interval at rest."""
+    """Slices of the samples in each static interval."""
     spans = stretches_at_rest(time, [gyro] if force is None else [gyro, force], gyro)
     return [slice(*np.searchsorted(time, span) + [0, 1]) for span in spans]
 
 
 def _rest_density(pieces: Sequence[Array], count: int, interval: float) -> float:
-    """Allan deviation of means of `count` samples as a density, less three of its sigmas; 0: too few."""
+    """Lower 3-sigma bound of a noise density, from the Allan deviation of means of `count` samples; 0: too few."""
     differences = [
         np.diff(piece[: len(piece) // count * count].reshape(-1, count, 3).mean(axis=1), axis=0) for piece in pieces
     ]
@@ -159,7 +159,7 @@ def _rest_density(pieces: Sequence[Array], count: int, interval: float) -> float
 
 
 def walked(noise: Noise, time: Array, means: Array, causes: Array) -> Level:
-    """The level of a bias's random walk from what was stated and from the bias itself, seen at some times.
+    """Estimate the level of a bias's random walk from direct observations of the bias and the stated level.
 
     By restricted maximum likelihood: the walk beside an error that is new every time, the mean and what follows its
     causes (g-sensitivity, the vertical part of the earth's rate, a slope over temperature) free.
@@ -194,7 +194,7 @@ def walked(noise: Noise, time: Array, means: Array, causes: Array) -> Level:
 
 
 def walking(config: Config) -> Level:
-    """The level of a bias's random walk whose steps are processes of the graph: as stated, or smaller.
+    """Level of a bias's random walk that acts through process factors: as stated or, for a default, smaller.
 
     A default is that of no particular sensor, and a better one's residuals say how far below it is.
     """
@@ -205,7 +205,7 @@ def walking(config: Config) -> Level:
 
 
 def _likelihood(means: Array, follows: Array, covariance: Array) -> float:
-    """Logarithm of the likelihood of columns (n, k) that follow others (n, d), restricted to what says nothing of how.
+    """Restricted log likelihood of columns (n, k), their regression on others (n, d) marginalised out.
 
     Patterson, Thompson, "Recovery of inter-block information when block sizes are unequal", Biometrika 1971.
     """
@@ -218,7 +218,7 @@ def _likelihood(means: Array, follows: Array, covariance: Array) -> float:
 
 
 def weighed(level: Level) -> Level:
-    """The level with its scale weighted between the stated and the estimated one."""
+    """Combine a level's stated and estimated scale, weighted by their uncertainties."""
     assert level.found is not None
     assert level.sigma is not None
     spread = level.sigma / level.found
@@ -226,7 +226,7 @@ def weighed(level: Level) -> Level:
 
 
 def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
-    """Density, per sqrt(Hz), of the white part of samples (n, k) while they move, and its relative sigma.
+    """Density per sqrt(Hz) of the white part of samples (n, k) in motion, and its relative sigma.
 
     From high differences of means of 1, 2, 4, ... samples, each of which sees a lower band: the first two that agree.
     None where none do, as behind a filter, under vibration, or where steps of the readings hide the noise.
@@ -251,7 +251,7 @@ def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
 
 
 def _differences(samples: Array, count: int) -> Array:
-    """High-order differences of means of `count` samples (n, k)."""
+    """High-order differences of means of `count` consecutive samples (n, k)."""
     out = np.empty((max(len(samples) // count - _ORDER, 0), samples.shape[1]))
     for begin in range(0, len(out), _BLOCK):
         end = min(begin + _BLOCK, len(out))
@@ -261,7 +261,7 @@ def _differences(samples: Array, count: int) -> Array:
 
 
 def typical(covariance: Array | None, *components: int) -> float | None:
-    """Median sigma of some components of measurements' covariances (n, m, m); None where none is stated."""
+    """Median sigma of selected components over covariances (n, m, m) of measurements; None where none is given."""
     if covariance is None:
         return None
     variance = np.concatenate([covariance[:, i, i] for i in components])

@@ -36,7 +36,7 @@ STRENGTH_ADVICE = Motion(
 
 
 def known_strength(config: Config, model: Array | None) -> tuple[float, float] | None:
-    """Strength of the field and its sigma, T: as measured, else of the model (3,); None without both."""
+    """Field strength and its sigma, T: measured, else that of the field model (3,); None without both."""
     measured = config.field.strength
     if measured is not None:
         return measured.value, measured.sigma
@@ -44,7 +44,7 @@ def known_strength(config: Config, model: Array | None) -> tuple[float, float] |
 
 
 def known_field(config: Config, model: Array) -> tuple[Array, float, float]:
-    """Prior mean (3,) of the field and sigmas of its strength and of each component across, T, from its model (3,).
+    """Prior mean (3,) of the field, sigma of its strength and sigma of each transverse component, T.
 
     Its direction is the model's; a strength that was measured replaces the model's.
     """
@@ -54,7 +54,7 @@ def known_field(config: Config, model: Array) -> tuple[Array, float, float]:
 
 
 def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float | None, float | None, float]:
-    """Latitude and longitude, rad, None if unknown, and height, m: the median of the fixes; the config's figures win.
+    """Latitude and longitude, rad (None if unknown), and height, m, from the config, else the median fix.
 
     Raises InputError when there are fixes and none of them can be used.
     """
@@ -71,7 +71,7 @@ def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float 
 def place_topics(
     fix: Topic, epoch_ns: int, latitude: float | None, longitude: float | None, height: float, frame_id: str = "gnss"
 ) -> dict[str, series.Topic]:
-    """The fix to be written, of a place in rad and m; none where it is unknown."""
+    """Topic with one fix to write, for a place in rad and m; empty if the place is unknown."""
     if latitude is None or longitude is None:
         return {}
     at = [np.array([each]) for each in (np.rad2deg(latitude), np.rad2deg(longitude), height)]
@@ -95,7 +95,7 @@ def median_fix(recording: Recording, topic: str) -> tuple[float, float, float]:
 def field_at(
     latitude: float, longitude: float, height: float, epoch_ns: int, date: datetime.date | None = None
 ) -> Array:
-    """The World Magnetic Model, (3,) T in East-North-Up, on a date or else that of a stamp.
+    """Field (3,) of the World Magnetic Model, T in East-North-Up, on a date, else on the date of a stamp.
 
     Args:
         latitude, longitude: rad.

@@ -69,7 +69,7 @@ GYRO_TREMOR, ACCEL_TREMOR = 0.05, 0.2
 
 
 def find_static_intervals(t: Array, accel: Stream, gyro: Stream | None = None, *others: Stream) -> Array:
-    """Beginnings and ends, (P, 2) s, of the static intervals, each at a sample's stamp.
+    """Find static intervals: start and end, (P, 2) s, each at a sample's stamp.
 
     Without a gyro a steady turn about what a sensor feels passes for a rest.
 
@@ -106,7 +106,7 @@ def find_static_intervals(t: Array, accel: Stream, gyro: Stream | None = None, *
 
 
 def _quiet_runs(t: Array, streams: Sequence[Stream]) -> tuple[Index, Array, Array]:
-    """First and last sample of each quiet run (P, 2), and for each stream its scatter (N,) and the floor of that.
+    """First and last sample of each quiet run (P, 2); scatter (N,) and noise floor of each stream.
 
     Raises InputError when the record is shorter than what is looked at.
     """
@@ -129,7 +129,7 @@ def _quiet_runs(t: Array, streams: Sequence[Stream]) -> tuple[Index, Array, Arra
 
 
 def _is_rest(values: Array, interval: float) -> bool:
-    """Whether a quiet run of vectors (n, 3) is long enough, or brief and white."""
+    """Whether a quiet run of vectors (n, 3) is a rest: long enough, or short and white."""
     length = (len(values) - 1) * interval
     if length < _SHORTEST or length > _BRIEF:
         return length > _BRIEF
@@ -138,7 +138,7 @@ def _is_rest(values: Array, interval: float) -> bool:
 
 
 def _split(scatter: Array) -> float:
-    """Otsu's threshold between two classes of scatter, in the logarithm; 0 where there are none."""
+    """Otsu's threshold between two classes of scatter, on the logarithm; 0 where the classes are not separate."""
     x = np.log(np.sort(scatter[np.isfinite(scatter) & (scatter > 0.0)]))
     lower = np.arange(1, len(x))
     if not len(lower):
@@ -151,7 +151,7 @@ def _split(scatter: Array) -> float:
 
 
 def _unmoved(first: int, last: int, streams: Sequence[Stream], floor: Array, interval: float) -> tuple[int, int]:
-    """First and last sample of a quiet run but for ends in which motion is slow."""
+    """Trim slow motion at both ends of a quiet run; return its first and last sample."""
     low, high = _SLOW
     slow = round(min(max(_SLOW_SHARE * (last - first) * interval, low), high) / interval)
     first, last = first + slow, last - slow
@@ -173,7 +173,7 @@ def _unmoved(first: int, last: int, streams: Sequence[Stream], floor: Array, int
 
 
 def _colour(values: Array) -> float:
-    """By what sums of some samples (n, d) scatter more than those of white noise: a filtered sensor's are alike."""
+    """Ratio of the scatter of sums of samples (n, d) to that of white noise; above 1 for a filtered sensor."""
     blocks = len(values) // _TOGETHER
     if blocks < _FEWEST_BLOCKS:
         return 1.0
@@ -183,7 +183,7 @@ def _colour(values: Array) -> float:
 
 
 def _still_for(off: Array, count: int) -> int:
-    """Number of leading samples (n, d), in units of their noise about a mean of `count` others, at that mean."""
+    """Number of leading samples, given as deviations (n, d) in sigmas from a mean of `count` others, without drift."""
     n = np.arange(1, len(off) + 1)
     drift = np.abs(np.cumsum(off, axis=0)).max(axis=1, initial=0.0) / np.sqrt(n * (1.0 + n / count))
     moved = np.flatnonzero(drift > _MOVED)
@@ -193,7 +193,7 @@ def _still_for(off: Array, count: int) -> int:
 
 
 def _scatter(values: Array, half: int) -> Array:
-    """Standard deviation (N,) over 2 half + 1 samples about each, root mean square over the axes; inf at the ends."""
+    """Running standard deviation (N,) over 2 half + 1 samples, rms over the axes."""
     n = 2 * half + 1
     centred = values - values.mean(axis=0)
     sums = [np.cumsum(np.pad(power, ((1, 0), (0, 0))), axis=0) for power in (centred, centred**2)]
@@ -206,7 +206,7 @@ def _scatter(values: Array, half: int) -> Array:
 
 
 def _turns_not(means: Array, forces: Array, lengths: Index, sigma: float) -> Mask:
-    """Which runs, of so many samples, have the mean rate (n, 3) that gyro bias and g-sensitivity give in most of them.
+    """Mask of runs whose mean rate (n, 3) agrees with one gyro bias and g-sensitivity, so without rotation.
 
     Bias b and g-sensitivity G of means = b + G forces by least squares with Cauchy's weights, from the median on: a
     turn adds far more than gravity does.

@@ -22,7 +22,7 @@ FIRST = "first_temperature"
 
 
 def read(reader: StreamReader, config: Config, slopes: Sequence[ParameterSpec], sensor_t: Array) -> Temperature | None:
-    """Temperature of a sensor with samples at sensor_t (N,), s; None without the topic, or if all slopes are fixed.
+    """Read a sensor's temperature at sensor_t (N,), s; None without the topic or if all slopes are fixed.
 
     Raises InputError as StreamReader.temperature does.
     """
@@ -32,27 +32,27 @@ def read(reader: StreamReader, config: Config, slopes: Sequence[ParameterSpec], 
 
 
 def reference(temperature: Temperature | None) -> float | None:
-    """The temperature at which a bias is the bias, degrees Celsius: the first."""
+    """Reference temperature of a bias, degrees Celsius: the first one recorded."""
     return None if temperature is None else temperature.first
 
 
 def above(temperature: Temperature | None, reference: float | None, at: Array) -> Array | None:
-    """Temperature (n,) above the reference, K, at times (n,), s; None without a thermometer."""
+    """Temperature (n,) above the reference, K, at times (n,), s; None if not recorded."""
     return None if temperature is None or reference is None else temperature.above(reference, at)
 
 
 def longest_gap(temperature: Temperature | None) -> float:
-    """Longest time between temperature messages, s, until a temperature can be interpolated."""
+    """Longest gap between temperature messages, s, over which the temperature is interpolated."""
     return 0.0 if temperature is None else float(np.diff(temperature.t).max(initial=0.0))
 
 
 def constants(reference: float | None) -> dict[str, float]:
-    """Constants of formulas that go with slopes over temperature."""
+    """Constants of formulas that have slopes over temperature."""
     return {} if reference is None else {FIRST: reference}
 
 
 def topics(temperature: Temperature | None, epoch_ns: int) -> dict[str, series.Topic]:
-    """Topic of the temperature to write, if there is one."""
+    """Temperature topic to write; empty without a temperature."""
     if temperature is None:
         return {}
     t_ns = nanoseconds(temperature.t, epoch_ns)

@@ -66,7 +66,7 @@ def triad_specs(
 
 
 def with_factor(sensor: str, quantities: Sequence[Quantity], config: Config, require: float) -> tuple[Quantity, ...]:
-    """Quantities with the factor that they have in common with the strength of what a sensor measures.
+    """Attach to K, b and the strength the scale factor that they share, see `CommonFactor`.
 
     Where the config requires the shape, those that it does not name are judged by it.
 
@@ -88,24 +88,24 @@ def with_factor(sensor: str, quantities: Sequence[Quantity], config: Config, req
 
 
 def triad_names(name: str, symmetric: bool = False) -> tuple[str, ...]:
-    """Names of a triad's numbers: rows of K, of a symmetric one its upper half, then b."""
+    """Names of a triad's parameters: K by rows (upper half of a symmetric K), then b."""
     gains = tuple(f"{name}_k{i}{j}" for i in "123" for j in "123" if i <= j or not symmetric)
     return (*gains, *(f"{name}_b{i}" for i in "123"))
 
 
 def gain_names(name: str, known: Collection[str]) -> list[list[str]]:
-    """Name of the parameter in each place of K."""
+    """Parameter names of the entries of K, in a 3 x 3 list."""
     return [[own if (own := f"{name}_k{i}{j}") in known or i <= j else f"{name}_k{j}{i}" for j in "123"] for i in "123"]
 
 
 def triad_of(name: str, values: Mapping[str, float]) -> tuple[Array, Array]:
-    """K (3, 3) and b (3,) of a triad from parameters by name."""
+    """Matrix K (3, 3) and offset b (3,) of a triad from parameters by name."""
     K = np.array([[values[entry] for entry in row] for row in gain_names(name, values)])
     return K, np.array([values[f"{name}_b{i}"] for i in "123"])
 
 
 def sensor_model(name: str, values: Mapping[str, float]) -> tuple[Array, Array]:
-    """K (3, 3) and bias (3,) of a sensor: nominal = K (raw - bias).
+    """Matrix K (3, 3) and bias (3,) of a sensor: nominal = K (raw - bias).
 
     From the rows of K and b of nominal = K raw + b, bias = -K^-1 b, or of a gyro from its bias, scale and skew, (I + S)
     rate + bias = raw; what is not among the values is 0. Raises KeyError when they have neither.
@@ -126,7 +126,7 @@ def triad_formula(
     body: str = "cube's",
     unit: str | None = None,
 ) -> Formula:
-    """K and b applied to a sensor's reading.
+    """Formula that applies K and b to a sensor's reading.
 
     Args:
         name: of the sensor.
@@ -145,7 +145,7 @@ def triad_formula(
 
 
 def parts_of(K: Array) -> Array:
-    """Scales (3), nonorthogonalities (3) and mounting (3) of a triad whose nominal = K raw + b; shape (9,).
+    """Decompose K of nominal = K raw + b into scales, nonorthogonalities and mounting angles, (9,).
 
     The rows of K^-1 are the sensitive axes in the body, as long as their scales; the mounting is the rotation nearest
     to the unit axes. Raises ValueError when K is singular or its axes are left-handed.
@@ -170,7 +170,7 @@ def numeric_jacobian(function: Callable[[Array], Array], x: Array, step: Array) 
 
 
 def parts_with_sigmas(K: Array, covariance: Array) -> tuple[Array, Array] | None:
-    """`parts_of` K, and their sigmas by the covariance (9, 9) of its rows; None for a K that is no sensor's."""
+    """Parts of K as `parts_of` and their sigmas, from covariance (9, 9) of K by rows; None if K is invalid."""
     try:
         J = numeric_jacobian(lambda rows: parts_of(rows.reshape(3, 3)), K.ravel(), np.full(9, _STEP))
     except ValueError:
@@ -179,7 +179,7 @@ def parts_with_sigmas(K: Array, covariance: Array) -> tuple[Array, Array] | None
 
 
 def parts_row(name: str, parts: Array, sigmas: Array) -> dict[str, object]:
-    """A sensor's parts as a row of findings."""
+    """Findings row of a sensor's scales, nonorthogonalities and mounting with their sigmas."""
     row: dict[str, object] = {"sensor": name}
     for i, kind in enumerate(("scale", "nonorthogonality", "mounting")):
         part = slice(3 * i, 3 * i + 3)

@@ -26,14 +26,14 @@ _DEVIATION = "deviation = magnetic heading − compass heading = −e = A + B si
 
 
 def raw_of(true: Truth, sensor: str, nominal: Array) -> Array:
-    """Reading (..., U, 3) of a triad, nominal = K raw + b."""
+    """Raw reading (..., U, 3) of a triad with nominal = K raw + b, for nominal vectors."""
     K = true.matrix(gain_names(sensor, true.index), 1.0)
     b = true.vector(*(f"{sensor}_b{i}" for i in "123"))
     return along(np.asarray(np.linalg.inv(K)), nominal - b[..., None, :])
 
 
 def along(matrices: Array, vectors: Array) -> Array:
-    """Products of matrices (..., 3, 3) and vectors (..., U, 3)."""
+    """Multiply matrices (..., 3, 3) by vectors (..., U, 3)."""
     return np.asarray(vectors @ np.swapaxes(matrices, -1, -2))
 
 
@@ -47,7 +47,7 @@ def gyro_reading(true: Truth, rate: Array, force: Array) -> Array:
 
 
 def triad_uses(true: Truth, sensors: Sensors) -> list[Use]:
-    """Heading, rate and specific force, of the sensors that there are."""
+    """Uses for the sensors present: heading, rate and specific force."""
     found = [_heading(true, sensors)] if "mag_k11" in true else []
     found += [_rate(sensors)] if "gyro_k11" in true or "gyro_bias_x" in true else []
     return found + ([_force(sensors)] if "accel_k11" in true else [])
@@ -97,7 +97,7 @@ def _heading(true: Truth, sensors: Sensors) -> Use:
 
 
 def _field(true: Truth, dip: float) -> Array:
-    """(..., 3) to magnetic north, west and up, in the unit of the strength; `dip`, rad, where none is known."""
+    """Field (..., 3) to magnetic north, west and up, in the strength's unit; `dip`, rad, if not a parameter."""
     if "field_n" in true:
         north, up = np.hypot(true.get("field_e"), true.get("field_n")), true.get("field_u")
     else:

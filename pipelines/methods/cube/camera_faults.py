@@ -29,7 +29,7 @@ _Case = tuple[str, str, Camera, Sequence[int]]
 
 
 def camera_fault(camera: Camera, body: TagBody, seen: Sequence[Detections], sigma_px: float) -> str | None:
-    """The fault that explains why tags do not fit their layout, with what to do; None where none does.
+    """Find the camera fault that explains why tags do not fit their layout, with a remedy; None if none does.
 
     Args:
         camera: as recorded.
@@ -73,7 +73,7 @@ def _cases(camera: Camera) -> Iterator[_Case]:
 
 
 def _error(camera: Camera, body: TagBody, seen: Sequence[Detections], order: Sequence[int] = range(4)) -> float:
-    """Median reprojection error, px per axis, infinite where most poses reject a tag or have no solution."""
+    """Median reprojection error, px per axis; infinite if most poses reject a tag or have no solution."""
     rows = list(order)
     poses = [
         estimate_pose(camera, body, replace(each, corners=each.corners[:, rows], covariance=each.covariance[:, rows]))

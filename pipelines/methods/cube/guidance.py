@@ -31,7 +31,7 @@ _FEWEST_POSES, _POSES_A_FACE = 4, 3
 
 
 def checklist(data: CubeData, config: Config) -> Sequence[ChecklistItem]:
-    """Poses and the faces that were up, tags seen, and the next best pose."""
+    """Checklist of poses and upward faces, tags seen, and the next best pose."""
     poses = static_poses(data, config)
     up = poses.accel / np.linalg.norm(poses.accel, axis=1, keepdims=True)
     faces = np.argmax(up @ np.array(list(SIDES.values())).T, axis=1)
@@ -58,7 +58,7 @@ def checklist(data: CubeData, config: Config) -> Sequence[ChecklistItem]:
 
 
 def next_pose(up: Array, mag: Array | None) -> Motion:
-    """The one of 24 attitudes along the axes that says most about accelerometer and magnetometer.
+    """Select the most informative of 24 axis-aligned attitudes for accelerometer and magnetometer.
 
     What a pose with nominal vector n adds to what a triad's twelve numbers are known by is x'N^-1x, x = (n, 1), N the
     sum of xx' over the poses there are.
@@ -104,7 +104,7 @@ def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
 
 
 def _tag_sizes(data: CubeData, config: Config, factor: float) -> tuple[CubeData, Config] | None:
-    """Data with all tag sizes scaled by a factor; None where the config names no tag."""
+    """Scale all tag sizes in the config by a factor; None where the config names no tag."""
     cube = config.section(CubeConfig)
     if not cube.tags:
         return None
@@ -124,7 +124,7 @@ def _tag_size(data: CubeData, config: Config, change: float) -> tuple[CubeData, 
 
 
 def _as_found(data: CubeData, config: Config, changed: CubeData, other: Config) -> tuple[CubeData, Config]:
-    """Changed data and config with the static poses found in the unchanged data.
+    """Give changed data the static poses cached for the unchanged data.
 
     They would be the same, but for first guesses; finding them takes longer than all the rest.
     """
@@ -218,7 +218,7 @@ def _choices(leans: Sequence[float]) -> list[Resting]:
 
 
 def _rows(known: _FisherInformation, nRb: Array, field: Array | None) -> list[tuple[Array, Array]]:
-    """Information so far and the row that resting in nRb next adds to it, of each sensor."""
+    """Information of each sensor so far, with the row that a next rest in nRb adds."""
     bRn = so3.inverse(nRb)
     found = [(known.accel, np.append(so3.rotate(bRn, [0.0, 0.0, 1.0]), 1.0))]
     if field is not None and known.mag is not None:
@@ -244,7 +244,7 @@ def _gains(known: _FisherInformation, choices: Sequence[Resting], field: Array |
 
 @cache
 def rested(up: Side, north: Side | None = None) -> str:
-    """Drawing of a cube that rests on a side, with a compass where another side is to point north."""
+    """Drawing of a cube resting on a side, with a compass if another side is to point north."""
     ahead = next(side for side in SIDES if side[1] != up[1]) if north is None else north
     return resting(Resting(up=up, north=ahead).nRb, compass=north is not None)
 

@@ -50,7 +50,7 @@ def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: b
 
 
 def _shots(recording: Recording, config: Config) -> Shots:
-    """The camera, and the tags in each picture."""
+    """Read the camera, and detect the tags in each picture."""
     from alidade.pipelines.vision.layout import Shots
 
     found = _tags(recording, config)
@@ -71,7 +71,7 @@ def _tags(recording: Recording, config: Config) -> list[tuple[int, Detections]]:
 
 
 def _every(pictures: int) -> int:
-    """Take every so many of them."""
+    """Stride through pictures that keeps at most `_MOST_PICTURES`."""
     return -(-pictures // _MOST_PICTURES)
 
 

@@ -114,7 +114,7 @@ def layout_report(layout: Layout, recordings: Sequence[str]) -> Report:
 
 
 def _tag_table(layout: Layout) -> Table:
-    """A row a placed tag; the first one defines the frame of the body."""
+    """Table of the placed tags; the first one defines the body frame."""
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
     degrees, mm = np.rad2deg(sigmas[:, :3].max(axis=1)), 1e3 * sigmas[:, 3:].max(axis=1)
     cells = [("0", "0"), *((f"{a:.2g}", f"{b:.2g}") for a, b in zip(degrees, mm, strict=True))]
@@ -133,7 +133,7 @@ def _tag_table(layout: Layout) -> Table:
 
 
 def _cameras(layout: Layout) -> tuple[Block, ...]:
-    """Numbers of the cameras that were adjusted and that the pictures determine."""
+    """Tables of the adjusted cameras' intrinsics that the pictures determine."""
     from alidade.pipelines.vision.layout import LINE_TIME
 
     rows: list[tuple[str, ...]] = []
@@ -163,13 +163,13 @@ _VIEWERS = {"from +x +y +z": (1.0, 0.7, 0.6), "from -x -y -z": (-1.0, -0.7, -0.6
 
 
 def _picture(layout: Layout) -> Plot:
-    """Squares as seen from two sides, with ids; those that face away are hidden."""
+    """Plot the tags' squares from two sides, with ids; averted tags are hidden."""
     views = [_view(layout, f"seen {words}", np.array(at)) for words, at in _VIEWERS.items()]
     return Plot("The tags", _CAPTION, views[0], (views[1],))
 
 
 def _view(layout: Layout, words: str, viewer: Array) -> Figure:
-    """A parallel projection, up is the body's +z as far as it goes."""
+    """Parallel projection of the tags; up is the body's +z where possible."""
     out = Figure("", words, 420, 0.5, square=True)
     body, towards = layout.body, viewer / np.linalg.norm(viewer)
     right = np.cross([0.0, 0.0, 1.0], towards)

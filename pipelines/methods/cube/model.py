@@ -108,7 +108,7 @@ def problem(data: CubeData, config: Config) -> Problem:
 
 
 def _by_sheets(known: Problem, plain: Problem) -> Problem:
-    """A problem with the joint prior of its tags' data sheets, which are what can be stated."""
+    """Restore the data-sheet names of the quantities after their priors were joined."""
     sheets = {q.name: q.sheet for q in plain.quantities}
     parameters = tuple(
         replace(p, quantities=tuple(replace(q, sheet=sheets[q.name]) for q in p.quantities)) for p in known.parameters
@@ -117,7 +117,7 @@ def _by_sheets(known: Problem, plain: Problem) -> Problem:
 
 
 def _premises(model: Model) -> tuple[str, ...]:
-    """Sentences about what the recording lacks."""
+    """Sentences about missing information in the recording."""
     lacking = {
         _NO_FIELD: model.poses.mag is not None and model.field is None,
         DEAD_BAND: model.dead_band > 0.0,
@@ -126,7 +126,7 @@ def _premises(model: Model) -> tuple[str, ...]:
 
 
 def _steps(model: Model, _: int) -> Iterator[Step]:
-    """One step a static pose, with the turn before it; the calibration variables come with the first.
+    """Yield a step for each static pose, with the preceding turn; the first one adds the calibration variables.
 
     No variable ages: a session has tens of poses, few enough to keep them all.
     """
@@ -171,14 +171,14 @@ def _trajectory(model: Model, poses: Sequence[int], values: gtsam.Values) -> Att
 
 
 def _process(model: Model, k: int) -> list[Factor]:
-    """Factors that lead to the attitude of pose k: the turn before it, or none."""
+    """Factors on pose k's attitude from the preceding turn, or a wide prior without a complete turn."""
     if k > 0 and model.samples(k).whole:
         return [turn_factor(model, k)]
     return [rotation_about(pose_key(k), model.initial[k], np.eye(3) / _ATTITUDE_PRIOR_SIGMA)]
 
 
 def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:
-    """The attitude of pose k carried on by the gyro as calibrated so far; the rest as measured."""
+    """Initial values of pose k: attitude propagated by the gyro as calibrated so far, the rest as measured."""
     out = gtsam.Values(initial)
     samples, deviation = model.samples(k), current.atVector(deviation_key(k - 1))
     own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), deviation)
@@ -220,7 +220,7 @@ class Turning:
 
     @property
     def whole(self) -> bool:
-        """Whether there is no gap in them."""
+        """Whether the samples have no gap."""
         return bool(np.diff(self.t).max(initial=0.0) <= _LONGEST_GAP)
 
 
@@ -326,7 +326,7 @@ def prepare(data: CubeData, config: Config) -> Model:
 def _attitudes(
     data: CubeData, config: Config, poses: StaticPoses, reference: Reference, field: Array | None, bias: Array
 ) -> Array:
-    """First guess of nRb (P, 4): seen by the camera, else carried on by the gyro and levelled."""
+    """Initial attitudes nRb (P, 4): from the camera, else propagated by the gyro and levelled."""
     path = GyroPath(data.imu_t, nominal(data.gyro, config.section(CubeConfig).raw.gyro), bias)
     found: list[Array] = []
     for k, seen in enumerate(poses.tags):
@@ -390,7 +390,7 @@ def place_key(k: int) -> int:
 
 
 def reference_key(k: int) -> int:
-    """Variable of what the reference says in pose k, nRB, a Rot3; of pose 0 where it stands still."""
+    """Key of the reference attitude nRB (Rot3) in pose k; that of pose 0 for a stationary reference."""
     return int(gtsam.symbol("R", k))
 
 
@@ -505,12 +505,12 @@ _STEADY = 1e-8
 
 
 def deviation_key(k: int) -> int:
-    """Variable of how far the offset is from its mean in pose k, (3,) in nominal units."""
+    """Key of the offset's deviation from its mean in pose k, (3,), nominal units."""
     return int(gtsam.symbol("d", k))
 
 
 def sum_key(k: int) -> int:
-    """Variable of the sum of deviations up to pose k, each with its share of the session, (3,) in nominal units."""
+    """Key of the sum of deviations up to pose k, weighted by duration, (3,), nominal units."""
     return int(gtsam.symbol("e", k))
 
 

@@ -270,7 +270,7 @@ def cube_parameters(
 
 
 def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Factor]]:
-    """The field, its prior mean (3,) and the factor of that; the config's priors win."""
+    """Field parameter, its prior mean (3,) and prior factor; the config's priors take precedence."""
     mean, along, across = known_field(config, model)
     plain = tuple(
         replace(q, prior_mean=float(m), nuisance=True)
@@ -288,7 +288,7 @@ def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Factor
 
 
 def _given(spec: ParameterSpec, config: Config) -> ParameterSpec:
-    """A spec with the prior of its data sheet, of what is no sensor error."""
+    """Give a spec its data-sheet prior without marking it as a sensor error."""
     return replace(spec, prior=stated(config, spec), data_sheet="")
 
 
@@ -334,6 +334,6 @@ def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConvers
 
 
 def _coordinates(linear: Array, values: gtsam.Values, key: int) -> tuple[Array, Array]:
-    """The reported numbers of a triad, a linear function (12, 12) of rows of K and of b, and their Jacobian."""
+    """Reported numbers of a triad, as a linear function (12, 12) of K by rows and b, with Jacobian."""
     numbers, J = calibration(np.asarray(values.atVector(key), dtype=float))
     return linear @ numbers, linear @ J

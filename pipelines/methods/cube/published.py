@@ -102,7 +102,7 @@ def nominal_vectors(data: CubeData, config: Config, nRb: Array, as_published: bo
 
 
 def published_estimate(data: CubeData, config: Config, problem: Problem) -> Estimate:
-    """The regressions as a solver of the problem: K and b of each triad, for the raw numbers as recorded.
+    """Run the regressions as a solver of the problem: K and b of each triad, for raw numbers as recorded.
 
     Raises:
         InputError: there is no camera or no reference, or too few poses.
@@ -141,7 +141,7 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
 
 
 def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArray[np.intp], Array]:
-    """Indices of the poses that show the cube, and nRb = nRB BRC cRb there, with all mounts as given.
+    """Indices of the poses with visible cube, and nRb = nRB BRC cRb there, with all mounts as stated.
 
     Raises:
         InputError: there is no camera or no reference.

@@ -182,7 +182,7 @@ class CubeData:
 
 
 def computed_once(compute: Callable[[CubeData, Config], _Result]) -> Callable[[CubeData, Config], _Result]:
-    """A function of data and config that finds its result once for each config; the data keep it."""
+    """Decorate a function of data and config so that the data cache its result for each config."""
 
     @wraps(compute)
     def call(data: CubeData, config: Config) -> _Result:
@@ -217,7 +217,7 @@ def local_field(data: CubeData, config: Config) -> Array:
 
 
 def stated_density(name: str, data: CubeData, config: Config, *families: str) -> Noise:
-    """One of DENSITIES as the config, the messages or nobody states it, in nominal SI, of some families."""
+    """Stated noise density `name` for some families, nominal SI: from config, messages or default."""
     sensor = name.removesuffix("_density")
     density: float | None = getattr(data, name)
     conversion: RawConversion | None = getattr(config.section(CubeConfig).raw, sensor)

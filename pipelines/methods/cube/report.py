@@ -146,13 +146,13 @@ def _gyro(parameters: Collection[str], conversion: RawConversion | None) -> Form
 
 
 def _drift(sensor: str, parameters: Collection[str]) -> str:
-    """Drift of a sensor's bias with temperature, nominal units; empty where its slopes are unknown."""
+    """Expression of a sensor's bias drift with temperature, nominal units; empty without slope parameters."""
     names = TEMPERATURE[sensor].names
     return temperature_text(names, parameters) if any(name in parameters for name in names) else ""
 
 
 def _reduced(reading: str, errors: Sequence[str], conversion: RawConversion | None) -> str:
-    """A reading minus errors in nominal units."""
+    """Expression of a reading minus errors in nominal units."""
     scale = "" if conversion is None else f" / {conversion.scale!r}"
     each = [f" - {error}{scale}" for error in errors if error]
     return f"({reading}{''.join(each)})" if each else reading
@@ -199,7 +199,7 @@ def _triad(name: str, config: Config, estimate: Estimate) -> dict[str, object] |
 def _disturbed(
     data: CubeData, poses: StaticPoses, config: Config, estimate: Estimate, values: Mapping[str, float]
 ) -> list[dict[str, object]]:
-    """The poses near iron, or in reach of a current: their magnetometer was rejected."""
+    """Findings rows of poses with a rejected magnetometer, near iron or a current."""
     residuals, attitudes = estimate.residuals.get("magnetometer"), estimate.attitudes
     if residuals is None or attitudes is None or poses.mag is None or "mag_k11" not in values:
         return []
@@ -306,7 +306,7 @@ def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
 def _errors(
     data: CubeData, config: Config, poses: StaticPoses, calibration: Calibration, values: Mapping[str, float]
 ) -> list[tuple[str, Array, Array, Array]]:
-    """Sensor, times (n,), and errors (n, 3), SI, before and after calibration, against the estimate's attitudes."""
+    """Errors (n, 3), SI, before and after calibration by sensor, at times (n,), s, against the estimated attitudes."""
     attitudes = calibration.estimate.attitudes
     if attitudes is None or not len(attitudes.time) or data.latitude is None:
         return []
@@ -371,7 +371,7 @@ def _before_and_after(name: str, time: Array, before: Array, after: Array) -> Pl
 
 
 def _strengths(data: CubeData, values: Mapping[str, float]) -> dict[str, float]:
-    """Sensor -> the strength that its vectors have at rest, SI."""
+    """Strength of the vector that each sensor measures at rest, SI."""
     found = {}
     if data.latitude is not None and "accel_k11" in values:
         found["accel"] = float(gravity(data.latitude, data.height))
@@ -383,7 +383,7 @@ def _strengths(data: CubeData, values: Mapping[str, float]) -> dict[str, float]:
 def _sphere(
     name: str, strength: float, data: CubeData, config: Config, poses: StaticPoses, values: Mapping[str, float]
 ) -> Plot | None:
-    """Vectors at rest on their sphere, seen along two axes, and how far from it they are."""
+    """Plot vectors at rest along two axes, on their sphere, with their distance from it."""
     means = poses.accel if name == "accel" else poses.mag
     assert means is not None
     good = np.isfinite(means).all(axis=1)
@@ -417,7 +417,7 @@ def _sphere(
 
 
 def _add_both(out: Figure, x: list[Array], y: list[Array]) -> None:
-    """Uncalibrated as rings, calibrated as dots."""
+    """Add uncalibrated points as rings and calibrated ones as dots to a figure."""
     out.points(x[0], y[0], "uncalibrated", BEFORE, 8, shape="ring")
     out.points(x[1], y[1], "calibrated", COLORS[0], 5)
 

@@ -84,7 +84,7 @@ def attitudes(scenario: CubeScenario, seed: int) -> Array:
 
 
 class _World:
-    """One simulated session: everything that is true, drawn from the seed, and the sensors in it."""
+    """A simulated session: truth drawn from the seed, and the sensors."""
 
     def __init__(self, scenario: CubeScenario, seed: int) -> None:
         self.scenario = scenario
@@ -132,7 +132,7 @@ class _World:
         self.truth: dict[str, float] = {}
 
     def _surroundings(self, model: Array) -> tuple[Array, float]:
-        """Field (3,), T, and the correction of the reference's heading, rad.
+        """Draw the field (3,), T, and the heading correction of the reference, rad.
 
         The model errs more in the field's direction, by the iron of the building, than in its strength. The draws have
         a generator of their own: what else happens in a seed's session does not depend on them.
@@ -176,7 +176,7 @@ class _World:
         return data
 
     def _moments(self, t: Array, rate_hz: float) -> Array:
-        """Middles of the parts of the samples' intervals, (N * parts,)."""
+        """Centres (N * parts,), s, of the parts that each sample's interval is divided into."""
         offsets = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5) / rate_hz
         return np.asarray((t[:, None] + offsets).ravel())
 
@@ -225,7 +225,7 @@ class _World:
         return t, wxyz, np.tile(np.diag(sigma**2), (len(t), 1, 1))
 
     def _tag(self, tag: int, t: Array) -> tuple[Array, Array, Array]:
-        """Attitudes cRt (N, 4), places (N, 3) m, and the cosines (N,) between the normal and the way to the camera."""
+        """Tag attitudes cRt (N, 4), positions (N, 3) m, and cosines (N,) of the normal to the camera's direction."""
         wxyz, normal = FACES[tag]
         cRb = so3.multiply(so3.inverse(self.nRC), self.motion.attitude(t))
         cRt = so3.compose(cRb, wxyz, so3.exp(self.tags[tag]))

@@ -137,7 +137,7 @@ def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
 
 
 def _unrest(t: Array, values: Array, span: Array) -> Array:
-    """Scatter (P,) of vectors within each span over that of the quieter quarter of spans, at least 1."""
+    """Scatter (P,) of vectors within each span, over that of the quietest quarter of spans; at least 1."""
     rows = np.searchsorted(t, span)
     scatter = np.sqrt([values[first : last + 1].var(axis=0).mean() for first, last in rows])
     quiet = float(np.quantile(scatter, 0.25))
@@ -182,7 +182,7 @@ def _seen_tags(
 
 
 def _corner_sigma(seen: Sightings, span: Array, config: Config) -> float:
-    """Sigma of a corner in one picture, px per axis, measured between neighbouring pictures of the static poses (P, 2).
+    """Corner noise of one picture, px per axis, from consecutive pictures of the static poses (P, 2).
 
     Second differences: a camera that moves evenly does not show in them. As stated where no tag is in three pictures.
     """
@@ -194,7 +194,7 @@ def _corner_sigma(seen: Sightings, span: Array, config: Config) -> float:
 
 
 def _stated_px(config: Config) -> float:
-    """Sigma of a corner in one picture, px per axis, as the config or nobody states it."""
+    """Corner noise of one picture, px per axis, as stated by the config, else the default."""
     return first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)
 
 
@@ -224,7 +224,7 @@ def _away(corners: Array) -> Array:
 
 
 def _in_common(seen: Sightings, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Rows of detections from the set of tags, and the pictures showing all of it, that keep the most rows."""
+    """Select detections of one set of tags, in the pictures that show all of these, with the most rows."""
     frames, ids = seen.frame[rows], seen.ids[rows]
     shown = {frame: frozenset(ids[frames == frame].tolist()) for frame in frames.tolist()}
     pictures = {tags: [frame for frame, whole in shown.items() if whole >= tags] for tags in shown.values()}
@@ -241,7 +241,7 @@ def _seen_in(
     wrong: dict[int, int],
     dropped: dict[str, int],
 ) -> SeenTags | None:
-    """The tags that fit their pose; counts those that do not in `wrong`."""
+    """Tags that fit the pose; misfits are counted in `wrong`."""
     from alidade.pipelines.vision.pose import estimate_pose
 
     assert data.camera is not None

@@ -161,7 +161,7 @@ CAMERA_NUMBERS = ("camera_focal", "camera_centre_x", "camera_centre_y")
 
 
 def layout_prior(config: Config) -> GaussianPrior:
-    """Prior of tags and camera by the covariance of their layout or drawing, but for numbers with a prior of their own.
+    """Joint prior of tags and camera from the layout's or drawing's covariance, except numbers with own priors.
 
     The tag with the lowest id is exact.
     """

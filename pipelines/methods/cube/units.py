@@ -61,7 +61,7 @@ def check_units(accel: Readings, gyro: Readings, mag: Readings | None = None) ->
 
 
 def _wrong(name: str, readings: Readings) -> str:
-    """Sentence about an implausible sensor; empty without fault."""
+    """Sentence about an implausible sensor; empty if plausible."""
     values = nominal(readings.values, readings.conversion)
     if name == "gyro":
         fast = too_fast(readings.topic, readings.t, values)
@@ -73,7 +73,7 @@ def _wrong(name: str, readings: Readings) -> str:
 
 
 def _section(found: dict[str, tuple[float, float]]) -> str:
-    """The conversions guessed as a section of the config in one line, and what they are."""
+    """Guessed conversions as one line of config, with explanation."""
     if not found:
         return "State the conversion to SI in the config under cube.raw"
     entries, words = [], []
@@ -97,7 +97,7 @@ def _usual(name: str, scale: float) -> str:
 
 
 def _accel(values: Array) -> tuple[float, float] | None:
-    """SI of a count by gravity, and the offset."""
+    """Scale of an accelerometer count, m/s^2, by gravity, and offset in counts."""
     radius, offset = _ball(values)
     return (_G / radius, offset) if radius > 0.0 else None
 
@@ -125,7 +125,7 @@ def _ball(values: Array) -> tuple[float, float]:
 
 
 def _gyro(accel: Readings, gyro: Readings) -> tuple[float, float] | None:
-    """By how the direction of gravity turns: of its unit vector a the rate is -w x a; None where nothing turned."""
+    """Scale of a gyro count by the rotation of gravity's direction a, rate -w x a; None without rotation."""
     radius, offset = _ball(accel.values)
     size = max(2, round(_MEAN / float(np.median(np.diff(gyro.t)))))
     whole = len(gyro.t) // size * size

@@ -46,7 +46,7 @@ _MANOEUVRES = 0.3
 
 
 def _inverted(data: HeadData, config: Config) -> tuple[HeadData, Config]:
-    """Attitudes hRc where cRh is wanted; their errors turn with them."""
+    """Invert vision attitudes hRc to cRh, with rotated covariances."""
     covariance = data.vision_cov
     if covariance is not None:
         R = so3.matrix(data.vision_wxyz)
@@ -55,18 +55,18 @@ def _inverted(data: HeadData, config: Config) -> tuple[HeadData, Config]:
 
 
 def _reordered(data: HeadData, config: Config, order: tuple[int, ...]) -> tuple[HeadData, Config]:
-    """The components of vision's quaternions in another order; what was said of their errors is none of these."""
+    """Permute the components of vision's quaternions, without their covariances."""
     return replace(data, vision_wxyz=data.vision_wxyz[:, order], vision_cov=None), config
 
 
 def _misordered(data: HeadData, config: Config, order: tuple[int, ...]) -> tuple[HeadData, Config] | None:
-    """What the config has inverted, as recorded but for the order of its components: the same up to the mounts."""
+    """Undo the config's `invert` and permute the quaternion components; None without `invert`."""
     source = config.topics.get(VISION_ATTITUDE.key)
     return _reordered(*_inverted(data, config), order) if source is not None and source.invert else None
 
 
 def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
-    """Helmet and platform the other way round; nobody has read force and temperature in the platform."""
+    """Exchange the helmet's and the platform's gyro; None without a platform gyro."""
     if data.platform_t is None or data.platform_gyro is None:
         return None
     swapped = replace(
@@ -84,7 +84,7 @@ def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
 
 
 def _moving(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
-    """A bias free to follow the rate of a platform that nobody measured."""
+    """Let the gyro bias walk fast enough to follow an unmeasured platform rate; None with a platform gyro."""
     if data.platform_t is not None:
         return None
     noise = config.noise.model_copy(update={"gyro_bias_walk": _MANOEUVRES})

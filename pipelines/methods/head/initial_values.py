@@ -67,7 +67,7 @@ def guess_picture_clock(
     parameters: tuple[Parameter, Parameter, Parameter],
     sigma: float,
 ) -> Clock:
-    """Clock that fits the helmet's gyro to the pictures best, estimated with gyro bias and mount.
+    """Estimate the camera's clock, gyro bias and mount that fit the helmet's gyro to the pictures; return the clock.
 
     It is near the delay at which the norms of both rates are correlated most: a fit from zero ends within a swing.
 
@@ -118,7 +118,7 @@ def guess_picture_clock(
 
 
 def _pairs(time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pictures about _GUESS_SPAN apart, at most about so many pairs."""
+    """Indices of picture pairs about `_GUESS_SPAN` s apart, at most about `most` pairs."""
     stride = max(1, round(_GUESS_SPAN / max(float(np.median(np.diff(time))), 1e-3))) if len(time) > 1 else 1
     i = np.flatnonzero(time[stride:] - time[:-stride] < 2.0 * _GUESS_SPAN)
     i = i[:: -(-len(i) // most) or 1]

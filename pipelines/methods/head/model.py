@@ -116,7 +116,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
 
 
 def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | None:
-    """Errors of vision that depend on the attitude that gyros and vision find together.
+    """Error map of vision over the estimated attitude.
 
     They move nothing: what depends on the attitude may be the gyro's as well. In BROAD's first trial such errors are
     the same in both halves; freed, they move attitudes by .3 deg from motion capture's, .04 deg before.
@@ -146,7 +146,7 @@ def _denser_graph(config: Config, data: HeadData, model: _Model, levels: Sequenc
 
 
 def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
-    """Pictures share a keyframe within this time, s, over which gyro noise adds little to vision's."""
+    """Time, s, within which pictures share a keyframe, since gyro noise adds little to vision's."""
     density = [noises["gyro_density"].used, noises["gyro_rate_noise"].used * _rate(data)]
     if "platform_gyro_density" in noises:
         density.append(noises["platform_gyro_density"].used)
@@ -281,7 +281,7 @@ def _prepare(
 
 
 def _carrier(gyro: GyroPath, force: Array | None) -> GyroPath:
-    """The gyro that carries attitudes from keyframes to pictures, its rates at rest by their mean.
+    """Gyro for propagation from keyframes to pictures, with rates at rest replaced by their mean.
 
     The time offset turns what is seen by the rate: at rest by noise, which passes for information about it.
     """
@@ -290,7 +290,7 @@ def _carrier(gyro: GyroPath, force: Array | None) -> GyroPath:
 
 
 def _between(gyro: GyroPath, platform: GyroPath | None, taken: Array, bRv: Array, at: Array) -> Array:
-    """Attitudes at some times (n, 4) from those of pictures, carried by the gyros: gaps may hold more than a turn."""
+    """Attitudes (n, 4) at times between pictures, interpolated by the gyros, correct over gaps of several turns."""
 
     def held(times: Array) -> tuple[Array, Array]:
         return so3.identity(len(times)) if platform is None else platform.attitude(times), gyro.attitude(times)
@@ -301,7 +301,7 @@ def _between(gyro: GyroPath, platform: GyroPath | None, taken: Array, bRv: Array
 
 
 def _all_around(attitudes: Array) -> bool:
-    """Whether more than chance outliers among attitudes (n, 4) are farther than FADE from the first."""
+    """Whether a significant share of attitudes (n, 4) is farther than FADE from the first."""
     angles = np.linalg.norm(so3.log(so3.multiply(so3.inverse(attitudes[:1]), attitudes)), axis=1)
     return bool((angles > FADE).mean() > _FEW_OUTLIERS)
 
@@ -371,7 +371,7 @@ def _begin(model: _Model, step: Step) -> None:
 
 
 def _pictures(model: _Model, keyframes: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The pictures of some keyframes, and the keyframe of each."""
+    """Indices of the pictures of some keyframes, and the keyframe of each picture."""
     rows = [np.arange(*model.pictures[k : k + 2]) for k in keyframes]
     return np.concatenate(rows), np.repeat(np.array(keyframes, dtype=np.intp), [len(r) for r in rows])
 
@@ -402,7 +402,7 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
-    """bRv at the pictures' true times on the gyro's clock."""
+    """Attitudes bRv at the pictures' true times on the gyro's clock."""
     rows, of = _pictures(model, [k - model.chain.first for k in keyframes])
     if len(rows) == 0:
         return Attitudes(np.empty(0), np.empty((0, 4)))

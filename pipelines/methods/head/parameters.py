@@ -141,7 +141,7 @@ class HeadParameters:
 
     @property
     def has_picture_errors(self) -> bool:
-        """Whether the pictures' errors behind the time offset are variables."""
+        """Whether the pictures have error parameters other than the time offset."""
         return len(self.picture.quantities) > 1
 
     @property

@@ -103,7 +103,7 @@ def euler_kalman_filter(
 
 
 def published_estimate(data: HeadData, config: Config, problem: Problem) -> Estimate:
-    """The filter as a solver of the problem: it knows the gyro's bias, reported as it stands at the end."""
+    """Run the published filter as a solver of the problem, for the gyro bias at the end of the recording."""
     noise = config.noise
     sigma = noise.vision_attitude
     if sigma is None and data.vision_cov is not None:

@@ -42,7 +42,7 @@ _MOUNTS = *HELMET.names, *CAMERA.names
 
 
 def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
-    """Mounts, rates, attitude and time, with the errors of gyros and clock that are among the parameters."""
+    """Formulas of mounts, rates, attitude and time, with those gyro and clock errors that are parameters."""
     return [
         Formula("markers to helmet IMU", "vRh", "Exp(helmet_mount)", ()),
         Formula("platform to camera", "cRb", "Exp(camera_mount)", ()),
@@ -61,7 +61,7 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
 
 
 def _platform_rate(parameters: Collection[str]) -> list[Formula]:
-    """The platform's rate where errors of its gyro are among the parameters."""
+    """Formula of the platform's rate, if errors of its gyro are parameters."""
     if not any(name in parameters for name in (*PLATFORM_BIAS.names, *_PLATFORM_S)):
         return []
     rate = f"platform_gyro - {vector_text(PLATFORM_BIAS.names, parameters)}"
@@ -89,7 +89,7 @@ def head_plots(data: HeadData, calibration: Calibration) -> list[Plot]:
 
 
 def _from_vision(data: HeadData, calibration: Calibration, attitudes: Attitudes) -> Attitudes:
-    """bRv by each vision frame alone, with the mounts and the clock found."""
+    """Attitudes bRv by single vision frames, with the estimated mounts and clock."""
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
 
     time = _picture_times(data, values)
@@ -151,7 +151,7 @@ def _camera_mount_unknown(calibration: Calibration) -> bool:
 
 
 def _constant_turn(truth: Attitudes, attitudes: Attitudes) -> Array:
-    """The rotation (4,) that, on the left of the attitudes, brings them nearest to the truth (Markley 2007)."""
+    """Rotation (4,) that aligns attitudes with the truth if multiplied from the left (Markley 2007)."""
     inside = _inside(truth, attitudes.time)
     at = so3.interpolate(truth.time, truth.wxyz, attitudes.time[inside])
     turns = so3.multiply(at, so3.inverse(attitudes.wxyz[inside]))
@@ -163,20 +163,20 @@ def _inside(attitudes: Attitudes, time: Array) -> NDArray[np.bool_]:
 
 
 def _error(truth: Attitudes, attitudes: Attitudes) -> tuple[Array, Array]:
-    """Times within the truth's, and the angles to it there, deg."""
+    """Times within the truth's, s, and angles between truth and attitudes there, deg."""
     inside = _inside(truth, attitudes.time)
     some = Attitudes(attitudes.time[inside], attitudes.wxyz[inside])
     return some.time, np.linalg.norm(_delta(truth, some), axis=1)
 
 
 def _delta(attitudes: Attitudes, others: Attitudes) -> Array:
-    """Rotation vectors, deg, from the attitudes, taken at the others' times, to the others."""
+    """Rotation vectors (n, 3), deg, from interpolated attitudes to others at the others' times."""
     at = so3.interpolate(attitudes.time, attitudes.wxyz, others.time)
     return np.rad2deg(so3.log(so3.multiply(so3.inverse(at), others.wxyz)))
 
 
 def _vectors(wxyz: Array) -> Array:
-    """Rotation vectors, deg."""
+    """Convert quaternions to rotation vectors, deg."""
     return np.rad2deg(so3.log(wxyz))
 
 
@@ -188,7 +188,7 @@ _OUTLYING = 5.0
 
 @dataclass(frozen=True)
 class _Applied:
-    """Mounts, gyros without their errors, and times of the pictures on their clock (n,), s, by a calibration."""
+    """A calibration applied to a recording: mounts, corrected gyros, picture times (n,), s, on the gyro's clock."""
 
     vRh: Array
     cRb: Array
@@ -241,7 +241,7 @@ def validate(data: HeadData, config: Config, values: Mapping[str, float]) -> tup
 
 
 def _windows(data: HeadData, ways: Sequence[_Applied]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Vision frames from which and to which attitudes are carried, all of them within the gyros' record."""
+    """Indices of start and stop vision frames of 1-s windows within the gyros' records."""
     t = data.vision_t
     start = np.arange(len(t))
     after = np.clip(np.searchsorted(t, t + _SPAN), 1, len(t) - 1)
@@ -257,7 +257,7 @@ def _windows(data: HeadData, ways: Sequence[_Applied]) -> tuple[NDArray[np.intp]
 
 
 def _carried_on(data: HeadData, way: _Applied, start: NDArray[np.intp], stop: NDArray[np.intp]) -> Array:
-    """bRv at the frames `stop`, (n, 4), from vision at the frames `start` and the gyros in between."""
+    """Attitudes bRv (n, 4) at the `stop` frames, propagated by the gyros from vision at the `start` frames."""
     t0, t1 = way.time[start], way.time[stop]
     bRv = so3.compose(so3.inverse(way.cRb), data.vision_wxyz[start], so3.inverse(way.vRh))
     bRv = so3.multiply(bRv, way.helmet.increments(t0, t1).wxyz)
@@ -269,7 +269,7 @@ def _rotation_error(predicted: Array, measured: Array) -> Array:
 
 
 def _validation(against: str, time: Array, errors: Sequence[Array], note: str = "") -> Validation:
-    """Without the windows that vision outliers spoil, which are the same before and after."""
+    """Build a validation of propagated attitudes without windows with vision outliers."""
     lengths = np.minimum(*(np.linalg.norm(e, axis=1) for e in errors))
     good = lengths <= _OUTLYING * np.median(lengths)
     spoilt = int((~good).sum())
@@ -329,7 +329,7 @@ def at_gyro_rate(data: HeadData, attitudes: Attitudes, values: Mapping[str, floa
 
 
 def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], at: Array) -> Array:
-    """Attitudes bRv (n, 4) at times on the gyro's clock, carried by the gyros from those before and after.
+    """Attitudes bRv (n, 4) at times on the gyro's clock, propagated from the nearest known ones before and after.
 
     Args:
         data: the recording.
@@ -349,7 +349,7 @@ def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], a
 
 
 def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:
-    """The helmet's gyro by its formula in calibration.yaml; errors whose cause was not measured stay in it."""
+    """Helmet gyro corrected by its formula in calibration.yaml; errors with unmeasured causes remain."""
     measured: dict[str, Array | None] = {"gyro": data.head_gyro, "accel": data.head_force, "temperature": None}
     if data.temperature is not None:
         values = {temperature.FIRST: data.temperature.first, **values}
@@ -361,7 +361,7 @@ def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:
 
 
 def _platform_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath | None:
-    """The platform's gyro less its errors; None at rest."""
+    """Platform gyro minus its errors; None for a platform at rest."""
     if data.platform_t is None or data.platform_gyro is None:
         return None
     known = any(each.name == "w_ib" for each in formulas(values))

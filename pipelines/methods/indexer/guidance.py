@@ -26,7 +26,7 @@ _TURNS = 3
 
 
 def checklist(data: IndexerData, _: Config) -> Sequence[ChecklistItem]:
-    """Turns forward and back about each axis, by the angle at which the other one stands."""
+    """Checklist of turns forward and back about each axis, by the angle of the other axis."""
     turns: dict[tuple[str, int], list[int]] = {}
     for run in axis_motion(data).runs:
         if run.axis in ("outer", "inner"):
@@ -89,7 +89,7 @@ Axis = Literal["outer", "inner"]
 
 @cache
 def turning(axis: Axis, other_deg: float, ways: str = "start end") -> str:
-    """Drawing of one axis turning while the other stands at an angle.
+    """Drawing of one axis turning while the other axis stands at an angle.
 
     Args:
         axis: that turns.

@@ -95,7 +95,7 @@ class _Model:
 
     @property
     def options(self) -> tuple[Option, ...]:
-        """The factor's options that are parameters."""
+        """Optional variables of the factor that are parameters here."""
         given = {p.key for p in self.parameters}
         names: tuple[Option, ...] = ("errors", "temperature", "encoder", "epsilon")
         return tuple(name for name in names if KEYS[name] in given)
@@ -123,7 +123,7 @@ def problem(data: IndexerData, config: Config) -> Problem:
 
 
 def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[Level, ...]:
-    """Repeatability of mean rates, by kind of window: noise of gyro and encoders, and additional noise."""
+    """Noise levels of mean rates for each kind of window: gyro, encoders and additional noise."""
     found = []
     known = max(gyro.noise.known, encoders.noise.known)
     source = gyro.noise.source if encoders.noise.known < known else encoders.noise.source
@@ -139,7 +139,7 @@ def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[
 
 
 def _encoders(noise: Noise, scatter: float) -> Level:
-    """The level of the encoders' noise: what they show at rest, if they show any (rad), weighed against what is stated.
+    """Encoder noise level from the scatter at rest, rad, weighted with the stated level.
 
     A figure that is certainly another, by how well it is known, stands for more than this noise, and stays.
     """
@@ -199,7 +199,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
 
 
 def _steps(model: _Model, _: int) -> Iterator[Step]:
-    """A step for every group, however many measurements are wanted together."""
+    """Yield a step for each group of windows."""
     seen: set[tuple[str, int]] = set()
     for i, group in enumerate(model.groups):
         step = Step(
@@ -227,7 +227,7 @@ def _begin(model: _Model, step: Step) -> None:
 
 
 def _add_bias(model: _Model, i: int, step: Step) -> None:
-    """The bias of a group and the mean so far, which is what is reported from then on."""
+    """Add the bias of group i and the mean bias until then, the reported one, to a step."""
     bias = model.bias
     bias.begin(step, i, model.bias_guess)
     bias.end(step, i, model.bias_guess)
@@ -238,7 +238,7 @@ def _add_bias(model: _Model, i: int, step: Step) -> None:
 
 
 def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: Step) -> None:
-    """The factor of a group, and the tilt of its position when that is new."""
+    """Add the factor of group i to a step, with the tilt of its position when that is new."""
     group = model.groups[i]
     options = model.options
     columns = [KEYS["theta"], model.bias.key(i), *(KEYS[name] for name in options)]
@@ -262,7 +262,7 @@ def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: St
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
-    """The carrier's attitude nRb."""
+    """Carrier's attitude nRb over the frames of the trajectory."""
     rows = model.frames[list(keyframes)]
     epsilon = float(values.atVector(KEYS["epsilon"])[0]) if "epsilon" in model.options else 0.0
     encoder = values.atVector(KEYS["encoder"]) if "encoder" in model.options else np.zeros(len(ENCODER_ERRORS))
@@ -314,7 +314,7 @@ _DISAGREEMENT = 0.01
 def agreeing(
     groups: tuple[Group, ...], parameters: Sequence[Parameter], density: float, encoder: float
 ) -> tuple[tuple[Group, ...], int]:
-    """The groups whose gyro follows the encoders, and how many do not.
+    """Groups whose gyro agrees with the encoders, and the number of groups that disagree.
 
     Fits gyro = A w + b over all groups, so that neither mounting nor bias counts as disagreement.
 
@@ -372,7 +372,7 @@ def _fit(w: Array, gyro: Array, weight: Array) -> tuple[Array, Array]:
 
 
 def guess(groups: tuple[Group, ...]) -> tuple[Array, Array]:
-    """First guess of theta (3,) and the bias (3,): the rotation that best takes the platform's rates to the gyro's."""
+    """Initial mounting theta (3,), rad, and bias (3,), by aligning the platform's mean rates with the gyro's."""
     w = np.array([g.mean_platform for g in groups])
     gyro = np.array([g.mean_gyro for g in groups])
     weight = np.array([g.duration for g in groups])
@@ -388,7 +388,7 @@ _ATTITUDE_RATE = 10.0
 
 
 def frames(data: IndexerData, motion: AxisMotion) -> Index:
-    """Gyro samples for the trajectory; none when the INS puts out no attitude."""
+    """Indices of gyro samples for the trajectory; empty if the INS outputs no attitude."""
     if data.attitude is None:
         return np.empty(0, dtype=np.intp)
     stride = max(1, round(1.0 / (_ATTITUDE_RATE * float(np.median(np.diff(data.gyro_t))))))
@@ -396,7 +396,7 @@ def frames(data: IndexerData, motion: AxisMotion) -> Index:
 
 
 def carrier(data: IndexerData, motion: AxisMotion, rows: Index, theta: Array, epsilon: float, encoder: Array) -> Array:
-    """nRb = nRm mRt tRb at gyro samples; the encoders' errors (5,) as alidade.factors.indexer has them."""
+    """Attitude nRb = nRm mRt tRb at gyro samples; encoder errors (5,) as in alidade.factors.indexer."""
     assert data.attitude is not None
     at = data.gyro_t[rows] - encoder[4]
     outer, inner = (

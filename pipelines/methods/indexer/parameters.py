@@ -50,7 +50,7 @@ THETA_UNIT = 1e-3
 
 
 def indexer_parameters(config: Config, stamp_sigma: float = 0.0, thermometer: bool = False) -> tuple[Parameter, ...]:
-    """The method's parameters with their priors in force; of the assumptions those that are not all fixed.
+    """Parameters of the method with their priors in force, without fully fixed nuisance parameters.
 
     That the axes are not perpendicular is assumed only where the config gives it a prior. `stamp_sigma`, s: how well
     the stamps are known; `thermometer`: whether the IMU's temperature is measured.
@@ -74,5 +74,5 @@ def theta_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
 
 
 def several(values: Mapping[str, float], names: Sequence[str]) -> Array:
-    """Parameters by name as an array; those that are not given are zero."""
+    """Array of parameters by name; missing ones are zero."""
     return np.array([values.get(name, 0.0) for name in names])

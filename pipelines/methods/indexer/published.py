@@ -36,7 +36,7 @@ _FLAT = 1e-9
 
 @dataclass(frozen=True)
 class HalfDifference:
-    """Half difference of the mean rates of one position.
+    """Half difference of the forward and backward mean rates at one position.
 
     Attributes:
         position: 1 and 2 outer axis, 3 and 4 inner axis, with the other at 0 and at half a turn.
@@ -70,7 +70,7 @@ class ThinShell:
 
 
 def published_estimate(data: IndexerData, config: Config, problem: Problem) -> Estimate:
-    """One sweep of the search as a solver of the problem: it knows the angles theta.
+    """Run the thin-shell search once, as a solver of the problem that estimates the angles theta.
 
     The publication gives no accuracy; the covariance is what gyro noise alone does to the eight components.
     """
@@ -93,7 +93,7 @@ def published_estimate(data: IndexerData, config: Config, problem: Problem) -> E
 
 
 def _covariance(theta: Array, measured: Sequence[HalfDifference], density: float) -> Array:
-    """Covariance (3, 3) rad^2 of white gyro noise through the eight components; 1 rad for an unobserved angle."""
+    """Covariance (3, 3), rad^2, of theta by white gyro noise in the eight components; 1 rad if unobserved."""
     J = numeric_jacobian(lambda angles: np.concatenate(_across(angles, measured)), theta, np.full(3, 1e-6))
     # Half the difference of two means over half of the time each.
     weights = np.repeat([half.duration for half in measured], 2) / density**2
@@ -101,7 +101,7 @@ def _covariance(theta: Array, measured: Sequence[HalfDifference], density: float
 
 
 def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
-    """Half differences of the positions in the recording, in order; visits of a position are averaged.
+    """Half differences of the recording's positions, in order, averaged over repeated visits.
 
     Raises:
         InputError: no position has whole turns forward and back.
@@ -134,12 +134,12 @@ def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
 
 
 def cost(theta: ArrayLike, measured: Sequence[HalfDifference]) -> float:
-    """Sum of squares of the components across the axis in t, (rad/s)^2, at theta (3,), rad."""
+    """Sum of squared half differences across the rotation axis in t, (rad/s)^2, at theta (3,), rad."""
     return sum(float(row @ row) for row in _across(theta, measured))
 
 
 def _across(theta: ArrayLike, measured: Sequence[HalfDifference]) -> list[Array]:
-    """Components (2,) across the axis in t of each half difference, rad/s."""
+    """Components (2,) of each half difference across the rotation axis in t, rad/s."""
     x, y, z = np.asarray(theta, dtype=float)
     ex, ey, ez = np.eye(3)
     C_m_t = so3.compose(so3.exp(z * ez), so3.exp(y * ey), so3.exp(x * ex))
@@ -148,7 +148,7 @@ def _across(theta: ArrayLike, measured: Sequence[HalfDifference]) -> list[Array]
 
 
 def search(measured: Sequence[HalfDifference], half_width: float = np.deg2rad(2.0), iterations: int = 28) -> ThinShell:
-    """The thin-shell search over theta_x, then theta_y, then theta_z, each with the others where they are.
+    """Search theta_x, theta_y and theta_z in turn by the thin-shell method, the other angles unchanged.
 
     Args:
         measured: half differences; the base is level and points north, as the schedule of the publication asks.
@@ -167,7 +167,7 @@ def search(measured: Sequence[HalfDifference], half_width: float = np.deg2rad(2.
 def _shell(
     theta: Array, axis: int, measured: Sequence[HalfDifference], half_width: float, iterations: int
 ) -> tuple[float, int, bool]:
-    """The angle of one axis, how often the fourth case was met, and whether the cost is flat."""
+    """Search one angle; return it, the number of fourth cases, and whether the cost is flat."""
 
     def at(angle: float) -> float:
         trial = theta.copy()
@@ -193,7 +193,7 @@ def _shell(
 
 
 def _position(run: Run) -> int | None:
-    """Number of the published position a run belongs to, None for another."""
+    """Number (1 to 4) of the published position that a run has; None for other positions."""
     if run.axis not in ("outer", "inner"):
         return None
     off_zero = abs((run.other + np.pi) % (2.0 * np.pi) - np.pi)
@@ -204,7 +204,7 @@ def _position(run: Run) -> int | None:
 
 
 def _mean_over_whole_turns(data: IndexerData, motion: AxisMotion, run: Run) -> tuple[Array, float]:
-    """Mean gyro rate (3,) from the time a run has turned a little to whole turns later, by the encoder, and how long.
+    """Mean gyro rate (3,) over a run's whole turns, by the encoder, and their duration, s.
 
     The turns start behind the ramp, since the publication averages uniform turning; a run without turns to spare is
     taken from its start.

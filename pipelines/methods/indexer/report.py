@@ -44,7 +44,7 @@ _JOINT_NAMES = ("outer", "inner")
 
 
 def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
-    """Mounting, rate and attitude, with the errors of gyro, encoders and axes that are among the parameters."""
+    """Formulas of mounting, rate and attitude, with those sensor errors that are among the parameters."""
     angles = axis_angles(_JOINT_NAMES, ONCE_PER_TURN.names, DELAY.names[0], parameters)
     outer, inner = [angle.name for angle in angles] or _JOINT_NAMES
     rate, inputs = gyro_rate(parameters, ERRORS, (), GYRO_SLOPE.names)
@@ -77,7 +77,7 @@ _ARCSEC = np.rad2deg(1.0) * 3600.0
 
 
 def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
-    """The method's own figures; those that the recording has no data for are left out."""
+    """Figures of the method for which the recording has data."""
     config = calibration.config
     estimate = calibration.estimate
     values = calibration.problem.numbers(estimate)
@@ -92,7 +92,7 @@ def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
 
 
 def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | None:
-    """Direction of each position's half difference across its axis, before and after turning it by theta."""
+    """Plot each position's half difference across its axis, before and after compensation by theta."""
     try:
         found = half_differences(data)
     except InputError:
@@ -121,7 +121,7 @@ def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | Non
 
 
 def _misfit(turning: list[Group], values: dict[str, float]) -> Plot:
-    """Mean gyro less prediction over each turn or move, as an angle of the axis."""
+    """Plot mean gyro rate minus prediction over each turn or move, as an angle of the axis."""
     out = Figure("gyro less encoders, arcsec")
     time, error = misfit(turning, values)
     for i, axis in enumerate(AXES):
@@ -135,7 +135,7 @@ def _misfit(turning: list[Group], values: dict[str, float]) -> Plot:
 
 
 def _contributions(turning: list[Group], values: dict[str, float]) -> Plot:
-    """Share of each position in what is known of the angles."""
+    """Plot each position's share of the information about the mounting angles."""
     information: dict[str, Array] = {}
     for group in turning:
         n = len(group.gyro)
@@ -160,7 +160,7 @@ def _contributions(turning: list[Group], values: dict[str, float]) -> Plot:
 
 
 def _attitude(data: IndexerData, config: Config, values: dict[str, float]) -> Plot:
-    """Error of the carrier's attitude put out, before and after compensation."""
+    """Plot the error of the INS attitude output, before and after compensation."""
     found = validate(data, config, values)[0]
     out = Figure("attitude error, deg", y_scale="log")
     said = []
@@ -174,7 +174,7 @@ def _attitude(data: IndexerData, config: Config, values: dict[str, float]) -> Pl
 
 
 def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> list[Validation]:
-    """Errors without and with a calibration: of the attitude put out, where there is one, and of the turns' mean rates.
+    """Errors before and after calibration: of the attitude output, if recorded, and of the turns' mean rates.
 
     The carrier's attitude is nRb = nRm mRt tRb(outer, inner), without calibration mRt = identity and perpendicular
     axes; the carrier is the indexer's base and stands still at the config's `indexer.base_attitude`.
@@ -202,13 +202,13 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
 
 
 def _carrier(data: IndexerData, motion: AxisMotion, rows: Index, values: Mapping[str, float]) -> Array:
-    """The carrier's attitude at gyro samples, by calibrated parameters."""
+    """Carrier's attitude at gyro samples, by calibrated parameters."""
     epsilon = float(several(values, EPSILON)[0])
     return carrier(data, motion, rows, several(values, THETA), epsilon, several(values, ENCODER))
 
 
 def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array, Array]:
-    """Ends (n,) of the groups, s, and their mean rates less what encoders and earth say, over the rate, (n, 3) in t.
+    """End times (n,) of groups, s, and relative residuals (n, 3) of their mean rates in t.
 
     Args:
         groups: in which an axis turns.

@@ -112,7 +112,7 @@ class _Drive:
         return abs(self.angle) / self.speed + self.speed / self.acceleration
 
     def turned(self, t: Array) -> Array:
-        """Angle turned by the time t, while it moves, rad: the rate is a trapezoid."""
+        """Angle of the motion at times t, rad, for a trapezoidal rate."""
         ramp, s = self.speed / self.acceleration, t - self.start
         even, braking = (np.maximum(s - corner, 0.0) for corner in (ramp, self.duration - ramp))
         return np.asarray(np.sign(self.angle) * 0.5 * self.acceleration * (s**2 - even**2 - braking**2))
@@ -180,7 +180,7 @@ def indexer_config(scenario: IndexerScenario) -> str:
 
 
 def _program(scenario: IndexerScenario) -> tuple[list[_Drive], float]:
-    """Motions in time order and the duration, s."""
+    """Schedule of motions in time order, and its duration, s."""
     drives: list[_Drive] = []
     at = np.zeros(2)
     now = scenario.dwell_s
@@ -205,7 +205,7 @@ def _program(scenario: IndexerScenario) -> tuple[list[_Drive], float]:
 
 
 def _recorded(t: Array, drives: list[_Drive], scenario: IndexerScenario) -> Array:
-    """The stamps outside moves that are not recorded."""
+    """Remove the stamps within moves that the scenario does not record."""
     keep = np.ones(len(t), dtype=bool)
     for move in drives:
         if move.is_move and not scenario.record_moves:
@@ -214,7 +214,7 @@ def _recorded(t: Array, drives: list[_Drive], scenario: IndexerScenario) -> Arra
 
 
 def _commanded(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Array:
-    """Axis angles (2, N), rad, that the drives follow. Ripple comes with the angle, as cogging does."""
+    """Commanded axis angles (2, N), rad, with a ripple periodic in the angle, as cogging is."""
     angles = np.zeros((2, len(t)))
     for drive in drives:
         begin, end = np.searchsorted(t, [drive.start, drive.start + drive.duration])
@@ -225,7 +225,7 @@ def _commanded(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Arr
 
 
 def _angles(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t: Array) -> Array:
-    """True axis angles (2, N), rad. The drives follow the encoders, and with them the encoders' harmonics."""
+    """True axis angles (2, N), rad: the drives follow the encoders with their harmonic errors."""
     commanded = _commanded(scenario, drives, t)
     angles = commanded.copy()
     for order, amplitude in enumerate(scenario.encoder_harmonics_arcsec, start=1):
@@ -234,7 +234,7 @@ def _angles(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t: A
 
 
 def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t: Array) -> Array:
-    """nRm, shape (N, 4)."""
+    """Attitude nRm (N, 4) of the gyro."""
     ex, ey, ez = np.eye(3)
     outer, inner = _angles(scenario, drives, phases, t)[..., None]
     k, w = scenario.wobble_per_turn, scenario.wobble_arcsec * ARCSEC

@@ -65,7 +65,7 @@ _EZ = np.array([0.0, 0.0, 1.0])
 
 
 def _sequence() -> tuple[Array, Array, Array]:
-    """Times, angles of the inner axis and its rates, (U,)."""
+    """Rotation sequence of an hour: times, s, angles of the inner axis, rad, and its rates, rad/s, (U,)."""
     time = np.arange(_STEP_S, _HOUR_S + 0.5 * _STEP_S, _STEP_S)
     middle = time - 0.5 * _STEP_S
     leg, into = np.divmod(middle, _DWELL_S + _TURN_S)

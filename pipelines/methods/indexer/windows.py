@@ -35,7 +35,7 @@ _GAP_SAMPLES = 2.5
 
 @dataclass(frozen=True)
 class Run:
-    """A segment in which the same axes moved the same way, without gaps in either stream.
+    """A segment with a constant state of motion of both axes, without gaps in either stream.
 
     Attributes:
         axis: which one moved.
@@ -63,7 +63,7 @@ class Run:
 
 @dataclass(frozen=True)
 class AxisMotion:
-    """The encoder stream made continuous, the runs in it, and the gaps between them.
+    """The continuous encoder stream, its runs, and the gaps between these.
 
     Attributes:
         t: (M,) s.
@@ -79,7 +79,7 @@ class AxisMotion:
 
 
 def axis_motion(data: IndexerData) -> AxisMotion:
-    """Runs of a recording; wrapped angles are unwrapped, runs end at gaps of either stream.
+    """Find the runs of a recording, from unwrapped angles; runs end at gaps of either stream.
 
     Raises:
         InputError: the axes hardly turn.
@@ -136,7 +136,7 @@ def _speeds(t: Array, angles: Array) -> Array:
 
 
 def _runs(t: Array, angles: Array, moving: Array) -> list[Run]:
-    """Cut one piece where the state of the axes changes; states too short to be meant join the one before.
+    """Cut a piece into runs where the axes' motion changes; too short states join the previous run.
 
     `moving` (M, 2) is 1 for an axis that moves forward, -1 back, 0 at rest.
     """
@@ -170,7 +170,7 @@ def _run(t: Array, angles: Array, moving: Array, begin: int, end: int) -> Run:
 
 
 def encoder_scatter(motion: AxisMotion) -> float:
-    """Noise from encoder sample to encoder sample while the axes rest, rad; 0 if they never do."""
+    """Noise of one encoder sample, from second differences at rest, rad; 0 if the axes never rest."""
     spread = []
     for run in motion.runs:
         if run.axis == "none":
@@ -206,7 +206,7 @@ KINDS = ("turn", "move", "dwell")
 
 @dataclass(frozen=True)
 class Group:
-    """Adjoining windows of one run and what was measured in them.
+    """Consecutive windows of one run with their measurements.
 
     Attributes:
         kind: "turn" for a whole turn, "move" for less, "dwell".
@@ -224,26 +224,26 @@ class Group:
 
     @property
     def duration(self) -> float:
-        """Time from the begin of a group of turns to its end, s."""
+        """Time from start to end of a group, s."""
         return float(self.rates.edges[-1] - self.rates.edges[0])
 
     @property
     def mean_gyro(self) -> Array:
-        """Mean rate (3,) over the whole group, rad/s."""
+        """Mean gyro rate (3,) over the group, rad/s."""
         return np.asarray(np.diff(self.rates.edges) @ self.gyro / self.duration)
 
     def temperature_rise(self, reference: float | None) -> Array | None:
-        """Mean temperatures (n,) above another, degrees Celsius, K; None where nobody measures them."""
+        """Mean temperatures (n,) above a reference, K; None where not measured."""
         return None if self.celsius is None or reference is None else self.celsius - reference
 
     @property
     def mean_platform(self) -> Array:
-        """Mean rate (3,) of the platform over the whole group with perpendicular axes, in t, rad/s."""
+        """Mean rate (3,) of the platform over the group, for perpendicular axes, in t, rad/s."""
         return np.asarray(np.diff(self.rates.edges) @ (self.rates.fixed + self.rates.cosine) / self.duration)
 
     @property
     def position(self) -> tuple[str, int] | None:
-        """The axis that turns and at which angle the other stands, in steps; None when not one axis turns alone."""
+        """Rotating axis and angle of the other one, in steps; None unless exactly one axis turns."""
         if self.run.axis not in ("outer", "inner"):
             return None
         steps = round(360.0 / _SAME_ANGLE_DEG)
@@ -251,7 +251,7 @@ class Group:
 
 
 def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool = True) -> tuple[Group, ...]:
-    """The groups of a recording in time order; none shares an encoder sample with another."""
+    """Groups of windows of a recording in time order, without common encoder samples."""
     nRbase = np.array(config.section(IndexerConfig).base_attitude)
     latitude = data.latitude_deg
     earth = np.zeros(3) if latitude is None else earth_rate(np.deg2rad(latitude))
@@ -286,7 +286,7 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
 
 
 def _borders(motion: AxisMotion, run: Run) -> Iterator[tuple[str, Array]]:
-    """Kind and window edges, s, of each group of a run."""
+    """Yield kind and window edges, s, of each group of a run."""
     if run.axis == "none":
         # Ends early enough for the motion that follows to start where it does.
         yield "dwell", np.array([run.start, run.stop - _DWELL_MARGIN * float(np.median(np.diff(motion.t)))])

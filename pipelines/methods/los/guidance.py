@@ -19,7 +19,7 @@ _LEAST_SWAY_RAD = np.deg2rad(2.0)
 
 
 def checklist(data: LosData, _: Config) -> Sequence[ChecklistItem]:
-    """Sway about each axis of the carrier, and whether the target was in sight."""
+    """Checklist of sway about each axis of the carrier, and of the target's visibility."""
     seen = f"{1.0 / np.median(np.diff(data.image_t)):.3g} LOS errors/s"
     sway = turned(data.gyro_t, data.gyro)
     spread = np.rad2deg(np.ptp(data.gimbal, axis=0))

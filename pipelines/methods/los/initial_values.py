@@ -34,26 +34,26 @@ _CLOCK_PAIRS = 500
 
 
 def los_direction(measured: Array) -> Array:
-    """Unit vectors (n, 3) in c towards the target at LOS errors phx, phz, (n, 2 or more)."""
+    """Unit vectors (n, 3) in c towards the target, from LOS errors phx, phz (n, 2 or more), rad."""
     ahead = np.stack([np.tan(measured[:, 1]), np.ones(len(measured)), -np.tan(measured[:, 0])], axis=1)
     return np.asarray(ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
 
 
 def los_error(direction: Array) -> Array:
-    """LOS errors phx, phz (n, 2), rad, of directions (n, 3) in c."""
+    """LOS errors phx, phz (n, 2), rad, from directions (n, 3) in c."""
     x, y, z = direction.T
     return np.stack([-np.arctan2(z, y), np.arctan2(x, y)], axis=1)
 
 
 def camera(gimbal: Array, angles: Array, names: tuple[str, ...]) -> Array:
-    """cRm (n, 4) at gimbal angles (n, 2) and mounting angles (d,), rad."""
+    """Camera attitude cRm (n, 4) at gimbal angles (n, 2) and mounting angles (d,), rad."""
     n = len(gimbal)
     model = LosDirectionFactor(np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2, 2)), gimbal, names)
     return model.camera(np.tile(angles, (n, 1)))
 
 
 def seen(cRm: Array, measured: Array) -> Array:
-    """tRm (n, 4) of cameras that see the target at phx, phz, with the roll they measure (n, 3) or, if NaN, none."""
+    """Attitude tRm (n, 4) from cRm and measured phx, phz, roll (n, 3), rad; a NaN roll counts as zero."""
     y = np.array([0.0, 1.0, 0.0])
     swing = _shortest(np.broadcast_to(y, (len(cRm), 3)), los_direction(measured))
     cRt = so3.multiply(swing, so3.exp(-np.nan_to_num(measured[:, 2])[:, None] * y))
@@ -63,7 +63,7 @@ def seen(cRm: Array, measured: Array) -> Array:
 def initial_attitudes(
     chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measured: Array, gyro: GyroPath
 ) -> Array:
-    """tRm (n, 4): carried by the gyro from a target's first picture, turned to where each picture shows the target."""
+    """Initial attitudes tRm (n, 4): gyro propagation from a target's first picture, aligned with each picture."""
     out = np.empty((len(time), 4))
     toward = so3.rotate(so3.inverse(cRm), los_direction(measured))
     for chain in chains:
@@ -74,13 +74,13 @@ def initial_attitudes(
 
 
 def _carried(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
-    """tRm (n, 4) at one target's pictures: where the first of them shows it, carried on by the gyro."""
+    """Attitude tRm (n, 4) at one target's pictures, propagated by the gyro from the first picture."""
     turned = gyro.attitude(time)
     return so3.compose(seen(cRm[:1], measured[:1]), so3.inverse(turned[:1]), turned)
 
 
 def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath, target_rate: Array) -> Array:
-    """phx, phz (n, 2), rad, predicted for one target's pictures by the gyro alone since the first of them.
+    """LOS errors phx, phz (n, 2), rad, of one target's pictures, predicted by the gyro from the first.
 
     The target's frame turns at `target_rate` (3,), rad/s.
     """
@@ -98,7 +98,7 @@ def guess(
     parameters: tuple[Parameter, ...],
     sigma: float,
 ) -> tuple[Array, Array]:
-    """Mounting angles and gyro bias (3,) that best carry LOS errors on to those a second later, robustly.
+    """Estimate mounting angles and gyro bias (3,) robustly from LOS errors predicted over one second.
 
     Args:
         chains: pictures of one target each, as rows of what follows.
@@ -136,7 +136,7 @@ def guess_picture_clock(
     guessed: tuple[Array, Array],
     sigma: float,
 ) -> tuple[Clock, tuple[Array, Array, float]]:
-    """The clock with which LOS errors are carried on best, with mounting angles, gyro bias and delay of the encoders.
+    """Estimate the camera's clock with mounting angles, gyro bias and encoder delay from predicted LOS errors.
 
     Encoders that read late spoil the errors more than late pictures do, which the gimbal stabilises.
 
@@ -179,7 +179,7 @@ def _miss_by_clock(
     gimbal: GimbalPath,
     gyro: GyroPath,
 ) -> Miss:
-    """Function `_miss` near x whose last three numbers are the encoders' delay and the clock's.
+    """Prediction errors as `_miss`, near x, with encoder delay and clock as last three numbers of x.
 
     The gyro's rotations are computed once.
     """
@@ -201,7 +201,7 @@ def _miss_by_clock(
 def _miss(
     x: Array, names: tuple[str, ...], turns: Increments, gimbal: tuple[Array, Array], before: Array, after: Array
 ) -> Array:
-    """Prediction errors (n, 2) of LOS errors after a rotation from those before it, rad.
+    """Errors (n, 2), rad, of LOS errors predicted over gyro rotations from earlier LOS errors.
 
     Args:
         x: mounting angles of these names and bias.
@@ -217,7 +217,7 @@ def _miss(
 
 
 def _pairs(chains: Sequence[NDArray[np.intp]], time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pictures of one target a second apart, at most about so many pairs."""
+    """Indices of picture pairs of one target, one second apart, at most about `most` pairs."""
     first, second = [], []
     for chain in chains:
         later = np.searchsorted(time[chain], time[chain] + _SPAN)
@@ -230,7 +230,7 @@ def _pairs(chains: Sequence[NDArray[np.intp]], time: Array, most: int) -> tuple[
 
 
 def _shortest(a: Array, b: Array) -> Array:
-    """The shortest rotations (n, 4) that turn unit vectors a into b."""
+    """Shortest rotations (n, 4) that rotate unit vectors a to b."""
     return so3.normalize(np.concatenate([1.0 + (a * b).sum(axis=1, keepdims=True), so3.cross(a, b)], axis=1))
 
 
@@ -248,7 +248,7 @@ _FOLLOWERS = 5
 def select_pictures(
     data: LosData, sigma: Array, margin: float
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
-    """The pictures used, which of them are the first of their target, and what was left out.
+    """Select the usable pictures; return indices, mask of each target's first one, and exclusion counts.
 
     `margin`, s, is left out on either side of a gap in which the gimbal may have turned to another target.
     """
@@ -288,14 +288,14 @@ def select_pictures(
 
 
 def _in_gap(t: Array, at: Array) -> NDArray[np.bool_]:
-    """Whether times lie between two samples that are too far apart."""
+    """Mask of times that lie in a gap between two samples."""
     step = np.diff(t)
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(step) - 1)
     return np.asarray(step[i] > _GAP * np.median(step))
 
 
 def _first_of_target(data: LosData, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Mask of first pictures of a chain: after a gap in which the target may have changed, or of the gyro."""
+    """Mask of pictures that start a chain, after a gap with a possible change of target or a gyro gap."""
     starts = np.ones(len(rows), dtype=bool)
     if len(rows) < 2:
         return starts
@@ -308,7 +308,7 @@ def _first_of_target(data: LosData, rows: NDArray[np.intp]) -> NDArray[np.bool_]
 
 
 def _wrong_before_followers(error: Array, sigma: Array) -> int:
-    """Number of LOS errors at the start of a chain that disagree with the median of the next."""
+    """Number of LOS errors at the start of a chain that disagree with the median of their followers."""
     for i in range(len(error) - _FOLLOWERS):
         after = error[i + 1 : i + 1 + _FOLLOWERS]
         drift = np.median(np.abs(np.diff(after, axis=0)), axis=0)

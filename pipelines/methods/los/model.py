@@ -92,7 +92,7 @@ class _Model:
 
     @property
     def gimbal_errors(self) -> GimbalErrors:
-        """Of mounting and encoders, where errors of the sensors are variables."""
+        """Error model of gimbal mounting and encoders, for problems with sensor errors as variables."""
         return GimbalErrors(self.parameters.names, tuple(self.mount.tolist()))
 
 
@@ -129,7 +129,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
 
 
 def _error_map(config: Config, model: _Model, _: Estimate) -> ErrorMap | None:
-    """Errors of LOS errors that depend on the gimbal angles."""
+    """Error map of the LOS errors over the gimbal angles."""
     sine, cosine, each = np.sin(model.angles), np.cos(model.angles), np.eye(2)
     alone, slopes = np.hstack([sine, cosine]), np.hstack([cosine[..., None] * each, -sine[..., None] * each])
     i, j = [0, 0, 2, 2], [1, 3, 1, 3]
@@ -147,7 +147,7 @@ def _error_map(config: Config, model: _Model, _: Estimate) -> ErrorMap | None:
 
 
 def _noises(data: LosData, config: Config) -> dict[str, Level]:
-    """Noises in use, by name; the encoders' noise is part of the tracker's rows."""
+    """Noises in use, by name; the tracker's rows include the encoders' noise."""
     los, roll = typical(data.error_cov, 0, 1), typical(data.error_cov, 2)
     found = [Level(stated("los_error", config, los, _FAMILIES, (0, 1)))]
     if np.isfinite(data.error[:, 2]).any():
@@ -247,7 +247,7 @@ def _prepare(
 
 @dataclass(frozen=True, eq=False)
 class _Used:
-    """The pictures that are used.
+    """The selected pictures and their measurements.
 
     Attributes:
         time: (K,) stamps, s.
@@ -273,7 +273,7 @@ class _Used:
     def of(
         cls, data: LosData, config: Config, gimbal: GimbalPath, margin: float, start: float
     ) -> tuple[_Used, dict[str, int]]:
-        """Pictures used, from `start` on and `margin` s away from gaps, and the numbers left out by reason."""
+        """Select pictures from `start` on and `margin` s away from gaps; return them and exclusion counts."""
         encoder = _encoder_sigma(data.image_t, gimbal, config)
         covariance = _covariance(data, gimbal, config, encoder)
         rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), margin)
@@ -288,7 +288,7 @@ class _Used:
 
 
 def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> tuple[Clock, Array]:
-    """The clock by which stamps count, and how long each picture's target has been watched, (K,), s."""
+    """Clock of the stamps, and time (K,), s, since each picture's target was found."""
     found = used.time[used.starts]
     if before is not None and before.around is not None and start > -np.inf:
         # The data are the recording's end, and its first target may have been found before.
@@ -299,13 +299,13 @@ def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> 
 
 
 def _encoder_sigma(time: Array, gimbal: GimbalPath, config: Config) -> Array:
-    """Sigma (K,), rad, of the encoders' noise in angles at times (K,)."""
+    """Encoder noise (K,), rad, of gimbal angles interpolated to times (K,)."""
     _, weights = gimbal.weights(time)
     return np.asarray(first_given(config.noise.encoder, DEFAULT_NOISE.encoder) * np.linalg.norm(weights, axis=1))
 
 
 def _covariance(data: LosData, gimbal: GimbalPath, config: Config, encoder: Array) -> Array:
-    """Covariance (K, 3, 3) of phx, phz, roll: tracker's or config's, and the encoders'; NaN where not measured."""
+    """Covariance (K, 3, 3) of phx, phz, roll, rad^2, by tracker or config plus encoders; NaN where not measured."""
     if data.error_cov is None:
         los = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
         roll = first_given(config.noise.los_roll, DEFAULT_NOISE.los_roll)
@@ -321,7 +321,7 @@ def _covariance(data: LosData, gimbal: GimbalPath, config: Config, encoder: Arra
 
 
 def _sqrt_information(covariance: Array) -> Array:
-    """Square-root information R (K, 3, 3), upper triangular; last row and column are zero without roll."""
+    """Square-root information R (K, 3, 3), upper triangular, 1/rad; zero in row and column of a missing roll."""
     out = np.zeros_like(covariance)
     rolls = np.isfinite(covariance[:, 2, 2])
     for size, mine in ((3, rolls), (2, ~rolls)):
@@ -333,7 +333,7 @@ def _sqrt_information(covariance: Array) -> Array:
 
 
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
-    """Pictures close in time, and more until there are `chunk`; the first step brings variables and priors too."""
+    """Yield steps of at least `chunk` pictures (the last may be smaller); the first step adds variables and priors."""
     time = model.chain.time
     begin = int(np.searchsorted(time, after, side="right"))
     while begin < len(time):
@@ -372,13 +372,13 @@ def _step(model: _Model, keyframes: range) -> Step:
 
 
 def _found(model: _Model, k: int, current: gtsam.Values) -> Array:
-    """tRm (4,) where a target is found, with the mounting angles as estimated by now."""
+    """Attitude tRm (4,) at picture k, where a target is found, by the current mounting angles."""
     cRm = camera(model.angles[k : k + 1], current.atVector(model.parameters.angles.key), model.parameters.names)
     return seen(cRm, model.measured[k : k + 1])[0]
 
 
 def _start_factor(model: _Model, k: int) -> Factor:
-    """Wide prior on the first attitude of a target."""
+    """Wide prior on the attitude at a target's first picture."""
     rolls = np.isfinite(model.measured[:, 2]).any()
     sigmas = np.array([_WIDE, _WIDE if rolls else _HELD, _WIDE])
     initial = model.chain.initial[k]
@@ -386,7 +386,7 @@ def _start_factor(model: _Model, k: int) -> Factor:
 
 
 def _whitened(model: _Model, factor: Factor) -> Factor:
-    """Wrap increments of the gyro so that errors of the gimbal leave their noise as it is; no other factor."""
+    """Wrap gyro increment factors so that gimbal errors leave their noise unchanged; return other factors as is."""
     increments, sight, around = factor.process, model.parameters.sight, model.around
     if increments is None or sight is None or around is None or factor.family != "gyro":
         return factor
@@ -397,7 +397,7 @@ def _whitened(model: _Model, factor: Factor) -> Factor:
 
 
 def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
-    """One factor for the pictures with roll, one for those without."""
+    """Build one factor of the pictures with roll and one of those without."""
     k = np.array(keyframes)
     rolls = np.isfinite(model.measured[k, 2])
     return [

@@ -92,7 +92,7 @@ PARAMETERS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, BIAS, *NUISANCE, LOS_MAP)
 
 @dataclass(frozen=True)
 class LosParameters:
-    """The variables that all measurements share.
+    """Variables that all measurements share.
 
     Attributes:
         angles: of the mounting.
@@ -108,7 +108,7 @@ class LosParameters:
 
     @classmethod
     def of(cls, config: Config, drivers: Sequence[ParameterSpec], stamp_sigma: float = 0.0) -> LosParameters:
-        """Parameters with the priors of the config.
+        """Build the parameters with the priors of the config.
 
         Args:
             config: priors, data sheets, accuracies wanted.
@@ -136,7 +136,7 @@ class LosParameters:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The mounting angles that are variables."""
+        """Names of the mounting angles that are variables."""
         return tuple(q.name for q in self.angles.quantities)
 
     @property

@@ -43,7 +43,7 @@ class LosLeastSquares:
 def recursive_least_squares(
     data: LosData, los_sigma: float = 2e-5, initial_sigma: float = 0.1, exact: bool = False
 ) -> LosLeastSquares:
-    """Run the filter over a session.
+    """Run the published recursive least squares over a session.
 
     Args:
         data: the session.
@@ -73,7 +73,7 @@ def recursive_least_squares(
 
 
 def published_estimate(data: LosData, config: Config, problem: Problem) -> Estimate:
-    """The filter as a solver of the problem: it knows the four mounting angles, and no gyro bias."""
+    """Run the published filter as a solver of the problem, for four mounting angles without a gyro bias."""
     sigma = config.noise.los_error
     if sigma is None and data.error_cov is not None:
         sigma = float(np.sqrt(np.median(data.error_cov[:, [0, 1], [0, 1]])))
@@ -97,7 +97,7 @@ def published_estimate(data: LosData, config: Config, problem: Problem) -> Estim
 
 
 def rates(data: LosData, exact: bool = False) -> tuple[Array, Array, Array]:
-    """Stamps of the pictures (n + 1,), the LOS error rates between them (n, 2), rad/s, and the mean H (n, 2, 4)."""
+    """Stamps of the pictures (n + 1,), s, LOS error rates between them (n, 2), rad/s, and mean H (n, 2, 4)."""
     start = max(data.gyro_t[0], data.gimbal_t[0])
     stop = min(data.gyro_t[-1], data.gimbal_t[-1])
     inside = (data.image_t >= start) & (data.image_t <= stop)
@@ -119,7 +119,7 @@ def rates(data: LosData, exact: bool = False) -> tuple[Array, Array, Array]:
 
 
 def sensitivity(azimuth: Array, elevation: Array, rate: Array, exact: bool = False) -> Array:
-    """H, shape (n, 2, 4), at gimbal angles (n,), rad, and carrier rates (n, 3), rad/s."""
+    """Jacobian H (n, 2, 4) of LOS rates by mounting angles, at gimbal angles (n,), rad, and rates (n, 3)."""
     s, c, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
     wx, wy, wz = rate.T
     zero = np.zeros_like(s)

@@ -139,7 +139,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
 
 
 def check(data: LosData, gyro: str, gimbal: str) -> None:
-    """Raise InputError where gimbal, gyro and pictures contradict one another, by the topics named."""
+    """Raise InputError where gimbal, gyro and pictures contradict one another; the message names the topics."""
     check_gimbal(gimbal, data)
     check_motion(gyro, gimbal, data)
 
@@ -186,7 +186,7 @@ def check_gimbal(topic: str, data: LosData) -> None:
 
 
 def check_motion(gyro: str, gimbal: str, data: LosData) -> None:
-    """Raise InputError if the gimbal holds the picture far better with gyro or gimbal read another way.
+    """Raise InputError if another sign or unit of gyro or gimbal explains the stabilisation far better.
 
     That is: gyro axes of the opposite sign, a gyro in deg/s, gimbal angles that do not follow the carrier.
     """
@@ -208,7 +208,7 @@ def check_motion(gyro: str, gimbal: str, data: LosData) -> None:
 
 
 def _between_pictures(data: LosData) -> tuple[Array, Array, Array]:
-    """Times (n,) s of pictures apart, and about the camera's z and x between them, rad: (n - 1, 2), (n - 1, 2, 3).
+    """Picture times (n,), s, gimbal rotation (n - 1, 2), carrier rotation (n - 1, 2, 3) between them, rad.
 
     The first is the gimbal's own turn less what the picture shows of it, the second the carrier's by its gyro's axes.
     """
@@ -229,7 +229,7 @@ def _between_pictures(data: LosData) -> tuple[Array, Array, Array]:
 
 
 def _turned_by_carrier(data: LosData) -> Iterator[tuple[slice, Array]]:
-    """Samples of the gyro, and (n, 2, 3) rad: how far each axis has turned the picture about the camera's z and x.
+    """Yield gyro samples and the picture's rotation since the start by each gyro axis, (n, 2, 3) rad.
 
     That is since the start. The samples come block by block, each with the last one of the block before.
     """
@@ -250,7 +250,7 @@ def _turned_by_carrier(data: LosData) -> Iterator[tuple[slice, Array]]:
 
 
 def _span(values: Array) -> Array:
-    """Largest less smallest of each column; NaN, which compares as False, for fewer than two rows."""
+    """Maximum minus minimum of each column; NaN for fewer than two rows."""
     return np.asarray(np.ptp(values, axis=0)) if len(values) > 1 else np.full(values.shape[1], np.nan)
 
 
@@ -275,7 +275,7 @@ def _gimbal(reader: StreamReader, topic: str) -> tuple[Array, Array]:
 
 
 def _error(reader: StreamReader, topic: str) -> tuple[Array, Array]:
-    """Times and phx, phz, roll; messages without phx or phz (target lost), or with a frozen one, are dropped."""
+    """Read stamps and phx, phz, roll; messages without phx or phz (target lost) or with a frozen one are dropped."""
     errors = reader.recording.vector(topic)
     reader.count(topic, "stamped by log time (kept)", errors.stamped_by_log)
     offset = errors.vector[:, [0, 2]]
@@ -301,7 +301,7 @@ def _error(reader: StreamReader, topic: str) -> tuple[Array, Array]:
 
 
 def _check_tracked(topic: str, offset: Array) -> None:
-    """Raise InputError if phx or phz (N, 2) are nearly always one value: errors that agree so look like small ones."""
+    """Raise InputError if phx or phz (N, 2) is nearly always one value, as from a tracker that is not locked."""
     share = np.array([np.unique(column, return_counts=True)[1].max() for column in offset.T]) / len(offset)
     stuck = " and ".join(axis for axis, much in zip("xz", share, strict=True) if much >= _STUCK)
     if stuck and len(offset) >= _FEWEST:
@@ -315,7 +315,7 @@ def _check_tracked(topic: str, offset: Array) -> None:
 
 
 def _from_pictures(reader: StreamReader, config: Config) -> tuple[Array, Array, Array]:
-    """LOS errors of the target that the first picture shows, with the tracker's covariance."""
+    """Measure LOS errors in the pictures, of the target in the first, with the tracker's covariance."""
     from alidade.pipelines.vision.target import los_errors
 
     topic = config.topic(IMAGE)

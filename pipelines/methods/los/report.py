@@ -43,7 +43,7 @@ DRIVERS = SENSITIVITY.names, GYRO_SLOPE.names
 
 
 def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
-    """Mounting, rate, camera and clock, with the errors of the sensors that are among the parameters."""
+    """Formulas of mounting, rate, camera and clock, with those sensor errors that are among the parameters."""
     angles = axis_angles(JOINTS, ONCE_PER_TURN.names, DELAY.names[0], parameters)
     azimuth, elevation = [angle.name for angle in angles] or JOINTS
     rate, inputs = gyro_rate(parameters, S, *DRIVERS)
@@ -83,7 +83,7 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
 
 
 def findings(data: LosData, config: Config, _: Estimate) -> Findings:
-    """Rows of `fixed_assumptions`: those that the recording gives no hold on, and why."""
+    """Rows of `fixed_assumptions`: nuisance parameters that the recording cannot estimate, with the reason."""
     return {} if data.force is not None else fixed_without_force(SENSITIVITY, config, config.topic(IMU))
 
 
@@ -95,7 +95,7 @@ _SHOWN = 6.0
 
 
 def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
-    """LOS error measured and predicted, and their difference with and without the mounting angles."""
+    """Plots of LOS errors, measured and predicted, and their difference with and without the mounting angles."""
     config = calibration.config
     estimate = calibration.estimate
     values = calibration.problem.numbers(estimate)
@@ -117,7 +117,7 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
 
 
 def _predicted(data: LosData, gyro: GyroPath, time: Array, measured: Array, values: Mapping[str, float]) -> Array:
-    """phx, phz (n, 2) of one target's pictures as carried on from the first, rad."""
+    """LOS errors phx, phz (n, 2), rad, of one target's pictures, predicted from the first picture."""
     names = tuple(name for name in ANGLES if name in values)
     at = taken(data, time, values)
     cRm = camera(angles(data, at, values), np.array([values[name] for name in names]), names)
@@ -169,7 +169,7 @@ _NEIGHBOURS, _OUTLYING = 9, 8.0
 
 
 def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tuple[Validation, ...]:
-    """LOS error since each target was found, before and after compensation; once more without its steady drift.
+    """LOS error since each target's first picture, before and after compensation; again without steady drift.
 
     Args:
         data: the session.
@@ -201,7 +201,7 @@ def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tupl
 
 
 def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float]) -> Array:
-    """phx, phz (n, 2) of one target's pictures with the gimbal driven by compensated commands since the first."""
+    """LOS errors phx, phz (n, 2), rad, of one target if compensated commands had driven the gimbal."""
     t = data.image_t[chain]
     inside = (data.gyro_t > t[0]) & (data.gyro_t < t[-1])
     at = np.concatenate([t[:1], data.gyro_t[inside], t[-1:]])
@@ -226,14 +226,14 @@ def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float
 
 
 def _carrier_from_gyro(values: Mapping[str, float]) -> Array:
-    """M = Rz(dz) Rx(-gx) Ry(-gy), (4,)."""
+    """Mounting rotation M = Rz(dz) Rx(-gx) Ry(-gy), (4,), from gyro to carrier."""
     dz = values.get("delta_z", values.get("delta_pz", 0.0) - values.get("delta_gz", 0.0))
     gx, gy = values.get("delta_gx", 0.0), values.get("delta_gy", 0.0)
     return so3.compose(passive(2, dz), passive(0, -gx), passive(1, -gy))
 
 
 def _camera_attitude(gimbal: Array, px: float) -> Array:
-    """cRb = Rx(eps + px) Rz(eta), (n, 4)."""
+    """Camera attitude cRb = Rx(eps + px) Rz(eta), (n, 4)."""
     return so3.multiply(passive(0, gimbal[:, 1] + px), passive(2, gimbal[:, 0]))
 
 
@@ -249,7 +249,7 @@ def _near_neighbours(error: Array) -> NDArray[np.bool_]:
 
 
 def _without_drift(t: Array, error: Array) -> Array:
-    """Errors less the straight line fitted to them."""
+    """Subtract a fitted straight line from errors."""
     line = np.stack([np.ones_like(t), t - t.mean()], axis=1)
     return np.asarray(error - line @ np.linalg.lstsq(line, error)[0])
 
@@ -259,7 +259,7 @@ _BLOCK = 100_000
 
 
 def rates(data: LosData, values: Mapping[str, float]) -> Array:
-    """True rates (N, 3) at the gyro's samples, rad/s; errors whose cause was not measured stay in them."""
+    """Corrected rates (N, 3), rad/s, at the gyro's samples; errors with unmeasured causes remain."""
     warm = None if data.temperature is None or FIRST not in values else data.temperature.above(0.0, data.gyro_t)
     causes = {SENSITIVITY: data.force, GYRO_SLOPE: warm}
     unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
@@ -274,7 +274,7 @@ def rates(data: LosData, values: Mapping[str, float]) -> Array:
 
 
 def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:
-    """When pictures were taken (n,), s, no further than gyro and gimbal were recorded."""
+    """Exposure times (n,), s, of stamps, limited to the records of gyro and gimbal."""
     clock = Clock(float(data.image_t[0]), values.get("time_offset", 0.0), values.get("clock_skew", 0.0))
     delay = values.get("encoder_delay", 0.0)
     first = max(data.gyro_t[0], data.gimbal_t[0] + delay)
@@ -283,7 +283,7 @@ def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:
 
 
 def angles(data: LosData, at: Array, values: Mapping[str, float]) -> Array:
-    """Angles of azimuth and elevation (n, 2), rad, at true times."""
+    """Corrected azimuth and elevation (n, 2), rad, at true times."""
     read = GimbalPath(data.gimbal_t, data.gimbal).at(at - values.get("encoder_delay", 0.0))
     s, c = np.array([values.get(name, 0.0) for name in ONCE_PER_TURN.names]).reshape(2, 2).T
     return np.asarray(read - s * np.sin(read) - c * np.cos(read))

@@ -64,7 +64,7 @@ class LosNoise(ScenarioPart):
 
 
 class LosAngles(ScenarioPart):
-    """Mounting angles, deg: what the method is to find."""
+    """Mounting angles to be found by the method, deg."""
 
     delta_px: float = 0.5
     delta_pz: float = 0.25
@@ -74,7 +74,7 @@ class LosAngles(ScenarioPart):
 
 
 class Loss(ScenarioPart):
-    """A target lost over [start, end), after which the camera holds on to another one."""
+    """Loss of the target over [start, end), s, after which the camera tracks another target."""
 
     start_s: float
     end_s: float
@@ -139,7 +139,7 @@ class LosScenario(ScenarioPart):
 
     @property
     def gaps(self) -> list[Span]:
-        """[start, end) of all segments without pictures of the target, s."""
+        """Intervals [start, end), s, without pictures of the target."""
         return [*self.dropouts_s, *((loss.start_s, loss.end_s) for loss in self.losses)]
 
 
@@ -165,7 +165,7 @@ class LosMotion:
     effects: Mapping[str, float]
 
     def gimbal_at(self, t: Array) -> Array:
-        """Azimuth and elevation (n, 2), rad."""
+        """Azimuth and elevation (n, 2), rad, at times (n,), s."""
         return np.stack([np.interp(t, self.edges, self.gimbal[:, k]) for k in range(2)], axis=1)
 
     def covers(self, t: Array) -> NDArray[np.bool_]:
@@ -209,7 +209,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
 
 
 def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np.random.Generator) -> LosMotion:
-    """The carrier's sway as the gyro sees it, and what the stabilisation loop makes of that.
+    """Simulate the carrier's sway, the gyro samples, and the gimbal motion of the stabilisation loop.
 
     Errors of the sensors by name are all NUISANCE.
     """
@@ -236,12 +236,12 @@ def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    """Samples, so many at once that hours of them take little more memory than what is kept of them."""
+    """Yield slices of samples in blocks of bounded size, to bound memory."""
     return (slice(begin, min(begin + _BLOCK, count)) for begin in range(0, count, _BLOCK))
 
 
 def _in_gyro(scenario: LosScenario, t: Array, vector: Array) -> Array:
-    """A vector of n (3,) in m at times t (N,), (N, 3)."""
+    """Rotate a vector (3,) from n to m at times t (N,), s: (N, 3)."""
     nRm = so3.multiply(scenario.carrier.attitude(t), _gyro_mount(scenario))
     return so3.rotate(so3.inverse(nRm), vector)
 
@@ -253,7 +253,7 @@ def _shake(readings: Array, sigma: float, rng: np.random.Generator) -> None:
 
 
 def _encoders(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Stamps and readings (n, 2) of the encoders, rad; what would be read beyond the recording's ends is left out."""
+    """Stamps, s, and readings (n, 2), rad, of the encoders within the recording."""
     t = sample_times(scenario.duration_s, scenario.gimbal_rate_hz, scenario.gimbal_phase)
     at = t + motion.effects["encoder_delay"]
     t, at = t[motion.covers(at)], at[motion.covers(at)]
@@ -274,7 +274,7 @@ def carrier_attitude(scenario: LosScenario, t: Array) -> Array:
 
 
 def camera_attitude(scenario: LosScenario, gimbal: Array, effects: Mapping[str, float]) -> Array:
-    """bRc, shape (N, 4), at true gimbal angles (N, 2) and with the gimbal's and the camera's own errors, rad."""
+    """Camera attitude bRc (N, 4) at true gimbal angles (N, 2), rad, with errors of gimbal and camera, rad."""
     px, pz = np.deg2rad([scenario.angles_deg.delta_px, scenario.angles_deg.delta_pz])
     # Each passive matrix of cRb is Exp(a e)^T, so the inverse has them the other way round and active.
     return so3.compose(
@@ -298,7 +298,7 @@ def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulat
 
 
 def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
-    """The pictures behind the LOS errors of `simulate_los` with the same seed; drawn one by one as they are taken."""
+    """Render the pictures of `simulate_los` with the same seed, one by one."""
     rng = np.random.default_rng(seed)
     rng_of_sensors = np.random.default_rng([seed, 1])
     effects = true_values(NUISANCE, scenario, rng_of_sensors)
@@ -339,7 +339,7 @@ def _exposures(settings: LosCamera, K: Array, cRt: Array, rng: np.random.Generat
 
 
 def _texture(rng: np.random.Generator) -> Array:
-    """Grey levels (900, 1200) with detail at two scales."""
+    """Random grey levels (900, 1200) with detail at two scales."""
     import cv2
 
     fine, coarse = (cv2.GaussianBlur(rng.normal(size=(900, 1200)), (0, 0), s) for s in (3.0, 20.0))
@@ -347,7 +347,7 @@ def _texture(rng: np.random.Generator) -> Array:
 
 
 def los_config(scenario: LosScenario, images: bool = False) -> str:
-    """The recording's config (YAML): the noise that was simulated and the scenario's priors.
+    """Config (YAML) of the recording: the simulated noise and the scenario's priors.
 
     LOS errors from pictures bring their own covariance.
     """
@@ -358,7 +358,7 @@ def los_config(scenario: LosScenario, images: bool = False) -> str:
 
 
 def _slew(scenario: LosScenario, t: Array) -> Array:
-    """Rates (N, 2), rad/s, at which the gimbal is turned towards other targets while none is in sight."""
+    """Gimbal rates (N, 2), rad/s, towards the next target while none is in sight."""
     out = np.zeros((len(t), 2))
     for loss in scenario.losses:
         during = (t >= loss.start_s) & (t < loss.end_s)
@@ -368,7 +368,7 @@ def _slew(scenario: LosScenario, t: Array) -> Array:
 
 
 def _stabilise(scenario: LosScenario, t: Array, gyro: Array) -> Array:
-    """Gimbal angles (N + 1, 2) under the commanded rates, commands computed for the angles at mid-interval."""
+    """Gimbal angles (N + 1, 2), rad, under the commanded rates, computed for the angles at mid-interval."""
     dt = 1.0 / scenario.gyro_rate_hz
     angles = np.empty((len(t) + 1, 2))
     angles[0] = np.deg2rad([scenario.azimuth_deg, scenario.elevation_deg])
@@ -388,14 +388,14 @@ def _stabilise(scenario: LosScenario, t: Array, gyro: Array) -> Array:
 
 
 def _command(wx: float, wy: float, wz: float, azimuth: float, elevation: float) -> tuple[float, float]:
-    """Azimuth and elevation rates of CN102288133B."""
+    """Azimuth and elevation rate commands, rad/s, by CN102288133B."""
     s, c = sin(azimuth), cos(azimuth)
     se, ce = sin(elevation), cos(elevation)
     return (-se * s * wx + se * c * wy - ce * wz) / ce, -c * wx - s * wy
 
 
 def targets(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Stamps (K,) of the pictures that show a target, and its attitudes cRt (K, 4): y towards it, z its up."""
+    """Stamps (K,), s, of pictures that show a target, and target attitudes cRt (K, 4): y towards it, z up."""
     stamps = sample_times(scenario.duration_s, scenario.image_rate_hz, scenario.image_phase)
     seen = np.ones(len(stamps), dtype=bool)
     for start, end in scenario.gaps:
@@ -420,7 +420,7 @@ def targets(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) 
 
 
 def picture_of(cRt: Array) -> Array:
-    """phx, phz and roll (K, 3), rad, of a target whose y axis points away from the camera and whose z is its up.
+    """LOS errors and roll phx, phz, roll (K, 3), rad, of a target at cRt with y away from the camera and z up.
 
     The roll is minus the turn of the similarity that best fits the pinhole picture of a small patch of the target.
     """
@@ -435,19 +435,19 @@ def picture_of(cRt: Array) -> Array:
 
 
 def _gyro_mount(scenario: LosScenario) -> Array:
-    """bRm: w_m = Ry(gy) Rx(gx) Rz(gz) w_b."""
+    """Gyro mounting bRm (4,), with w_m = Ry(gy) Rx(gx) Rz(gz) w_b."""
     angles = scenario.angles_deg
     gx, gy, gz = np.deg2rad([angles.delta_gx, angles.delta_gy, angles.delta_gz])
     return so3.compose(_about(2, gz), _about(0, gx), _about(1, gy))
 
 
 def _about(axis: int, angle: Array | float) -> Array:
-    """Exp(angle * e_axis)."""
+    """Rotation Exp(angle * e_axis), (..., 4)."""
     return so3.exp(np.asarray(angle, dtype=float)[..., None] * np.eye(3)[axis])
 
 
 def _earth(scenario: LosScenario, t: Array) -> Array:
-    """Mean of the earth's rate (3,) in m, rad/s."""
+    """Mean earth rate (3,) in m, rad/s."""
     rate, total = earth_rate(np.deg2rad(scenario.latitude_deg or 0.0)), np.zeros(3)
     for some in _blocks(len(t)):
         total += _in_gyro(scenario, t[some], rate).sum(axis=0)

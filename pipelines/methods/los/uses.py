@@ -23,7 +23,7 @@ _FORCE = np.array([[0.0, 0.0, G]])
 
 
 def uses(_true: Truth, _config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
-    """Pointing over azimuth and elevation, and the LOS rate that stabilisation leaves."""
+    """Uses of a los calibration: pointing over azimuth and elevation, and residual LOS rate under stabilisation."""
     pointing = Use(
         "pointing",
         "Line of sight against the IMU",
@@ -54,13 +54,13 @@ def uses(_true: Truth, _config: Config, _noise: Mapping[str, float]) -> Sequence
 
 
 def _imu_to_carrier(true: Truth) -> Array:
-    """M, (..., 4)."""
+    """Mounting rotation M (..., 4) from IMU to carrier."""
     z = true.get("delta_z") if "delta_z" in true else true.get("delta_pz") - true.get("delta_gz")
     return so3.compose(passive(2, z), passive(0, -true.get("delta_gx")), passive(1, -true.get("delta_gy")))
 
 
 def _camera(true: Truth, azimuth: Array, elevation: Array) -> Array:
-    """cRm, (..., U, 4), at readings of the encoders (U,)."""
+    """Camera attitude cRm (..., U, 4) at encoder readings (U,), rad."""
     one = {name: true.get(name)[..., None] for name in (*ONCE_PER_TURN.names, *_TURNS)}
     angles = []
     for reading, (sine, cosine) in ((azimuth, ONCE_PER_TURN.names[:2]), (elevation, ONCE_PER_TURN.names[2:])):

@@ -44,7 +44,7 @@ class _Graph:
 
 
 def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variable, ...]) -> Problem:
-    """The graph with the gyro that the model says how it is mounted."""
+    """Build the graph of a recording with a gyro, whose mounting the model's first guess gives."""
     assert model.guess is not None
     assert model.dip is not None
     sensors = {sensor.name: sensor for sensor in model.sensors}
@@ -75,7 +75,7 @@ def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variab
 
 
 def _level(sensor: Sensor, guess: FieldGuess) -> Level:
-    """A noise to begin with: that of the first guess for a magnetometer whose noise nobody states."""
+    """Initial noise level: that of the first guess for a magnetometer without a stated noise."""
     if sensor.name != "mag" or sensor.noise.source != "default" or sensor.noise.known == 0.0:
         return Level(sensor.noise)
     return Level(sensor.noise, max(1.0, guess.sigma / float(np.median(sensor.sigma))))
@@ -87,7 +87,7 @@ def _seen(sensor: Sensor, whole: Array | None) -> Seen:
 
 
 def _steps(graph: _Graph, chunk: int) -> Iterator[Step]:
-    """The first keyframe with all that measurements share and its priors, then `chunk` keyframes at a time."""
+    """Yield the first keyframe with all shared variables and their priors, then `chunk` keyframes at a time."""
     count = len(graph.turning.chain.time)
     yield _step(graph, range(1))
     for begin in range(1, count, chunk):
@@ -166,7 +166,7 @@ def _earth_key(turned: Turning) -> list[int]:
 
 
 def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array, Array, Array, Array]:
-    """Stamps, times of the keyframes, readings and their sigmas without unit, and s since the first keyframe."""
+    """Stamps, s, keyframe times, s, normalised readings and sigmas, and s since the first keyframe."""
     time = sensor.time[seen.row]
     return (
         time,
@@ -178,7 +178,7 @@ def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array
 
 
 def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
-    """nRb, n along the field."""
+    """Attitudes nRb at keyframes; n is level, with y along the horizontal field."""
     chain, rows = graph.turning.chain, list(keyframes)
     aRb = so3.from_gtsam([values.atRot3(chain.state(k)) for k in rows])
     time = chain.time[rows]

@@ -63,7 +63,7 @@ def _sphere_numbers(centre: Array) -> Array:
 
 
 def _centres(raw: Array, centre: Array, radius: float, strength: float | None) -> list[Array]:
-    """Centres of spheres near the readings: the nearest; of a known radius, both through their ring, and zero."""
+    """Candidate centres of a sphere: the fitted one, two of known radius through the readings' ring, and zero."""
     if strength is None:
         return [centre]
     spread = raw - raw.mean(axis=0)
@@ -73,7 +73,7 @@ def _centres(raw: Array, centre: Array, radius: float, strength: float | None) -
 
 
 def _inliers_ellipsoid(raw: Array) -> Ellipsoid | None:
-    """The algebraic ellipsoid through the readings that are near it."""
+    """Fit an algebraic ellipsoid robustly, by repeated rejection of distant readings."""
     kept, last = np.ones(len(raw), dtype=bool), None
     for _ in range(_ROUNDS):
         found = ellipsoid(raw[kept])
@@ -89,7 +89,7 @@ def _inliers_ellipsoid(raw: Array) -> Ellipsoid | None:
 
 
 def _sphere(raw: Array) -> tuple[Array, float]:
-    """Centre and radius of the sphere through readings (n, 3), the nearest to their mean where there are many."""
+    """Centre and radius of the sphere fitted to readings (n, 3); the minimum-norm solution if not unique."""
     origin, unit = raw.mean(axis=0), max(float(raw.std()), np.finfo(float).tiny)
     scaled = (raw - origin) / unit
     design = np.column_stack([2.0 * scaled, np.ones(len(raw))])

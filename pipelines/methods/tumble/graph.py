@@ -75,13 +75,13 @@ def problem(data: TumbleData, config: Config) -> Problem:
 
 
 def _constants(data: TumbleData, model: Model) -> dict[str, float]:
-    """The first temperature and, for the heading of a magnetometer alone, the dip of the field's model, rad."""
+    """Formula constants: first temperature and, for heading by a magnetometer alone, the model's dip, rad."""
     dip = {} if model.dip is not None or model.modelled_dip is None else {"field_dip": model.modelled_dip}
     return temperature.constants(temperature.reference(data.temperature)) | dip
 
 
 def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[Step]:
-    """A step for each interval of time; the first contains the variables and their priors too."""
+    """Yield a step for each interval of time; the first one adds the variables and their priors."""
     loss = TruncatedLoss(gate(1))
     times = [each.time for each in (*model.sensors, model.moments) if each is not None]
     start, stop = min(t[0] for t in times), max(t[-1] for t in times)
@@ -105,7 +105,7 @@ def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[St
 
 
 def _mirrored(model: Model, values: gtsam.Values) -> Iterator[gtsam.Values]:
-    """The same lengths and dips, of a body seen in mirrors across the axes of the K that is symmetric, or is to be.
+    """Yield mirrored solutions with the same lengths and dips, reflected across the axes of the symmetric K.
 
     Lengths and angles stay under any rotation or mirror Q of all nominal vectors, and Q K is symmetric for these alone.
     """

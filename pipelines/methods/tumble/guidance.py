@@ -40,7 +40,7 @@ def checklist(data: TumbleData, config: Config) -> Sequence[ChecklistItem]:
 
 
 def _picture(sensor: str, where: Array) -> str:
-    """Of the device with a direction (3,) in it along the field, or up."""
+    """Drawing of the device with a body direction (3,) along the field, or upwards."""
     if sensor == "mag":
         return along(where, "field")
     axis = np.cross(where, [0.0, 0.0, 1.0])
@@ -55,7 +55,7 @@ _REST = 1.5
 
 
 def variations(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """Changes of a planned motion that may determine more: in words, and the changed scenario."""
+    """Planned motions, in words, that may determine more, with the changed scenario."""
     yield "twice as many attitudes", {**scenario, "attitudes": 2 * scenario["attitudes"]}
     if scenario["tilt_deg"] < 180.0:
         yield "turned upside down too", {**scenario, "tilt_deg": 180.0}

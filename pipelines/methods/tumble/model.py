@@ -138,12 +138,12 @@ class Sensor:
 
     @property
     def scaled(self) -> Array:
-        """Raw readings (n, 3) over their radius, without unit."""
+        """Raw readings (n, 3) divided by their radius, dimensionless."""
         return self.raw / self.radius
 
     @property
     def scales(self) -> Array:
-        """Factors on the variable's numbers when they are reported."""
+        """Scale factors from the normalised variable to the reported numbers."""
         gains = len(self.start) - 3
         return np.repeat([self.strength / self.radius, self.strength], [gains, 3])
 
@@ -160,7 +160,7 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Dip:
-    """The field's inclination: first guess, rad, and by the field model, rad, with how well that is known, or None.
+    """Inclination of the field, rad: first guess, and field model with sigma or None.
 
     A magnetometer alone has none: the level frame is defined by the field, with sigma 0.
     """
@@ -214,7 +214,7 @@ class Model:
 
 
 def prepare(data: TumbleData, config: Config) -> Model:
-    """Raises InputError when there are too few samples or rests, or the date does not do for the field model."""
+    """Prepare a recording. Raises InputError with too few samples or rests, or a date outside the field model."""
     premises: list[str] = []
     field = None
     if data.mag is not None and data.latitude is not None and data.longitude is not None:
@@ -270,7 +270,7 @@ def prepare(data: TumbleData, config: Config) -> Model:
 
 
 def _maybe_a_unit(sensor: Sensor) -> str:
-    """Note on readings that count as counts, but whose size is that of a unit; empty on others."""
+    """Note on readings treated as counts whose magnitude suggests a unit; empty for others."""
     size = float(np.median(np.linalg.norm(sensor.raw, axis=1)))
     unit, kind = likely_unit(sensor.name, size), {"accel": "accel", "mag": "field"}[sensor.name]
     if not unit or "counts" in unit:
@@ -282,13 +282,13 @@ def _maybe_a_unit(sensor: Sensor) -> str:
 
 
 def _modelled(config: Config, field: Array) -> tuple[float, float]:
-    """The dip of the field (3,) and its sigma, rad."""
+    """Dip of the modelled field (3,) and its sigma, rad."""
     strength = float(np.linalg.norm(field))
     return float(np.arcsin(-field[2] / strength)), sheet(config, FIELD) / strength
 
 
 def _is_upright(data: TumbleData, rests: Array | None) -> bool:
-    """Whether an accelerometer's readings, its motion among them where it never rests, leave K at its prior."""
+    """Whether an accelerometer's readings cover so few attitudes that K stays at its prior."""
     assert data.accel is not None
     assert data.accel_t is not None
     raw = _means(data.accel_t, data.accel, rests)[1]
@@ -318,7 +318,7 @@ def _about_one_axis(mag: Sensor) -> list[str]:
 
 
 def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, list[str]]:
-    """The magnetometer in the gyro's axes, and why the gyro is not used though it is there, or what it assumes."""
+    """Magnetometer guess in the gyro's axes, with notes: assumptions, or why the gyro is not used."""
     if any(reason.endswith(NO_RATE) for reason in data.dropped):
         return None, ["The gyro is not used: it reads more than rad/s can be; is it in deg/s, or in counts?"]
     if data.gyro is None or data.gyro_t is None or data.mag is None:
@@ -336,7 +336,7 @@ def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, l
 def _chained(
     sensors: list[Sensor], gyro: FieldGuess, model: tuple[float, float] | None
 ) -> tuple[list[Sensor], Dip, FieldGuess, list[str]]:
-    """Sensors in the gyro's axes, and the dip."""
+    """Sensors, dip and first guess in the gyro's axes, with notes."""
     *beside, mag = sensors
     beside = [replace(each, symmetric=False, start=each.start @ entries(True).T) for each in map(_of_hand, beside)]
     sine, premises, found = 0.0, [], _of_guess(mag, gyro)
@@ -364,7 +364,7 @@ def _chained(
 
 
 def _of_guess(mag: Sensor, guess: FieldGuess) -> Sensor:
-    """The magnetometer with a guess for its start, whose K has a determinant of one without unit."""
+    """Start a magnetometer at a first guess, with its radius set so that normalised K has determinant 1."""
     radius = float(np.abs(np.linalg.det(guess.K))) ** (-1.0 / 3.0)
     scale = mag.radius / radius
     start = np.append(radius * guess.K, guess.b)
@@ -381,7 +381,7 @@ def _of_guess(mag: Sensor, guess: FieldGuess) -> Sensor:
 
 
 def _of_hand(accel: Sensor) -> Sensor:
-    """An accelerometer used in motion: the noise of the hand's motion is estimated from the residuals."""
+    """Give an accelerometer without rests the noise of hand motion, to be estimated from residuals."""
     if accel.rested or accel.noise.known == 0.0:
         return accel
     return replace(accel, noise=replace(accel.noise, name="accel_motion", source="default", known=_HARDLY))
@@ -401,12 +401,12 @@ def _is_mounted_straight(rotation: Array) -> bool:
 
 
 def _inverted(accel: Sensor) -> Sensor:
-    """An accelerometer whose readings all have the opposite sign."""
+    """Invert the sign of all of an accelerometer's readings."""
     return replace(accel, start=-accel.start, turned=-accel.turned)
 
 
 def _turned(sensor: Sensor, rotation: Array) -> Sensor:
-    """A sensor whose start is symmetric, turned by an orthogonal matrix."""
+    """Rotate a sensor with a symmetric initial K by an orthogonal matrix."""
     numbers = sensor.start @ entries(sensor.symmetric).T
     K = rotation @ numbers[:9].reshape(3, 3)
     start = np.concatenate([K.ravel(), rotation @ numbers[9:]])
@@ -414,7 +414,7 @@ def _turned(sensor: Sensor, rotation: Array) -> Sensor:
 
 
 def _rests(data: TumbleData, config: Config) -> Array | None:
-    """Beginnings and ends (P, 2), s, of when all sensors were quiet; None where what lies between tells more."""
+    """Start and end (P, 2), s, of intervals with all sensors at rest; None if motion is more informative."""
     assert data.accel is not None
     assert data.accel_t is not None
     t = data.accel_t
@@ -438,12 +438,12 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
 
 
 def _scatter_within(t: Array, accel: Array, rests: Array) -> float:
-    """Median over rests of what an accelerometer scatters by within each, over gravity: a slow turn is no rest."""
+    """Median over rests of an accelerometer's scatter over gravity, which reveals slow rotations."""
     return float(np.median([relative_scatter(accel[first:last]) for first, last in np.searchsorted(t, rests)]))
 
 
 def _at(time: Array, stamps: Array, values: Array) -> Array:
-    """Vectors (n, 3) at the times, linear between their stamps."""
+    """Interpolate vectors (n, 3) linearly between their stamps, to given times."""
     return np.stack([np.interp(time, stamps, axis) for axis in values.T], axis=1)
 
 
@@ -480,7 +480,7 @@ def _sensor(
     config: Config,
     known: tuple[float, float, str],
 ) -> Sensor:
-    """A triad whose K is symmetric.
+    """Build a triad with symmetric K.
 
     Args:
         name: accel or mag.
@@ -532,7 +532,7 @@ def _sensor(
 
 
 def _scatter_at_rest(t: Array, raw: Array, rests: Array, centre: Array) -> float:
-    """Density, per sqrt(Hz), of what lengths scatter by within rests; 0 where that is not seen.
+    """Noise density, per sqrt(Hz), of vector lengths within rests; 0 where undetermined.
 
     Few rests determine the ellipsoid with hardly a residual, whose size says nothing of their noise.
     """
@@ -550,7 +550,7 @@ def _scatter_at_rest(t: Array, raw: Array, rests: Array, centre: Array) -> float
 
 
 def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float, at_rest: float) -> Noise:
-    """What is stated, in the unit recorded; by nobody, what rests show; of counts without any, what was seen."""
+    """Stated noise in the recorded unit; without a statement that at rest, for counts else that of the residuals."""
     family = {"accel": "accelerometer", "mag": "magnetometer"}[name]
     if is_si:
         noise = stated(f"{name}_density", config, message, (family,))
@@ -565,7 +565,7 @@ def _is_si(name: str, raw: Array) -> bool:
 
 
 def _means(t: Array, values: Array, rests: Array | None) -> tuple[Array, Array, Array]:
-    """Times, means over the rests and numbers of samples in each, empty ones left out; of no rests, all samples."""
+    """Times, means over the rests and sample counts, without empty rests; without rests, all samples."""
     if rests is None:
         return t, values, np.ones(len(t))
     first, last = np.searchsorted(t, rests[:, 0]), np.searchsorted(t, rests[:, 1], side="right")
@@ -582,7 +582,7 @@ def _together(
     rests: Array | None,
     model: tuple[float, float] | None,
 ) -> tuple[list[Sensor], Dip, Moments | None, list[str]]:
-    """Accelerometer, magnetometer turned into its axes, and the angles between what they measured."""
+    """Combine accelerometer and magnetometer: both in one frame, with the angles between their vectors."""
     assert data.mag_t is not None
     assert data.mag is not None
     rows, time, readings, number = _beside(data.mag_t, data.mag, accel.time, rests)
@@ -614,7 +614,7 @@ def _together(
 
 
 def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:
-    """Which of the accelerometer's readings have the magnetometer beside them; times, its readings, their samples."""
+    """Accelerometer rows with simultaneous magnetometer data; times, readings and sample counts of the latter."""
     if rests is not None:
         first, last = np.searchsorted(t, rests[:, 0]), np.searchsorted(t, rests[:, 1], side="right")
         rows = np.flatnonzero(last > first)
@@ -648,7 +648,7 @@ def _mounting(up: Array, field: Array) -> tuple[Array, float, bool]:
 
 
 def nearest_axes(rotation: Array) -> Array:
-    """The signed permutation of axes nearest to an orthogonal matrix: how a sensor is meant to be mounted."""
+    """Signed permutation of axes nearest to an orthogonal matrix: the nominal mounting of a sensor."""
     mounted = np.zeros((3, 3))
     left = np.abs(rotation).copy()
     for _ in range(3):

@@ -51,7 +51,7 @@ class Variable:
 
 
 def variables(model: Model, config: Config) -> tuple[Variable, ...]:
-    """Triads, strengths, dip and what drives an offset, in reporting order; a gyro's are `turning.parameters`.
+    """Variables of triads, strengths, dip and offset drivers in reporting order; gyro ones in `turning.parameters`.
 
     Raises InputError when the config names no such parameter.
     """
@@ -103,7 +103,7 @@ def _gain_unit(sensor: Sensor) -> str:
 
 
 def _strength(sensor: Sensor, config: Config) -> Variable:
-    """Strength of the measured vector: no motion separates it from the scale, whose sigma contains it."""
+    """Variable of the measured vector's strength, which no motion separates from the sensor's scale."""
     name, usual = STRENGTHS[sensor.name], sensor.spread or _ANY_STRENGTH * sensor.strength
     quantity = Quantity(
         name,
@@ -125,7 +125,7 @@ def _variable(key: int, quantities: tuple[Quantity, ...], scales: Array, start: 
 
 
 def _scaled(scales: Array, values: gtsam.Values, key: int) -> tuple[Array, Array]:
-    """The reported numbers of a variable, which has no unit, and their Jacobian."""
+    """Reported numbers of a dimensionless variable, and their Jacobian."""
     return scales * np.asarray(values.atVector(key), dtype=float), np.diag(scales)
 
 

@@ -50,7 +50,7 @@ class Ellipsoid:
 
 
 def ellipsoid(raw: Array) -> Ellipsoid | None:
-    """Through readings (n, 3); None where the quadric that fits best is no ellipsoid."""
+    """Fit an ellipsoid to readings (n, 3) by least squares; None where the best quadric is no ellipsoid."""
     origin, unit = raw.mean(axis=0), max(float(raw.std()), np.finfo(float).tiny)
     x, y, z = ((raw - origin) / unit).T
     design = np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z, 2 * x, 2 * y, 2 * z], axis=1)
@@ -64,7 +64,7 @@ def ellipsoid(raw: Array) -> Ellipsoid | None:
 
 
 def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Estimate:
-    """K and b of each sensor by itself; of a magnetometer beside an accelerometer turned as the graph's first guess.
+    """Estimate K and b of each sensor alone by an ellipsoid fit; a magnetometer is rotated as in the first guess.
 
     Raises InputError where the best quadric is no ellipsoid.
     """
@@ -101,7 +101,7 @@ def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Es
 
 
 def _numbers(sensor: Sensor, coefficients: Array, found: Ellipsoid) -> Array:
-    """K and b of a sensor, as it is reported, of a quadric near the best."""
+    """Reported K and b of a sensor, for quadric coefficients near the best."""
     shape = _shape(coefficients, found.origin, found.unit)
     assert shape is not None
     S, centre = shape
@@ -111,7 +111,7 @@ def _numbers(sensor: Sensor, coefficients: Array, found: Ellipsoid) -> Array:
 
 
 def _shape(coefficients: Array, origin: Array, unit: float) -> tuple[Array, Array] | None:
-    """S and centre of a quadric, None if it is no ellipsoid."""
+    """Matrix S and centre of a quadric; None if the quadric is no ellipsoid."""
     xx, xy, xz, yy, yz, zz = coefficients[:6]
     Q, u = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), coefficients[6:]
     if np.linalg.cond(Q) > 1e8:

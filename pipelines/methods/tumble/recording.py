@@ -125,7 +125,7 @@ def _check_gravity(topic: str, accel: Array) -> None:
 
 
 def _gyro(reader: StreamReader, topic: str, imu: series.ImuSeries) -> Samples[series.ImuSeries] | None:
-    """The gyro beside a magnetometer; None where there is none, or one that is not in rad/s.
+    """Read the gyro beside a magnetometer; None if missing or not in rad/s.
 
     Raises InputError where an axis is dead beside others, or a fifth of the samples is lost.
     """

@@ -63,13 +63,13 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
 
 
 def _less_square(formula: Formula, parameters: Collection[str]) -> Formula:
-    """Formula of the accelerometer's reading f_read, m/s^2 by axis, less its square term."""
+    """Formula of the accelerometer's reading f_read, m/s^2, minus its square term, axis by axis."""
     square = vector_text(ACCEL_SQUARE.names, parameters)
     return replace(formula, expression=f"f_read - {square} * f_read**2", inputs=("accel",))
 
 
 def _less_drift(formula: Formula, parameters: Collection[str]) -> Formula:
-    """The accelerometer's formula without the drift of b along the body's axes, where its slopes are known."""
+    """Subtract the temperature drift of b from the accelerometer's formula, where the slopes are parameters."""
     if not any(name in parameters for name in ACCEL_SLOPE.names):
         return formula
     return replace(
@@ -113,7 +113,7 @@ def directions(sensor: Sensor, values: Mapping[str, float]) -> Array:
 
 
 def _parts(sensor: Sensor, estimate: Estimate, values: Mapping[str, float]) -> dict[str, object] | None:
-    """K taken apart, of a sensor whose scale is against a nominal one."""
+    """Scales, nonorthogonalities and mounting of K, for a sensor with a nominal scale; else None."""
     if not sensor.is_si or sensor.unit == "1":
         return None
     names = triad_names(sensor.name, sensor.symmetric)[:-3]
@@ -125,7 +125,7 @@ def _parts(sensor: Sensor, estimate: Estimate, values: Mapping[str, float]) -> d
 
 
 def _nine(sensor: Sensor) -> list[str]:
-    """The parameter in each of the nine places of K."""
+    """Parameter names of the nine entries of K, by rows."""
     known = triad_names(sensor.name, sensor.symmetric)
     return [name for row in gain_names(sensor.name, known) for name in row]
 
@@ -156,7 +156,7 @@ def _offset(sensor: Sensor, estimate: Estimate, values: Mapping[str, float]) -> 
 
 
 def _stretch(sensor: Sensor, values: Mapping[str, float]) -> dict[str, object]:
-    """From the singular values of K^-1, relative to their geometric mean, and their directions in the body."""
+    """Findings row of a sensor's soft iron or scale: relative singular values of K^-1 with body directions."""
     K = triad_of(sensor.name, values)[0]
     _, sizes, axes = np.linalg.svd(np.linalg.inv(K))
     relative = sizes / np.cbrt(sizes.prod()) - 1.0
@@ -225,7 +225,7 @@ def _lengths(sensor: Sensor, values: Mapping[str, float]) -> Plot:
 
 
 def _sphere(sensor: Sensor, values: Mapping[str, float]) -> Plot:
-    """Readings in two views, as recorded about their own centre, and calibrated."""
+    """Plot the readings in two views: as recorded about their own centre, and calibrated."""
     K, b = triad_of(sensor.name, values)
     clouds = (sensor.raw / sensor.radius, (sensor.raw @ K.T + b) / sensor.strength)
     some = thin(3 * len(sensor.raw))
@@ -260,7 +260,7 @@ _STRENGTH_OF = {"accel": "specific force at rest, its strength", "mag": "magneti
 
 
 def validate(data: TumbleData, config: Config, values: Mapping[str, float]) -> list[Validation]:
-    """Lengths less the strength calibrated against; before compensation scaled to that strength on average.
+    """Vector lengths minus the calibration strength; before compensation scaled to that strength on average.
 
     Raises InputError when the calibration has none of the recording's sensors.
     """

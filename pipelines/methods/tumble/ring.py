@@ -16,7 +16,7 @@ _PARTS = 10
 
 @dataclass(frozen=True, eq=False)
 class Ring:
-    """The ellipse of readings about one axis.
+    """Ellipse through the readings of a rotation about one axis.
 
     Attributes:
         axis: (3,) unit vector along it, in the sensor's axes.
@@ -32,7 +32,7 @@ class Ring:
 
 
 def ring(raw: Array) -> Ring | None:
-    """The ring that readings (n, 3), in time order, lie on; None where they leave its plane, or no ellipse fits."""
+    """Fit the ring of readings (n, 3) in time order; None if they are not planar or no ellipse fits."""
     middle = raw.mean(axis=0)
     sizes, axes = np.linalg.svd(raw - middle, full_matrices=False)[1:]
     if sizes[2] > _FLAT * sizes[1]:

@@ -89,7 +89,7 @@ def simulated(scenario: TumbleScenario, seed: int, _images: bool = False) -> Sim
 
 
 def _level_frame(field: Array, earth: Array | None, alone: bool) -> dict[str, float]:
-    """Dip and the earth's rate where it is estimated; a magnetometer alone defines y by the field, and nothing x."""
+    """True dip, rad, and estimated earth rate, rad/s; for a magnetometer alone, y is along the field."""
     unit = field / np.linalg.norm(field)
     if alone and earth is not None:
         return {"field_dip": 0.0, "earth_rate_y": float(earth @ unit)}
@@ -98,7 +98,7 @@ def _level_frame(field: Array, earth: Array | None, alone: bool) -> dict[str, fl
 
 
 def _slopes(scenario: TumbleScenario, rng: np.random.Generator) -> dict[str, float]:
-    """Of the offsets of gyro and accelerometer over their temperature, where there is one."""
+    """Draw temperature slopes of the offsets of gyro and accelerometer, if temperature is simulated."""
     sensors = {"gyro": scenario.gyro, "accel": scenario.accelerometer}
     there = {name: sensor for name, sensor in sensors.items() if sensor is not None and scenario.temperature}
     return {
@@ -126,7 +126,7 @@ class _Motion:
         self.duration = float(self.starts[-1] + self.lasting[-1] + scenario.rest_s)
 
     def attitude(self, t: Array) -> Array:
-        """nRb (n, 4) at the times t (n,), s."""
+        """Attitudes nRb (n, 4) at times t (n,), s."""
         k = np.clip(np.searchsorted(self.starts, t, side="right") - 1, 0, len(self.starts) - 1)
         s = np.clip((t - self.starts[k]) / self.lasting[k], 0.0, 1.0)
         # Velocity and acceleration are zero at both ends.
@@ -199,7 +199,7 @@ def _force(motion: _Motion, sensor: TumbledAccelerometer, g: float, t: Array) ->
 
 
 def _read(nominal: Array, K: Array, b: Array, density: float, rate_hz: float, rng: np.random.Generator) -> Array:
-    """What a sensor with nominal = K raw + b says, with white noise."""
+    """Readings (n, 3) with white noise of a sensor with nominal = K raw + b."""
     exact = (nominal - b) @ np.linalg.inv(K).T
     return np.asarray(exact + density * np.sqrt(rate_hz) * rng.standard_normal(nominal.shape))
 

@@ -86,28 +86,28 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Readings: row (n,) of each, and keyframe (n,) that is nearest to it, in time order."""
+    """Indices of readings (n,) and of their nearest keyframes (n,), in time order."""
 
     row: Index
     keyframe: Index
 
     @classmethod
     def near(cls, time: Array, stamps: Array, rows: Index) -> Rows:
-        """The rows that a keyframe is near."""
+        """Select the rows close in time to a keyframe."""
         after = np.clip(np.searchsorted(time, stamps[rows]), 1, len(time) - 1)
         nearest = np.where(stamps[rows] - time[after - 1] < time[after] - stamps[rows], after - 1, after)
         close = np.abs(time[nearest] - stamps[rows]) <= _APART
         return cls(rows[close], nearest[close])
 
     def of(self, keyframes: range) -> Rows:
-        """The rows of some keyframes."""
+        """Select the rows of some keyframes."""
         chosen = slice(*np.searchsorted(self.keyframe, [keyframes.start, keyframes.stop]))
         return Rows(self.row[chosen], self.keyframe[chosen])
 
 
 @dataclass(frozen=True, eq=False)
 class FieldGuess:
-    """First guess: unit field in b = K raw + b, K (3, 3) and b (3,), and the gyro's bias (3,), rad/s.
+    """First guess by field and gyro: K (3, 3), b (3,) of a unit field K raw + b, gyro bias (3,), rad/s.
 
     sigma: noise of K raw per axis, robust, that of the gyro over the windows included.
     assumed: whether the motion leaves several K, of which this is that of a magnetometer mounted straight.
@@ -121,13 +121,13 @@ class FieldGuess:
 
     @property
     def mount(self) -> Array:
-        """Rotation (3, 3) of K's polar decomposition, a mirror where K is left-handed."""
+        """Orthogonal factor (3, 3) of K's polar decomposition, a reflection where K is left-handed."""
         u, _, vt = np.linalg.svd(self.K)
         return np.asarray(u @ vt)
 
     @property
     def mirrored(self) -> FieldGuess:
-        """The other solution: the opposite field, of a magnetometer with left-handed axes."""
+        """Mirrored solution: opposite field, for a magnetometer with left-handed axes."""
         return replace(self, K=-self.K, b=-self.b)
 
 
@@ -169,15 +169,15 @@ class Turning:
 
     @property
     def errors(self) -> int:
-        """Number of the gyro's errors."""
+        """Number of parameters of the gyro's errors."""
         return 0 if self.chain.errors is None else len(self.chain.errors.quantities)
 
     def elapsed(self, time: Array) -> Array:
-        """Times (n,) as s since the first keyframe, where the frames a (inertial) and n (level) coincide."""
+        """Convert times (n,) to s since the first keyframe, where the frames a (inertial) and n (level) coincide."""
         return np.asarray(time - self.chain.time[0])
 
     def aRn(self, time: Array, values: gtsam.Values) -> Array:
-        """Rotations aRn (n, 4) of the earth since the first keyframe, by its rate as known or as estimated."""
+        """Earth rotations aRn (n, 4) since the first keyframe, by the known or estimated earth rate."""
         earth = self.earth
         if earth is None:
             assert self.earth_rate is not None
@@ -186,7 +186,7 @@ class Turning:
 
 
 def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
-    """Magnetometer against gyro without knowing the ellipsoid: K, b and the gyro's bias by linear least squares.
+    """Solve K, b and the gyro's bias from magnetometer and gyro by linear least squares, without ellipsoid.
 
     The field stays while the device turns by dR from time i to time j: K raw_i + b = dR (K raw_j + b), linear and
     homogeneous in K and b. b is eliminated; K is the smallest right singular vector of the rest, which is total least
@@ -207,7 +207,7 @@ def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
 
 
 def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple[float, FieldGuess] | None:
-    """A guess from pairs of readings a span (s) apart, and how clearly others fit worse, see `_homogeneous`."""
+    """First guess from pairs of readings `span` s apart, and the misfit ratio of the next solution."""
     assert data.gyro_t is not None
     assert data.gyro is not None
     first, last = _pairs(time, span, data.gyro_t)
@@ -233,7 +233,7 @@ def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple
 
 
 def _pairs(time: Array, span: float, gyro: Array) -> tuple[Index, Index]:
-    """Readings about a span (s) apart, both within the gyro's record and without a gap between them."""
+    """Indices of reading pairs about `span` s apart, within the gyro's record and without gaps between."""
     inside, interval = _inside(time, gyro), float(np.median(np.diff(time)))
     stride = max(1, round(span / max(interval, 1e-3)))
     first, last = inside[:-stride], inside[stride:]
@@ -242,7 +242,7 @@ def _pairs(time: Array, span: float, gyro: Array) -> tuple[Index, Index]:
 
 
 def _homogeneous(R: Array, before: Array, after: Array, alike: float) -> tuple[Array, Array, bool, float]:
-    """K (3, 3) of unit norm and b (3,) with K before + b = R (K after + b).
+    """Solve K before + b = R (K after + b) for K (3, 3) of unit norm and b (3,).
 
     Of several K whose misfits are less than `alike` times the smallest it is that of a magnetometer mounted straight.
 
@@ -260,7 +260,7 @@ def _homogeneous(R: Array, before: Array, after: Array, alike: float) -> tuple[A
 
 
 def _mounted_straight(axes: Array) -> Array:
-    """K (9,) of the span of axes (9, k), orthonormal, that is nearest to axes named alike or permuted."""
+    """K (9,) in the span of orthonormal axes (9, k), nearest to identical or permuted axes."""
     ways = _right_angles().reshape(-1, 9)
     parts = ways @ axes
     share = np.square(parts).sum(axis=1) / 3.0
@@ -270,7 +270,7 @@ def _mounted_straight(axes: Array) -> Array:
 
 @cache
 def _right_angles() -> Array:
-    """The rotations (24, 3, 3) that take axes to axes, the identity first."""
+    """Rotations (24, 3, 3) that permute the axes, the identity first."""
     signed = (np.eye(3)[list(order)] * np.array(signs) for order in permutations(range(3)) for signs in _SIGNS)
     return np.array([each for each in signed if np.linalg.det(each) > 0.0])
 
@@ -278,7 +278,7 @@ def _right_angles() -> Array:
 def turning(
     data: TumbleData, config: Config, guess: FieldGuess, mag: Seen, accel: Seen | None, declination: float, dip: float
 ) -> Turning:
-    """The chain of attitudes of a tumble recording.
+    """Build the chain of attitudes of a tumble recording.
 
     Args:
         data: with a gyro.
@@ -341,7 +341,7 @@ def turning(
 
 
 def _hidden(data: TumbleData, half_width: float, beyond: Array) -> Array | None:
-    """Density (N,) of what a gyro does not show within its dead band, rad/s/sqrt(Hz); None without one.
+    """Noise density (N,), rad/s/sqrt(Hz), for the rate hidden in a gyro's dead band; None without a dead band.
 
     The rate there, with the bias that rests hide, is uniform in the band and may be the same all the time. Over all the
     time in it, T, white noise of the density half_width sqrt(T / 3) leaves its mean as uncertain as that.
@@ -355,12 +355,12 @@ def _hidden(data: TumbleData, half_width: float, beyond: Array) -> Array | None:
 
 
 def _earth(latitude: float, declination: float) -> Array:
-    """(3,) rad/s, rate of n, whose y axis points along the field's horizontal part."""
+    """Earth rate (3,), rad/s, in the level frame n with y along the horizontal field."""
     return np.asarray(so3.rotate(so3.exp(np.array([0.0, 0.0, declination])), earth_rate(latitude)))
 
 
 def _earth_rate(config: Config) -> Parameter:
-    """The earth's rate where its direction in n is unknown: of known size."""
+    """Parameter of the earth's rate in n, for unknown direction: components with the rate's size as prior sigma."""
     known = (
         Quantity(name, "rad/s", config.prior(name, EARTH_RATE), EARTH_RATE, np.inf, group="assumption")
         for name in EARTH
@@ -374,12 +374,12 @@ def _arm(config: Config) -> Parameter:
 
 
 def _inside(stamps: Array, gyro: Array) -> Index:
-    """Which stamps are within the gyro's record."""
+    """Indices of the stamps within the gyro's record."""
     return np.flatnonzero((stamps >= gyro[0]) & (stamps <= gyro[-1]))
 
 
 def _attitudes(time: Array, path: GyroPath, mag: Seen, beside: tuple[Seen, Rows] | None, dip: float) -> Array:
-    """First guess (k, 4) of aRb: carried by the gyro, drawn to the directions of the field, turned about it to up."""
+    """Initial attitudes aRb (k, 4): gyro propagation, corrected to the field's direction, then to up."""
     turns = path.increments(time[:-1], time[1:]).wxyz
     along = np.array([0.0, np.cos(dip), -np.sin(dip)])
     field = np.stack([np.interp(time, mag.time, axis) for axis in mag.direction.T], axis=1)
@@ -400,7 +400,7 @@ def _attitudes(time: Array, path: GyroPath, mag: Seen, beside: tuple[Seen, Rows]
 
 
 def _between(b: Array, a: Array) -> Array:
-    """The shortest rotation (4,) that takes a unit vector b to a."""
+    """Shortest rotation (4,) from unit vector b to a."""
     axis, cosine = np.cross(b, a), float(b @ a)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:

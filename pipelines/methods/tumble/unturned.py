@@ -30,7 +30,7 @@ _TOPICS = {"accel": IMU, "mag": MAG}
 
 
 def unturned(sensor: Sensor) -> Sensor:
-    """The sensor with means in place of readings, its `excess` corrected for their depth inside the ellipsoid.
+    """Replace a sensor's readings by means of neighbours, `excess` corrected for their depth in the ellipsoid.
 
     Rests are means already. Without a stated noise the sensor stays as it is: the scatter may be motion.
     """
@@ -71,7 +71,7 @@ def check_turned(sensor: Sensor, config: Config) -> None:
 
 
 def _beginnings(raw: Array, sigma: float) -> NDArray[np.intp]:
-    """The first sample of each mean: neighbours become one as long as there are any that may.
+    """Index of the first sample of each mean; neighbours are merged while their scatter allows.
 
     Of points of a sphere of radius 1, with a scatter V, the mean lies V / 2 inside.
     """
