@@ -28,7 +28,7 @@ MISFIT = "tags do not fit the layout"
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """View of a body in one picture: stamp, all tag ids in it, the pose, and why that cannot be used, if so."""
+    """View of a body in one picture: stamp, all tag ids, pose, and the reason if the pose is unusable."""
 
     t_ns: int
     ids: NDArray[np.int64]
@@ -56,7 +56,7 @@ class BoardAttitudes:
 def body_poses(
     images: Iterable[tuple[int, bytes]], camera: Camera, body: TagBody, sigma_px: float | None = None
 ) -> Iterator[Sight]:
-    """Poses of a body of tags, picture by picture; nothing is kept but the last attitude that needed no help.
+    """Yield the pose of a body of tags in each picture; the last unambiguous attitude guides the next.
 
     Args:
         images: stamps (ns) and encoded pictures (PNG, JPEG, ...), in time order.
@@ -90,7 +90,7 @@ def _problem(pose: BodyPose | None, found: Detections, sigma_px: float | None) -
 def board_attitudes(
     images: Iterable[tuple[int, bytes]], camera: Camera, board: TagBody, sigma_px: float | None = None
 ) -> BoardAttitudes:
-    """Attitudes of a helmet's tag board in the camera's optical frame, from pictures (arguments as in `body_poses`).
+    """Measure a helmet's tag board in pictures: attitudes in the camera's optical frame (arguments as in `body_poses`).
 
     Raises:
         InputError: no pictures, none that decodes, no tag of the board ever seen, or no attitude that can be used.

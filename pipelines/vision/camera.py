@@ -51,7 +51,7 @@ _PIXEL_TOLERANCE = 1e-9
 
 
 def lens_model(name: str, coefficients: Array) -> tuple[str, Array]:
-    """The distortion model of a name, as a driver writes it, and its coefficients without zeros that are none.
+    """Translate a driver's distortion model name; return it and the coefficients without padding zeros.
 
     Raises InputError where the model is another, or has another number of coefficients.
     """
@@ -142,13 +142,13 @@ class Camera:
         return np.concatenate([self.focal, self.centre, self.coefficients])
 
     def with_intrinsics(self, intrinsics: Array) -> Camera:
-        """The camera with other intrinsics, in the order of `intrinsics`."""
+        """Return the camera with other intrinsics, in the order of `intrinsics`."""
         fx, fy, cx, cy = intrinsics[:4]
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return replace(self, K=K, coefficients=intrinsics[4:])
 
     def project_with_jacobian(self, points: Array) -> tuple[Array, Array]:
-        """Pixels (..., 2) as `project` has them, and their Jacobian (..., 2, 3) by the points, NaN where they are."""
+        """Pixels (..., 2) as `project`, with their Jacobian (..., 2, 3) by the points; NaN behind the camera."""
         z = points[..., 2]
         if self.distortion_model == "equidistant":
             flat = points[..., :2]
@@ -173,7 +173,7 @@ class Camera:
         return distorted * self.focal + self.centre, self.focal[:, None] * J
 
     def by_intrinsics(self, points: Array) -> Array:
-        """Jacobian (..., 2, 4 + n) of the pixels of points, shape (..., 3), by `intrinsics`; NaN behind the camera."""
+        """Jacobian (..., 2, 4 + n) of projected points (..., 3) by the `intrinsics`; NaN behind the camera."""
         flat = (self.project(points) - self.centre) / self.focal
         J = np.zeros((*flat.shape, 4 + len(self.coefficients)))
         J[..., 0, 0], J[..., 1, 1] = flat[..., 0], flat[..., 1]
@@ -213,7 +213,7 @@ class Camera:
         return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
     def _distort(self, u: Array) -> tuple[Array, Array]:
-        """Distorted z = 1 coordinates of undistorted ones, shape (..., 2), and the Jacobian, shape (..., 2, 2)."""
+        """Distort z = 1 coordinates (..., 2); return these and the Jacobian (..., 2, 2)."""
         k1, k2, p1, p2, k3, k4, k5, k6 = [*self.coefficients.tolist(), 0.0, 0.0, 0.0][:8]
         x, y = u[..., 0], u[..., 1]
         r2 = x * x + y * y
@@ -233,7 +233,7 @@ class Camera:
         return out, J
 
     def _undistort(self, flat: Array) -> Array:
-        """Newton's iteration for the inverse of `_distort`; NaN where it does not reach the tolerance."""
+        """Invert `_distort` by Newton's iteration; NaN where the iteration does not converge."""
         if not self.coefficients.any():
             return flat
         u = flat.copy()
@@ -254,7 +254,7 @@ class Camera:
         return np.where(good[..., None], u, np.nan)
 
     def _angle(self, theta: Array) -> tuple[Array, Array]:
-        """Distorted angle of the equidistant model, and its derivative."""
+        """Return the distorted angle of the equidistant camera model and its derivative, rad."""
         k1, k2, k3, k4 = self.coefficients
         t2 = theta * theta
         distorted = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
@@ -275,7 +275,7 @@ class Camera:
 
 
 def camera_of(recording: Recording, config: Config) -> Camera:
-    """The camera of a recording. Raises InputError when its topic is missing or states what no camera can be."""
+    """Read the camera of a recording. Raises InputError if its topic is missing or describes no valid camera."""
     info = recording.camera_info(config.topic(CAMERA_INFO))
     camera = Camera(info.width, info.height, info.k, info.distortion_model, info.d, _rectified(info))
     if info.distortion_model not in ("", camera.distortion_model):
@@ -289,7 +289,7 @@ def camera_of(recording: Recording, config: Config) -> Camera:
 
 
 def _rectified(info: CameraInfo) -> Array | None:
-    """The left three columns of P; None where it is not filled in."""
+    """Left three columns of the projection matrix P; None where P is not filled in."""
     P = info.p[:, :3]
     plain = np.isfinite(P).all() and P[0, 0] > 0.0 and P[1, 1] > 0.0 and P[0, 1] == 0.0
     return P if plain else None

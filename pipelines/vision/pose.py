@@ -26,7 +26,7 @@ _DAMPING, _MAX_STEPS, _SETTLED_PX = 1e-3, 50, 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A body's pose that minimises reprojection errors.
+    """Body pose with minimal reprojection errors.
 
     Attributes:
         cRb: (4,) attitude of the body in the camera.
@@ -47,7 +47,7 @@ class PoseFit:
 
 
 def refine(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> PoseFit | None:
-    """The pose with the least reprojection errors near a given one; None where there is none.
+    """Refine a pose to the local minimum of the reprojection errors; None if there is none.
 
     By pycolmap, or by ourselves where it has no wheel.
 
@@ -62,7 +62,7 @@ def refine(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: 
 
 
 def reprojection_errors(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> Array:
-    """Reprojection errors (..., 2), px, of corners (..., 3) of the body: projected less seen."""
+    """Reprojection errors (..., 2), px, projected minus seen, of body corners (..., 3)."""
     return np.asarray(camera.project(position + so3.rotate(cRb, corners)) - pixels)
 
 
@@ -105,7 +105,7 @@ def refine_by_pycolmap(camera: Camera, corners: Array, pixels: Array, cRb: Array
 
 @lru_cache(maxsize=8)
 def _colmap_camera(camera: Camera) -> Any:
-    """The same camera for pycolmap (its place of a pixel's centre does not matter: points and K agree)."""
+    """Convert the camera to pycolmap; the pixel-centre convention cancels, as points and K agree."""
     import pycolmap
 
     k = np.concatenate([camera.focal, camera.centre, camera.coefficients])
@@ -183,7 +183,7 @@ class TagBody:
 
     @classmethod
     def from_board(cls, board: Board) -> TagBody:
-        """The body that a config's `tags` describe.
+        """Build the body from a config's `tags`.
 
         Raises:
             InputError: no tags, or one without a size.
@@ -237,7 +237,7 @@ class BodyPose:
 
     @property
     def decided(self) -> bool:
-        """The corners alone distinguish the pose from its flip."""
+        """Whether the corners alone distinguish the pose from its flip."""
         return self.ambiguity <= _AMBIGUOUS
 
 
@@ -248,7 +248,7 @@ def estimate_pose(
     sigma_px: float | None = None,
     expected: ArrayLike | None = None,
 ) -> BodyPose | None:
-    """The body's pose from the corners of its tags; None when none is seen well (or only ids that are seen twice).
+    """Estimate the body's pose from its tags' corners; None if no tag is seen well and only once.
 
     Reprojection errors are minimised with the camera's distortion; each tag's two planar solutions
     (T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", 2014; OpenCV's IPPE_SQUARE) are the starts.
@@ -282,7 +282,7 @@ def estimate_pose(
 
 
 def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequence[int]) -> tuple[TagBody, Array, float]:
-    """The body's tags that are seen, their corners, (n, 4, 2) px, and the mean variance of these, px^2."""
+    """Select well-seen tags of the body: tags, corners (n, 4, 2), px, and their mean variance, px^2."""
     seen = np.array([int(np.flatnonzero(detections.ids == i)[0]) for i in use], dtype=np.intp)
     variances = np.diagonal(detections.covariance[seen], axis1=-2, axis2=-1)
     worst = variances.max(axis=(1, 2))
@@ -294,14 +294,14 @@ def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequenc
 
 
 def part(body: TagBody, keep: NDArray[Any]) -> TagBody:
-    """The body with some of its tags only."""
+    """Return the body with selected tags only."""
     return TagBody(body.ids[keep], body.size[keep], body.bRt[keep], body.position[keep], body.family)
 
 
 def _solve(
     camera: Camera, tags: TagBody, pixels: Array, sigma: float, is_raised: bool, expected: ArrayLike | None
 ) -> BodyPose | None:
-    """The pose by corners of a sigma, px per axis, which is raised to what the misfit shows, if that is more."""
+    """Solve the pose for corner noise `sigma`, px per axis, raised to the level of the misfit if `is_raised`."""
     fits = sorted(_minima(camera, tags, pixels), key=lambda fit: fit.square)
     if not fits:
         return None
@@ -333,7 +333,7 @@ def angles(p: Array, q: Array) -> Array:
 
 
 def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array, Array]:
-    """Both poses that each tag by itself may have: cRt (n, 2, 4) and its place in c (n, 2, 3), m.
+    """Both pose solutions of each single tag: cRt (n, 2, 4) and position in c (n, 2, 3), m.
 
     Args:
         camera: the camera.
@@ -360,7 +360,7 @@ def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array,
 
 
 def _minima(camera: Camera, tags: TagBody, pixels: Array) -> list[PoseFit]:
-    """The refined best start, and the refined best start of those that lie on the other side of the flip.
+    """Refine the best start pose, and the best on the other side of the planar flip.
 
     Starts are both planar solutions of each tag, as poses of the body.
     """

@@ -73,7 +73,7 @@ class Detections:
 
 
 def detect(picture: Picture, family: str = "36h11", camera: Camera | None = None) -> Detections:
-    """Finds the tags of a family in a grey picture, shape (height, width), and measures their corners.
+    """Find the tags of a family in a grey picture (height, width) and measure their corners.
 
     With a camera the edges are straight in space; without, they are taken as straight in the picture.
 
@@ -94,7 +94,7 @@ def detect(picture: Picture, family: str = "36h11", camera: Camera | None = None
 
 
 def _read(picture: Picture) -> tuple[NDArray[np.int64], Array]:
-    """Ids (n,) and rough corners (n, 4, 2) of all tags; one that both detectors see counts once."""
+    """Ids (n,) and rough corners (n, 4, 2), px, of all tags, without duplicates between both detectors."""
     ids, corners = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
     for detector in _detectors(max(picture.shape)):
         found, numbers, _ = detector.detectMarkers(picture)
@@ -110,7 +110,7 @@ def _read(picture: Picture) -> tuple[NDArray[np.int64], Array]:
 
 @cache
 def _detectors(width: int) -> tuple[Any, Any]:
-    """For pictures so wide, px: with the narrow window, and with the wide one."""
+    """Build two tag detectors for a picture width, px: one with a narrow threshold window, one with a wide."""
     import cv2
 
     tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -139,7 +139,7 @@ def _parameters(window: int) -> Any:
 
 
 def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Array]:
-    """Corners, (n, 4, 2), and covariances from the edges; edge k runs from corner k to corner k + 1."""
+    """Refine corners (n, 4, 2), px, from edges, with covariances; edge k runs from corner k to k + 1."""
     n = len(plain)
     corners = plain
     centre = np.repeat(plain.mean(axis=1), 4, axis=0)
@@ -165,14 +165,14 @@ def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Arra
 
 
 def _limit(plain: Array) -> Array:
-    """How far (n, 1) px the edges may move a corner: half a cell and what a blurred or small tag may need."""
+    """Largest shift (n, 1), px, of a corner by the edge refinement: half a cell, within 2 to 5 px."""
     side = np.linalg.norm(plain - np.roll(plain, 1, axis=1), axis=-1).mean(axis=1, keepdims=True)
     return np.asarray(np.clip(0.5 * side / _CELLS, 2.0, 5.0))
 
 
 @dataclass(frozen=True, eq=False)
 class _Cuts:
-    """The step's place in each profile of each edge.
+    """Edge profiles across each tag edge, with the position of the step in each.
 
     Attributes:
         points: (e, c, 2) px.
@@ -194,7 +194,7 @@ class _Cuts:
 
 
 def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array) -> _Cuts:
-    """Cuts profiles across the edges from `start` to `end`, (e, 2), of tags about `centre`; black is inside.
+    """Sample profiles across the edges from `start` to `end`, (e, 2), px, of tags about `centre`; black is inside.
 
     The levels are those beyond the step's `blur`, (e,) px; with infinite blur, the ends of the profiles.
     """
@@ -238,12 +238,12 @@ def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array)
 
 
 def _needed(blur: Array) -> Array:
-    """Half the length, px, of a step blurred by a Gaussian of sigma `blur` px, with room to be off centre."""
+    """Half length, px, of the profile that a step with Gaussian blur of sigma `blur` px needs."""
     return 3.0 * blur + 0.7
 
 
 def _sample(picture: Picture, where: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Grey values between the pixels (bilinear), and whether the place lies in the picture."""
+    """Grey values by bilinear interpolation, and a mask of the positions inside the picture."""
     height, width = picture.shape
     x, y = where[..., 0], where[..., 1]
     column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
@@ -258,7 +258,7 @@ def _sample(picture: Picture, where: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _levels(grey: Array, where: NDArray[np.bool_], s: Array) -> tuple[Array, Array]:
-    """Grey levels beside each cut, (k, e, c), smoothed along the edge by a straight line, and their scatter, (k, e).
+    """Grey levels (k, e, c) beside each cut, fitted by a line along the edge, and their scatter (k, e).
 
     Means of the samples `where`, (k, e, samples). The line goes through medians, which dirt does not move.
     """
@@ -272,7 +272,7 @@ def _levels(grey: Array, where: NDArray[np.bool_], s: Array) -> tuple[Array, Arr
 
 
 def _fit(camera: Camera, cuts: _Cuts, start: Array, end: Array) -> tuple[Array, Array]:
-    """Planes through the camera's centre, (e, 3) unit normals, and the lines' variance, px^2, at start and end, (e, 2).
+    """Fit edge planes through the camera centre: unit normals (e, 3), and variance at both ends (e, 2), px^2.
 
     Total least squares on the directions of the points, reweighted (Tukey's biweight) against dirt on the edge.
     """
@@ -292,7 +292,7 @@ def _fit(camera: Camera, cuts: _Cuts, start: Array, end: Array) -> tuple[Array, 
 
 
 def _line_variance(cuts: _Cuts, w: Array, miss: Array, start: Array, end: Array) -> Array:
-    """Variance of the line across itself at the edge's ends; neighbours closer than a pixel share their noise."""
+    """Transverse variance of a fitted line at the edge's ends, px^2; cuts within a pixel share noise."""
     length = np.linalg.norm(end - start, axis=1)
     along = (end - start) / length[:, None]
     at = ((cuts.points - start[:, None]) * along[:, None]).sum(axis=2)
@@ -310,7 +310,7 @@ def _line_variance(cuts: _Cuts, w: Array, miss: Array, start: Array, end: Array)
 
 
 def _corner_covariance(normal: Array, variance: Array) -> Array:
-    """(n, 4, 2, 2) from the normals of the edges, (n, 4, 2), and their lines' variances at start and end, (n, 4, 2)."""
+    """Covariances (n, 4, 2, 2) of corners, px^2, from edge normals and edge-end variances, (n, 4, 2) each."""
     lines = np.stack([np.roll(normal, 1, axis=1), normal], axis=2)
     across = np.stack([np.roll(variance[..., 1], 1, axis=1), variance[..., 0]], axis=2)
     inverse = np.linalg.inv(lines)
@@ -328,7 +328,7 @@ _AHEAD = 4
 def detections(
     images: Iterable[tuple[int, bytes]], family: str = "36h11", camera: Camera | None = None
 ) -> Iterator[tuple[int, Detections | None]]:
-    """Stamps and what `detect` finds, in the order of the pictures; None where one does not decode.
+    """Yield the stamp and the detected tags of each picture, in order; None for an undecodable picture.
 
     Raises InputError as `detect` does.
     """
@@ -352,7 +352,7 @@ def detections(
 
 
 def decode(encoded: bytes) -> Picture | None:
-    """The grey picture in a PNG, JPEG, ... file; None when it does not decode."""
+    """Decode a PNG, JPEG, ... file to a grey picture; None if undecodable."""
     import cv2
 
     data = np.frombuffer(encoded, dtype=np.uint8)
@@ -361,7 +361,7 @@ def decode(encoded: bytes) -> Picture | None:
 
 
 def _prepare() -> None:
-    """One thread a process; an interruption is for the main process to handle."""
+    """Set up a worker process: one OpenCV thread, interruptions left to the main process."""
     import cv2
 
     cv2.setNumThreads(1)

@@ -55,7 +55,7 @@ class LosErrors:
 
 @dataclass(frozen=True, eq=False)
 class _Match:
-    """Directions of the same points in the first picture and now, (n, 3) each, their sigma, px, and their share."""
+    """Matched directions (n, 3) in the first and the current picture, with sigma, px, and inlier share."""
 
     first: Array
     now: Array
@@ -64,7 +64,7 @@ class _Match:
 
 
 def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors:
-    """LOS errors of the target that the first picture shows; pictures are streamed.
+    """Measure LOS errors of the target in the first picture, over a stream of pictures.
 
     A tag in the first picture is the target (the one nearest the middle), its centre the target's point. Else the whole
     first picture is, and its middle (the optical axis) the point.
@@ -151,7 +151,7 @@ class _Texture:
         self.middle = np.array([0.0, 0.0, 1.0])
 
     def find(self, picture: Picture, ckRc0: Array) -> _Match | str:
-        """Points by KLT in the picture turned back by the last turn, and once more by what that finds."""
+        """Track points by KLT from a predicted rotation, again from the rotation found; else search by features."""
         match = self._track(picture, ckRc0)
         if isinstance(match, str):
             start = self._search(picture)
@@ -189,7 +189,7 @@ class _Texture:
         return self._agreeing(good, there, now)
 
     def _agreeing(self, good: NDArray[np.bool_], there: Array, now: Array) -> _Match | str:
-        """The points that one similarity moves (RANSAC), if they are enough."""
+        """Keep the points consistent with one similarity (RANSAC), or return the reason for too few."""
         import cv2
 
         rows = np.flatnonzero(good)
@@ -208,7 +208,7 @@ class _Texture:
         return _Match(self._first[rows[near]], now[rows[near]], scatter, quality)
 
     def _search(self, picture: Picture) -> Array | None:
-        """The turn (4,) of a picture anywhere, from matched ORB features; None when too few match."""
+        """Rotation (4,) of a picture by matched ORB features, without prediction; None if too few match."""
         import cv2
 
         orb = cv2.ORB.create(800)
@@ -229,7 +229,7 @@ class _Texture:
 
 
 def _turn(match: _Match, camera: Camera) -> tuple[Array, Array]:
-    """ckRc0 (4,) that turns the first directions into those now, and the covariance of a turn in c, (3, 3) rad^2."""
+    """Rotation ckRc0 (4,) from first to current directions, and its covariance in c (3, 3), rad^2."""
     n = len(match.now)
     # A direction has no information about a turn about itself.
     information = n * np.eye(3) - match.now.T @ match.now
@@ -238,12 +238,12 @@ def _turn(match: _Match, camera: Camera) -> tuple[Array, Array]:
 
 
 def _miss(match: _Match, ckRc0: Array, camera: Camera) -> Array:
-    """(n, 2) px by which points miss where the turn puts them."""
+    """Residuals (n, 2), px, of the current points against the rotated first ones."""
     return camera.project(match.now) - camera.project(so3.rotate(ckRc0, match.first))
 
 
 def _los(ckRc0: Array, middle: Array, covariance: Array) -> tuple[Array, Array]:
-    """phx, phz, roll (3,) and their covariance; `covariance` is that of a turn from the left, in c.
+    """Convert a rotation to phx, phz, roll (3,), rad, with covariance; `covariance` is that of a left rotation in c.
 
     The target's frame t has y towards the target and is not twisted against l in the first picture; the roll is the
     twist of t about the line of sight (the texture turns the other way than the camera).

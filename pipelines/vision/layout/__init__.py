@@ -39,7 +39,7 @@ _MOSTLY_FALSE = 0.5
 
 @dataclass(frozen=True)
 class TagSeen:
-    """Statistics of a tag: in how many pictures used, root mean square error px per axis, sights left out as false.
+    """Statistics of a tag: number of pictures, root mean square error (px per axis), rejected sights.
 
     `inflation` is by how much its errors from picture to picture exceed what independent corners would give.
     """
@@ -121,7 +121,7 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
 
 
 def _apart(views: Gathered, given: TagBody) -> dict[int, str]:
-    """Tags that no chain of tags seen together ties to the first one."""
+    """Ids of tags without a chain of common pictures to the first tag, with the reason in words."""
     n, sights = len(given.ids), views.sights
     times = np.bincount(sights.tag, minlength=n)
     reached = _reached(sights, n)
@@ -140,7 +140,7 @@ def _apart(views: Gathered, given: TagBody) -> dict[int, str]:
 
 
 def _reached(sights: Sights, tags: int) -> NDArray[np.bool_]:
-    """(n,) tags that a chain of pictures ties to the first one."""
+    """Mask (n,) of tags connected to the first tag by a chain of common pictures."""
     pictures, reached = joint(sights, tags) > 0, np.arange(tags) == 0
     for _ in range(tags):
         reached = reached | (pictures & reached).any(axis=1)
@@ -148,7 +148,7 @@ def _reached(sights: Sights, tags: int) -> NDArray[np.bool_]:
 
 
 def _wrong(views: Gathered, fit: Fit) -> dict[int, str]:
-    """Tags whose pose is ambiguous or inconsistent."""
+    """Ids of tags with an ambiguous or inconsistent pose, with the reason in words."""
     body, sights = fit.bundle.body, views.sights
     n = len(body.ids)
     shown, used = np.bincount(sights.tag, minlength=n), np.bincount(fit.sights.tag, minlength=n)
@@ -205,7 +205,7 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
 
 
 def _with_camera(known: Covariance, fit: Fit) -> Array | None:
-    """As a layout has it; the share is the mean of those of the two focal lengths."""
+    """Covariance of tags and camera in a layout's form; focal share as the mean of both focal lengths' shares."""
     cameras = fit.bundle.cameras
     if not fit.additional.intrinsics.any() or len(cameras) > 1:
         return None

@@ -31,7 +31,7 @@ LINE_TIME = 3e-5
 
 @dataclass(frozen=True, eq=False)
 class Additional:
-    """Prior sigmas of additional parameters; 0 of those that are fixed.
+    """Additional parameters of a bundle with their prior sigmas; a sigma of 0 fixes a parameter.
 
     Attributes:
         given: the cameras that the priors are about; their shutters are taken not to roll.
@@ -55,19 +55,19 @@ class Additional:
         return np.asarray(self.sigma > 0.0)
 
     def parts(self, numbers: Array) -> tuple[Array, Array]:
-        """Numbers (..., k) as those of the intrinsics (..., c, n) and the line times (..., c)."""
+        """Split numbers (..., k) into intrinsics (..., c, n) and line times (..., c)."""
         c, n = self.intrinsics.shape
         return numbers[..., : c * n].reshape(*numbers.shape[:-1], c, n), numbers[..., c * n :]
 
     def off(self, bundle: Bundle) -> Array:
-        """Deviation (k,) of a bundle's intrinsics and line times from their priors."""
+        """Deviation (k,) of a bundle's intrinsics and line times from their prior means."""
         out = np.zeros_like(self.intrinsics)
         for row, now, given in zip(out, bundle.cameras, self.given, strict=True):
             row[: len(now.intrinsics)] = now.intrinsics - given.intrinsics
         return np.concatenate([out.ravel(), bundle.line_time])
 
     def moved(self, bundle: Bundle, step: Array) -> Bundle:
-        """The bundle with a step (k,) added to its additional parameters."""
+        """Add a step (k,) to the bundle's additional parameters."""
         intrinsics, line_time = self.parts(step)
         cameras = tuple(
             camera.with_intrinsics(camera.intrinsics + row[: len(camera.intrinsics)]) if row.any() else camera
@@ -76,7 +76,7 @@ class Additional:
         return replace(bundle, cameras=cameras, line_time=bundle.line_time + line_time)
 
     def rows(self, bundle: Bundle, sights: Sights, rows: Rows) -> Array:
-        """Jacobian (m, 8, k) of the errors."""
+        """Jacobian (m, 8, k) of the reprojection errors by the additional parameters."""
         m = len(sights)
         out = np.zeros((m, 4, 2, len(self.sigma)))
         intrinsics, line_time = self.parts(out)
@@ -90,19 +90,19 @@ class Additional:
 
 
 def nothing(bundle: Bundle) -> Additional:
-    """Additional parameters of a bundle, all fixed."""
+    """Return additional parameters of a bundle, all fixed."""
     cameras = bundle.cameras
     widest = max(len(camera.intrinsics) for camera in cameras)
     return Additional(cameras, np.zeros((len(cameras), widest)), np.zeros(len(cameras)))
 
 
 def shutters(bundle: Bundle) -> Additional:
-    """Line times as additional parameters, with a prior of 30 us about none, as a phone's."""
+    """Return free line times, with a prior of 30 us about zero, as for a phone's rolling shutter."""
     return replace(nothing(bundle), line_time=np.full(len(bundle.cameras), LINE_TIME))
 
 
 def with_intrinsics(bundle: Bundle) -> Additional:
-    """Line times and cameras about what their calibration says: focal lengths to 0.5 %, the centre to 5 px.
+    """Return free line times and intrinsics, near their calibration: focal lengths 0.5 %, centre 5 px.
 
     Each coefficient of the distortion has the sigma that moves the picture's farthest corner by a pixel.
     """
@@ -128,7 +128,7 @@ _STEADY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations with the pictures eliminated.
+    """Normal equations of a bundle, reduced to the shared unknowns by elimination of the pictures' poses.
 
     Attributes:
         free: (p,) which of the numbers shared by pictures are adjusted: six a tag, then the additional ones.
@@ -147,7 +147,7 @@ class Normal:
     gradient: Array
 
     def step(self) -> tuple[Array, Array]:
-        """Step of the shared numbers (p,), zero where fixed, and of the pictures (f, 6)."""
+        """Solve for the step of the shared unknowns (p,), zero where fixed, and of the pictures' poses (f, 6)."""
         moved = -np.linalg.solve(self.information, self.projection)
         pictures = -np.einsum("fij,fj->fi", self.inverse, self.gradient + self.across @ moved)
         shared = np.zeros(len(self.free))
@@ -156,7 +156,7 @@ class Normal:
 
 
 def shared_rows(bundle: Bundle, sights: Sights, rows: Rows, additional: Additional) -> Array:
-    """Jacobian (m, 8, p) of the errors by all that pictures share: the tags' poses, then additional parameters."""
+    """Jacobian (m, 8, p) of the errors by the shared unknowns: the tags' poses, then additional parameters."""
     m, tags = len(sights), len(bundle.body.ids)
     out = np.zeros((m, 8, 6 * tags))
     columns = 6 * sights.tag[:, None] + np.arange(6)
@@ -167,7 +167,7 @@ def shared_rows(bundle: Bundle, sights: Sights, rows: Rows, additional: Addition
 def normal_equations(
     bundle: Bundle, sights: Sights, rows: Rows, weights: Array, fixed: int, additional: Additional, damping: float = 0.0
 ) -> Normal:
-    """Normal equations of weighted errors; tag number `fixed` stays, Levenberg's damping is relative."""
+    """Build normal equations of weighted errors; tag `fixed` stays, the damping is relative (Levenberg)."""
     f = len(bundle.cRb)
     own, gradient = of_pictures(sights, rows, weights, f)
     A, J = _blocks(rows.by_picture, sights.picture, f), _blocks(rows.by_tag, sights.tag, len(bundle.body.ids))
@@ -196,20 +196,20 @@ def normal_equations(
 
 
 def _blocks(values: Array, columns: Index, count: int) -> Any:
-    """Sparse matrix (8 m, 6 count) of a Jacobian (m, 8, 6) by the pose of the picture or the tag of each sight."""
+    """Sparse matrix (8 m, 6 count) from each sight's Jacobian (m, 8, 6) by its picture's or tag's pose."""
     m = len(values)
     return sparse.bsr_array((values, columns, np.arange(m + 1)), shape=(8 * m, 6 * count)).tocsr()
 
 
 def of_pictures(sights: Sights, rows: Rows, weights: Array, f: int) -> tuple[Array, Array]:
-    """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses."""
+    """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses, the tags fixed."""
     At = np.swapaxes(rows.by_picture, 1, 2) * weights[:, None, None]
     gradient = sights.by_picture((At @ rows.miss[..., None])[..., 0], f)
     return sights.by_picture(At @ rows.by_picture, f), gradient
 
 
 def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional) -> Bundle:
-    """The bundle a step on: `shared` (p,) of tags and, if any, additional parameters, `pictures` (f, 6)."""
+    """Apply a step to a bundle: `shared` (p,) for tags and additional parameters, `pictures` (f, 6)."""
     tags = len(bundle.body.ids)
     step = shared[: 6 * tags].reshape(tags, 6)
     body = replace(
@@ -229,7 +229,7 @@ def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional
 def adjusted(
     bundle: Bundle, sights: Sights, fixed: int, additional: Additional, far: float = np.inf, steps: int = _STEPS
 ) -> tuple[Bundle, Rows]:
-    """The bundle of least squares, by Levenberg's and Marquardt's method.
+    """Minimise the bundle's reprojection errors by the Levenberg-Marquardt method.
 
     Args:
         bundle: where to start.
@@ -259,12 +259,12 @@ def adjusted(
 
 
 def weights(rows: Rows, far: float) -> Array:
-    """Weights (m,) of Geman's and McClure's loss; 1 without bound."""
+    """Weights (m,) of the Geman-McClure loss; 1 for an infinite bound `far`."""
     return np.ones(len(rows.miss)) if np.isinf(far) else np.asarray((far / (far + rows.squares)) ** 2)
 
 
 def loss(squares: Array, far: float) -> Array:
-    """Geman's and McClure's loss of sums of squares."""
+    """Geman-McClure loss of sums of squares."""
     return squares if np.isinf(far) else np.asarray(squares * (far / (far + squares)))
 
 
@@ -277,7 +277,7 @@ def _cost(rows: Rows, bundle: Bundle, additional: Additional, far: float) -> flo
 def refined_pictures(
     bundle: Bundle, sights: Sights, far: float = np.inf, steps: int = 15
 ) -> tuple[Bundle, Array, Array]:
-    """Pictures one by one with the tags where they are; costs (f,) and information (f, 6, 6) of their poses too."""
+    """Refine each picture's pose with fixed tags; also return costs (f,) and pose information (f, 6, 6)."""
     f = len(bundle.cRb)
     rows = linearized(bundle, sights)
     cost, damping = _costs(rows, sights, far, f), np.full(f, 1e-3)
@@ -313,7 +313,7 @@ def refined_pictures(
 
 
 def _costs(rows: Rows, sights: Sights, far: float, f: int) -> Array:
-    """(f,) of the pictures."""
+    """Robust cost (f,) of each picture."""
     return np.asarray(np.bincount(sights.picture, loss(rows.squares, far), f), dtype=float)
 
 
@@ -356,24 +356,24 @@ class Fit:
 
     @property
     def curvature(self) -> Array:
-        """Share (f,) of a picture's information that its weight leaves: less, since the weight follows the errors."""
+        """Ratio (f,) of a picture's true to its weighted information: below 1, as weights depend on errors."""
         squares = np.bincount(self.sights.picture, self.rows.squares, len(self.weight))
         free = np.maximum(freedom(self.sights, len(self.weight)), 1.0)
         return np.asarray(np.maximum(1.0 - 2.0 * squares / ((_NU + free) * free), 0.1))
 
     @property
     def errors_px(self) -> Array:
-        """Errors (m, 4, 2) of the sights used, px."""
+        """Reprojection errors (m, 4, 2) of the sights used, px."""
         return self.rows.miss.reshape(-1, 4, 2) * self.sights.sigma[:, None, None]
 
     def rms_px(self, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
-        """Root mean square error, px per axis, of some sights, with the weights of their pictures."""
+        """Weighted root mean square reprojection error of some sights, px per axis."""
         weight = self.weight[self.sights.picture][keep]
         return float(np.sqrt((weight * (self.errors_px**2).mean(axis=(1, 2))[keep]).sum() / weight.sum()))
 
 
 def fitted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -> Fit:
-    """The most likely bundle; false detections are left out.
+    """Adjust the bundle by maximum likelihood and reject false detections.
 
     Args:
         bundle: a start.
@@ -397,7 +397,7 @@ def fitted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -
 
 
 def _false(sights: Sights, squares: Array, sigma: float | None) -> NDArray[np.bool_]:
-    """(m,) sights that miss by far more than the others of their picture."""
+    """Mask (m,) of false detections: sights with far larger errors than the others in the same picture."""
     if sigma is None:
         # The median of a chi-square of seven degrees of freedom; a picture's pose takes one or so of a tag's eight.
         sigma = float(np.sqrt(np.median(squares) / _MEDIAN_OF_SEVEN))
@@ -431,12 +431,12 @@ def _reweighted(bundle: Bundle, sights: Sights, fixed: int, additional: Addition
 
 
 def freedom(sights: Sights, pictures: int) -> Array:
-    """Degrees of freedom (f,) of a picture beyond the six of its pose."""
+    """Degrees of freedom (f,) of each picture: eight per tag minus six for the pose, at least 0."""
     return np.asarray(np.maximum(8.0 * np.bincount(sights.picture, minlength=pictures) - 6.0, 0.0))
 
 
 def _scale(squares: Array, freedom: Array) -> tuple[float, Array]:
-    """Common sigma and the weights (f,) of pictures with these sums of squares."""
+    """Common sigma and picture weights (f,) by Student's t, from sums of squares and degrees of freedom."""
     variance = float(squares.sum() / freedom.sum())
     for _ in range(200):
         weight = (_NU + freedom) / (_NU + squares / variance)
@@ -447,7 +447,7 @@ def _scale(squares: Array, freedom: Array) -> tuple[float, Array]:
 
 
 def with_motion(bundle: Bundle, pictures: Index) -> Bundle:
-    """The bundle with the motion that some of its pictures, by ascending time, show; in others nothing moves."""
+    """Estimate the motion during given pictures (in ascending time) from their neighbours; others get zero."""
     motion = np.zeros_like(bundle.motion)
     for run in _runs(bundle, pictures):
         time = bundle.time[run]
@@ -463,7 +463,7 @@ def with_motion(bundle: Bundle, pictures: Index) -> Bundle:
 
 
 def _runs(bundle: Bundle, pictures: Index) -> list[Index]:
-    """Pictures of one camera that follow each other closely."""
+    """Runs of consecutive pictures of one camera with short gaps in time."""
     gap, camera = np.diff(bundle.time[pictures]), bundle.camera[pictures]
     # Where a time is unknown, NaN, no comparison holds.
     close = (gap > 0.0) & (gap < _APART) & (camera[1:] == camera[:-1])
@@ -471,7 +471,7 @@ def _runs(bundle: Bundle, pictures: Index) -> list[Index]:
 
 
 def _slope(t: Array, values: Array) -> Array:
-    """(6,) at t = 0 of polynomials of degree four, or as many as there are values (n, 6) for."""
+    """Derivative (6,) at t = 0 of the polynomials, of degree four at most, that fit values (n, 6)."""
     scale = np.abs(t).max()
     powers = (t / scale)[:, None] ** np.arange(min(_DEGREE + 1, len(t)))
     return np.asarray(np.linalg.lstsq(powers, values)[0][1] / scale)

@@ -50,7 +50,7 @@ _ROUNDING = 1e-9
 
 
 def _deformations() -> Array:
-    """(6, 4, 3) of unit length: size, height over width, shear, keystone along x and along y, twist.
+    """Unit deformations (6, 4, 3) of a tag: size, height over width, shear, keystone along x and y, twist.
 
     With the six numbers of a pose these are all that four corners may be off by.
     """
@@ -68,7 +68,7 @@ DEFORMATIONS = _deformations()
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """Covariance of a layout and of the additional parameters adjusted with it.
+    """Covariance of a layout and of its additional parameters.
 
     Attributes:
         tags: (6 (n - 1), 6 (n - 1)), of all tags but the fixed one, rad and m.
@@ -88,7 +88,7 @@ class Covariance:
 
 
 def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
-    """Covariance of an adjusted bundle.
+    """Compute the covariance of an adjusted bundle.
 
     Args:
         fit: the bundle.
@@ -120,7 +120,7 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
 
 
 def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
-    """Covariance (q, q) and step (q,) of the best estimate with the priors of additional parameters.
+    """Covariance (q, q) and step (q,) of the optimal estimate given the additional parameters' priors.
 
     Args:
         fit: adjusted with independent errors.
@@ -145,7 +145,7 @@ def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Arr
 
 
 def _eliminated(fit: Fit, fixed: int) -> tuple[Array, Array]:
-    """Errors by all shared unknowns, (m, 8, q), and by tags' deformations, pictures' poses eliminated."""
+    """Jacobian (m, 8, q) by shared unknowns and Jacobian by tag deformations, picture poses eliminated."""
     bundle, sights, rows = fit.bundle, fit.sights, fit.rows
     normal = normal_equations(bundle, sights, rows, np.ones(len(sights)), fixed, fit.additional)
     shared = shared_rows(bundle, sights, rows, fit.additional)[..., normal.free]
@@ -161,7 +161,7 @@ def _eliminated(fit: Fit, fixed: int) -> tuple[Array, Array]:
 
 
 def _sandwich(fit: Fit, own: Array, view: Index, white: Array) -> Array:
-    """(q, q) covariance of all that pictures share, from the influence of every error."""
+    """Sandwich covariance (q, q) of the shared unknowns, from the influence of every corner error."""
     bundle, sights = fit.bundle, fit.sights
     of, views = view[sights.picture], int(view.max()) + 1
     power, common = _spectrum(_correlations(fit, of, views), views), _common(fit, of)
@@ -184,7 +184,7 @@ def _sandwich(fit: Fit, own: Array, view: Index, white: Array) -> Array:
 
 
 def _correlations(fit: Fit, of: Index, views: int) -> Array:
-    """Correlation of a corner's error with its own so many views later, from 1 on until it has died out."""
+    """Autocorrelation of corner errors over views, at lags 1, 2, ... until it vanishes."""
     tags = len(fit.bundle.body.ids)
     mean, count = np.zeros((tags, views, 8)), np.zeros((tags, views))
     np.add.at(mean, (fit.sights.tag, of), fit.rows.miss)
@@ -205,7 +205,7 @@ def _correlations(fit: Fit, of: Index, views: int) -> Array:
 
 
 def _common(fit: Fit, of: Index) -> float:
-    """The share of the variance that pictures in which nothing moved have in common; 1 where there are too few."""
+    """Share of the error variance common to pictures without motion between them; 1 if there are too few."""
     order = np.lexsort((fit.sights.picture, fit.sights.tag))
     tag, view, miss = fit.sights.tag[order], of[order], fit.rows.miss[order]
     next_ = (tag[1:] == tag[:-1]) & (view[1:] == view[:-1])
@@ -216,7 +216,7 @@ def _common(fit: Fit, of: Index) -> float:
 
 
 def _spectrum(correlations: Array, views: int) -> Array:
-    """Weights (views + 1,) of the waves of `rfft` over twice the views, none negative."""
+    """Non-negative spectral weights (views + 1,) of the autocorrelation, for `rfft` over twice the views."""
     g = np.zeros(2 * views)
     g[0] = 1.0
     g[1 : len(correlations) + 1] = correlations
@@ -228,7 +228,7 @@ def _spectrum(correlations: Array, views: int) -> Array:
 
 
 def _variances(fit: Fit, taken: Array) -> Array:
-    """(n,) variance of each tag's errors over what their pictures' sigmas say; 1 where it is not clearly more.
+    """Variance (n,) of each tag's errors relative to the pictures' sigmas; 1 where not significantly larger.
 
     `taken` (n,) is what the adjustment of all that pictures share takes from a tag's sum of squares: of correlated
     errors more than of independent ones.
@@ -242,7 +242,7 @@ def _variances(fit: Fit, taken: Array) -> Array:
 
 
 def bend_rows(bundle: Bundle, sights: Sights, rows: Rows) -> Array:
-    """Jacobian (m, 8, 6) of the errors by deformations of each tag along `DEFORMATIONS`, as shares of its size."""
+    """Jacobian (m, 8, 6) of the errors by each tag's deformations along `DEFORMATIONS`, in tag sizes."""
     m = len(sights)
     by_corner = rows.by_tag[..., 3:].reshape(m, 4, 2, 3) @ so3.matrix(bundle.body.bRt[sights.tag])[:, None]
     by_deformation = np.einsum("mkij,bkj,m->mkib", by_corner, DEFORMATIONS, bundle.body.size[sights.tag])
@@ -250,7 +250,7 @@ def bend_rows(bundle: Bundle, sights: Sights, rows: Rows) -> Array:
 
 
 def bending(miss: Array, by_deformation: Array, own: Array, white: Array) -> tuple[float, Array]:
-    """Most likely sigma of a printed corner along x and y, as a share of the tag's size, and its (q, q) covariance.
+    """Most likely sigma of a printed corner along x and y, in tag sizes, and the resulting covariance (q, q).
 
     Errors are linear in the deformations x, and x in their gradient g = J x, J the information on x with all else
     eliminated: along the axes of J a component of g has the variance l + l^2 level^2, l its information.

@@ -45,7 +45,7 @@ _HEARD = 40
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """The two poses that each picture may have, the better first.
+    """The two candidate poses of each picture, the better first.
 
     Attributes:
         cRb, position: (f, 2, 4), (f, 2, 3).
@@ -60,7 +60,7 @@ class Sides:
 
 
 def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
-    """The most likely bundle of all tags; `body` is where they are, None if that is not known yet.
+    """Adjust the bundle of all tags; `body` gives initial tag poses, or None if unknown.
 
     Raises:
         InputError: the pictures do not distinguish the layout from its mirror image.
@@ -83,7 +83,7 @@ def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
 
 
 def _decisive(sights: Sights, view: Index) -> Index:
-    """Sights of the pictures from which tags are placed: one of each view, and not too many."""
+    """Select sights for placing tags: one picture per view, limited in number."""
     first = np.unique(view, return_index=True)[1]
     if len(first) > _MOST:
         # Of the ways in which tags are tied together, the rare ones stay.
@@ -95,14 +95,14 @@ def _decisive(sights: Sights, view: Index) -> Index:
 
 
 def _in_frame(body: TagBody, given: TagBody) -> TagBody:
-    """The body turned and moved so that its first tag is where it is given."""
+    """Transform the body so that its first tag has the given pose."""
     turn = so3.multiply(given.bRt[0], so3.inverse(body.bRt[0]))
     position = given.position[0] + so3.rotate(turn, body.position - body.position[0])
     return replace(body, bRt=so3.multiply(turn, body.bRt), position=position)
 
 
 def _right_side_out(start: Bundle, sights: Sights) -> TagBody:
-    """The body or its mirror image, whichever the pictures fit.
+    """Select the body or its mirror image, by the fit of the pictures.
 
     Raises:
         InputError: both fit.
@@ -126,7 +126,7 @@ def _right_side_out(start: Bundle, sights: Sights) -> TagBody:
 
 
 def flip_told(fit: Fit, view: Index, tag: int) -> bool:
-    """Whether the pictures distinguish the pose of a tag, by its index, from every other that they may fit; see `vote`.
+    """Whether the pictures distinguish a tag's pose (by tag index) from every alternative that `vote` finds.
 
     Pictures in which nothing moved count once.
     """
@@ -140,7 +140,7 @@ def flip_told(fit: Fit, view: Index, tag: int) -> bool:
 
 
 def grown(bundle: Bundle, sights: Sights) -> TagBody:
-    """The body with all its tags placed, in the frame of the one that is seen most with others.
+    """Place all tags one by one, in the frame of the tag most often seen together with others.
 
     Args:
         bundle: cameras, sizes; no pose in it is looked at.
@@ -164,7 +164,7 @@ def grown(bundle: Bundle, sights: Sights) -> TagBody:
 
 
 def mirrored(body: TagBody, about: int) -> TagBody:
-    """The body inside out: what a camera far away cannot distinguish from it. Tag number `about` stays."""
+    """Mirror image of the body, equivalent for a distant camera; tag number `about` stays."""
     aRb = so3.inverse(body.bRt[about])
     turned = so3.multiply(aRb, body.bRt) * [1.0, -1.0, -1.0, 1.0]
     place = so3.rotate(aRb, body.position - body.position[about]) * [1.0, 1.0, -1.0]
@@ -173,12 +173,12 @@ def mirrored(body: TagBody, about: int) -> TagBody:
 
 
 def with_pictures(bundle: Bundle, poses: Sides) -> Bundle:
-    """The bundle with the better pose of each picture."""
+    """Set each picture's pose to the better of its two candidates."""
     return replace(bundle, cRb=poses.cRb[:, 0], position=poses.position[:, 0])
 
 
 def joint(sights: Sights, tags: int) -> Array:
-    """Number (n, n) of pictures that show two tags together."""
+    """Count (n, n) of pictures that show each pair of tags together."""
     a, b = pairs(sights.picture)
     out = np.zeros((tags, tags))
     np.add.at(out, (sights.tag[a], sights.tag[b]), 1.0)
@@ -186,14 +186,14 @@ def joint(sights: Sights, tags: int) -> Array:
 
 
 def _next(sights: Sights, placed: NDArray[np.bool_]) -> int | None:
-    """The tag that is to be placed next: in most pictures together with placed ones."""
+    """Index of the tag to be placed next, most often seen with placed ones; None if there is none."""
     shown = np.bincount(sights.picture[placed[sights.tag]], minlength=sights.picture.max() + 1)
     rows = ~placed[sights.tag] & (shown[sights.picture] > 0)
     return int(np.bincount(sights.tag[rows]).argmax()) if rows.any() else None
 
 
 def _placed(bundle: Bundle, sights: Sights, poses: Sides, tag: int) -> Bundle:
-    """The bundle with one more tag where most pictures agree that it is."""
+    """Place one more tag at the pose that most pictures agree on."""
     rows = np.flatnonzero((sights.tag == tag) & np.isfinite(poses.cost[sights.picture, 0]))
     bRt, position, _ = vote(bundle, sights[_some(rows, _PICTURES)], poses)
     turned, places = bundle.body.bRt.copy(), bundle.body.position.copy()
@@ -202,14 +202,14 @@ def _placed(bundle: Bundle, sights: Sights, poses: Sides, tag: int) -> Bundle:
 
 
 def _some(rows: Index, most: int) -> Index:
-    """At most so many of them, at even distances."""
+    """Thin row indices evenly to at most `most`."""
     if len(rows) <= most:
         return rows
     return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.intp)]
 
 
 def vote(bundle: Bundle, sights: Sights, poses: Sides) -> tuple[Array, Array, Array]:
-    """Proposals for the pose of one tag, refined: bRt (h, 4), position (h, 3) and cost (h,), by ascending cost.
+    """Refined proposals for one tag's pose: bRt (h, 4), position (h, 3), m, and cost (h,), by ascending cost.
 
     The error of a picture's own pose is part of a corner's: its covariance is that of both.
 
@@ -259,7 +259,7 @@ def vote(bundle: Bundle, sights: Sights, poses: Sides) -> tuple[Array, Array, Ar
 def _against(
     bundle: Bundle, sights: Sights, cRb: Array, position: Array, known: Array, bRt: Array, place: Array
 ) -> tuple[Array, Array, Array]:
-    """Of each proposal (h) in each sight (s) and side (2): squares, gradient (6,), information (6, 6) for the tag.
+    """Squares, gradient (6,), information (6, 6) of a tag's pose, by proposal (h), sight (s), picture side (2).
 
     Errors of the picture's pose, of which so much is `known` (s, 2, 6, 6) by others, are marginalised.
     """
@@ -281,7 +281,7 @@ def _against(
 
 
 def with_flips(bundle: Bundle, sights: Sights) -> Sights:
-    """The sights with both poses of each tag by itself."""
+    """Add both planar pose solutions of each single tag to the sights."""
     m = len(sights)
     cRt, place = np.zeros((m, 2, 4)), np.zeros((m, 2, 3))
     size = bundle.body.size[sights.tag]
@@ -292,7 +292,7 @@ def with_flips(bundle: Bundle, sights: Sights) -> Sights:
 
 
 def lone_scale(bundle: Bundle, sights: Sights) -> float:
-    """Ratio of the corners' errors to those stated, from each tag by itself: eight numbers for a pose of six."""
+    """Ratio of actual to stated corner errors, from fits of single tags (eight numbers for a pose of six)."""
     n, camera = len(bundle.body.ids), bundle.camera[sights.picture]
     body = replace(bundle.body, bRt=so3.identity(n), position=np.zeros((n, 3)))
     alone = replace(sights, picture=np.arange(len(sights)))
@@ -303,7 +303,7 @@ def lone_scale(bundle: Bundle, sights: Sights) -> float:
 
 
 def sides(bundle: Bundle, sights: Sights) -> Sides:
-    """The two poses of each picture with the tags where the bundle's body has them.
+    """Find both candidate poses of each picture, for the tag poses of the bundle's body.
 
     Every pose of every tag in a picture is a start; the best is refined, and the best of those on the other side of
     the flip.
@@ -330,7 +330,7 @@ def sides(bundle: Bundle, sights: Sights) -> Sides:
 
 
 def _start_costs(bundle: Bundle, sights: Sights, cRb: Array, position: Array) -> Array:
-    """(m, 2) cost of all sights in a picture, were the picture's pose that of each start."""
+    """Cost (m, 2) of a picture's sights at each start pose, from either solution of each sight."""
     a, b = pairs(sights.picture)
     costs = []
     for k in range(2):
@@ -342,7 +342,7 @@ def _start_costs(bundle: Bundle, sights: Sights, cRb: Array, position: Array) ->
 
 
 def pairs(picture: Index) -> tuple[Index, Index]:
-    """All ordered pairs of sights in one picture, each with itself too; pictures ascend."""
+    """Ordered index pairs of sights in the same picture, self pairs included; pictures ascend."""
     counts = np.bincount(picture)[picture]
     first = np.searchsorted(picture, picture)
     a = np.repeat(np.arange(len(picture)), counts)
@@ -351,7 +351,7 @@ def pairs(picture: Index) -> tuple[Index, Index]:
 
 
 def _best(picture: Index, costs: Array, f: int) -> Index:
-    """(f,) the start of least cost in each picture, -1 where there is none."""
+    """Index (f,) of the cheapest start in each picture; -1 where there is none."""
     order = np.lexsort((costs, picture))
     order = order[np.isfinite(costs[order])]
     out = np.full(f, -1)
@@ -361,7 +361,7 @@ def _best(picture: Index, costs: Array, f: int) -> Index:
 
 
 def _refined(bundle: Bundle, sights: Sights, start: Index, cRb: Array, position: Array) -> Sides:
-    """One pose of each picture, without the axis of the two, from its start (f,): -1 where there is none."""
+    """Refine one pose of each picture from the start with index (f,); -1 for no start."""
     got = start >= 0
     there = replace(
         bundle,

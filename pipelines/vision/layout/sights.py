@@ -65,7 +65,7 @@ class Sights:
         return np.asarray(np.bincount(self.picture)[self.picture] > 1)
 
     def by_picture(self, values: Array, pictures: int) -> Array:
-        """Sums (pictures, ...) of values (m, ...) over the sights of each picture."""
+        """Sum values (m, ...) of the sights over each picture: (pictures, ...)."""
         out = np.zeros((pictures, *values.shape[1:]))
         seen, first = np.unique(self.picture, return_index=True)
         out[seen] = np.add.reduceat(values, first, axis=0)
@@ -74,7 +74,7 @@ class Sights:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Cameras, body and poses of the pictures that are adjusted.
+    """Cameras, tag body and picture poses of a bundle adjustment.
 
     Attributes:
         cameras: one or more.
@@ -98,19 +98,19 @@ class Bundle:
 
     @classmethod
     def of(cls, cameras: tuple[Camera, ...], camera: Index, body: TagBody, cRb: Array, position: Array) -> Bundle:
-        """Bundle of pictures during which nothing moves."""
+        """Build a bundle of pictures without motion during exposure."""
         f = len(cRb)
         return cls(cameras, camera, body, cRb, position, np.full(f, np.nan), np.zeros((f, 6)), np.zeros(len(cameras)))
 
     def lines(self, sights: Sights) -> Array:
-        """Rows (m, 4) by which corners lie below the middle of their picture."""
+        """Row offsets (m, 4), px, of corners below the middle of their picture."""
         middle = np.array([0.5 * (camera.height - 1) for camera in self.cameras])
         return np.asarray(sights.corners[..., 1] - middle[self.camera[sights.picture], None])
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Reprojection errors in sigmas, and their Jacobians, which are found when they are first asked for.
+    """Reprojection errors in sigmas, with Jacobians computed on demand.
 
     Attributes:
         miss: (m, 8) predicted - seen.
@@ -141,13 +141,13 @@ class Rows:
 
     @cached_property
     def by_picture(self) -> Array:
-        """Jacobian (m, 8, 6) by [delta, epsilon] of pictures: cRb Exp(delta), position + epsilon."""
+        """Jacobian (m, 8, 6) by picture pose steps [delta, epsilon]: cRb Exp(delta), position + epsilon."""
         by = np.concatenate([-self._by_turned @ so3.hat(self.turned), self.by_point], axis=-1)
         return by.reshape(-1, 8, 6)
 
     @cached_property
     def by_tag(self) -> Array:
-        """Jacobian (m, 8, 6) by [delta, epsilon] of tags: bRt Exp(delta), position + epsilon."""
+        """Jacobian (m, 8, 6) by tag pose steps [delta, epsilon]: bRt Exp(delta), position + epsilon."""
         in_b = self._by_turned if self.turn is None else self._by_turned @ so3.matrix(self.turn)
         in_t = in_b @ so3.matrix(self.bRt)[:, None]
         return np.concatenate([-in_t @ so3.hat(self.local), in_b], axis=-1).reshape(-1, 8, 6)
@@ -164,7 +164,7 @@ class Rows:
 
 
 def linearized(bundle: Bundle, sights: Sights) -> Rows:
-    """Errors (predicted - seen) of all sights and how they follow the poses."""
+    """Compute reprojection errors (predicted - seen) of all sights, and their Jacobians by the poses."""
     m, body = len(sights), bundle.body
     cRb, bRt, motion = bundle.cRb[sights.picture][:, None], body.bRt[sights.tag], bundle.motion[sights.picture][:, None]
     w, v = np.split(motion, 2, axis=-1)
@@ -190,7 +190,7 @@ def linearized(bundle: Bundle, sights: Sights) -> Rows:
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """A camera and the tags found in each of its pictures, in time order; at what time, s, if that is known."""
+    """A camera with the tags found in each of its pictures, in time order, and times, s, if known."""
 
     camera: Camera
     pictures: Sequence[Detections]
@@ -199,7 +199,7 @@ class Shots:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Sightings of all recordings together.
+    """Sights of all recordings combined.
 
     Attributes:
         start: the bundle with all pictures' poses at the origin.
@@ -216,7 +216,7 @@ _Seen = dict[int, tuple[Array, float]]
 
 
 def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
-    """The sights of the body's tags. An id that is seen twice in a picture counts as not seen there."""
+    """Collect the sights of the body's tags; ids seen twice in one picture are left out there."""
     cameras: list[Camera] = []
     pictures: list[_Seen] = []
     camera: list[int] = []
@@ -250,13 +250,13 @@ def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
 
 
 def _same(a: Camera, b: Camera) -> bool:
-    """Recordings whose camera info says the same were made by one camera."""
+    """Whether two cameras have equal calibrations, and so are one camera."""
     said = [(c.width, c.height, c.distortion_model, *c.intrinsics.tolist()) for c in (a, b)]
     return said[0] == said[1]
 
 
 def _usable(camera: Camera, given: TagBody, found: Detections) -> _Seen:
-    """Index of a tag of the body -> corners (4, 2) and their sigma, px."""
+    """Corners (4, 2) and their sigma, px, of each usable tag, by its index in the body."""
     ids, counts = np.unique(found.ids, return_counts=True)
     once = set(ids[counts == 1].tolist()) & set(given.ids.tolist())
     sigma = np.sqrt(np.diagonal(found.covariance, axis1=-2, axis2=-1).mean(axis=(1, 2)))
