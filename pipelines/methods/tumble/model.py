@@ -550,7 +550,7 @@ def _scatter_at_rest(t: Array, raw: Array, rests: Array, centre: Array) -> float
 
 
 def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float, at_rest: float) -> Noise:
-    """Stated noise in the recorded unit; without a statement that at rest, for counts else that of the residuals."""
+    """Noise as stated, in the recorded unit; if unstated, that at rest or, for counts, the first guess's scatter."""
     family = {"accel": "accelerometer", "mag": "magnetometer"}[name]
     if is_si:
         noise = stated(f"{name}_density", config, message, (family,))
