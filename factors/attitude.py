@@ -73,7 +73,7 @@ class VisionAttitudeFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Blocks of the variables: attitudes, bias, mounts, the pictures' errors and those of the gyros."""
+        """Blocks of the variables: attitudes, bias, mounts, picture errors, gyro errors."""
         picture = 1 if self.elapsed is None else len(PICTURE_ERRORS)
         return ROT3, 3, ROT3, ROT3, picture, *error_blocks(self.errors, self.platform_errors)
 
@@ -123,7 +123,7 @@ class VisionAttitudeFactor(Model):
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
 
     def _filtered(self, at: Array, picture: Array) -> tuple[Array, Array, Array]:
-        """What the filter turns bRv by (n, 3), the angular acceleration and the former's derivative by time."""
+        """Rotation (n, 3), rad, of bRv by the gyro's filter, angular acceleration, rotation derivative by time."""
         if picture.shape[1] == 1:
             nothing = np.zeros((len(at), 3))
             return nothing, nothing, nothing
@@ -132,7 +132,7 @@ class VisionAttitudeFactor(Model):
         return filter_ * acceleration, acceleration, filter_ * jerk
 
     def exposed(self, picture: Array) -> tuple[Array, Array]:
-        """When the pictures were taken (n,), s, and its derivatives by time offset and skew (n, 1 or 2)."""
+        """Exposure times (n,), s, and their derivatives by time offset and skew (n, 1 or 2)."""
         offset = picture[:, OFFSET_COLUMN]
         if picture.shape[1] == 1:
             return self.time + offset, np.ones((len(picture), 1))
@@ -141,7 +141,7 @@ class VisionAttitudeFactor(Model):
         return at, np.stack([np.ones_like(elapsed), -elapsed], axis=1)
 
     def _seen(self, cRh: Array, picture: Array) -> tuple[Array, Callable[[], Array], Array]:
-        """The attitudes with the scale of angles, and how cRh and that scale, if it is a variable, turn them."""
+        """Attitudes corrected by the angle scale, their derivatives by cRh, and (n, 3, .) by the scale."""
         n = len(cRh)
         if picture.shape[1] == 1:
             return cRh, lambda: np.eye(3), np.empty((n, 3, 0))
@@ -162,7 +162,7 @@ class VisionAttitudeFactor(Model):
 
 
 def faded(angle: Array) -> tuple[Array, Array]:
-    """Share of itself by which a scale enlarges an angle, 1 to FADE and 0 at half a turn; d(share angle)/d angle."""
+    """Weight of an angle scale, falling from 1 at FADE to 0 at half a turn, and d(weight * angle) / d angle."""
     phase = np.pi * np.clip((angle - FADE) / (np.pi - FADE), 0.0, 1.0)
     share = 0.5 * (1.0 + np.cos(phase))
     return share, share - angle * 0.5 * np.sin(phase) * np.pi / (np.pi - FADE)

@@ -37,7 +37,7 @@ _CHECKED: set[Hashable] = set()
 
 
 class _Evaluation:
-    """Whitened residuals (n, m) at some values, and the Jacobians (n, m, d) by the model's blocks once asked for."""
+    """Whitened residuals (n, m) at some values, with Jacobians (n, m, d) by block computed on demand."""
 
     def __init__(self, residuals: Array, linearize: Callable[[], tuple[Array, ...]], weights: Array | None) -> None:
         self.residuals = residuals if weights is None else weights * residuals
@@ -46,7 +46,7 @@ class _Evaluation:
 
     @property
     def jacobians(self) -> tuple[Array, ...]:
-        """By the model's blocks."""
+        """Jacobians (n, m, d) by each of the model's blocks."""
         if self._jacobians is None:
             blocks = self._linearize()
             self._jacobians = blocks if self._weights is None else _scaled(blocks, self._weights)
@@ -55,7 +55,7 @@ class _Evaluation:
 
 @dataclass
 class BoundModel:
-    """A model tied to variables: what a gtsam graph takes (`.factor`) and what reports ask for (`.residuals`).
+    """A model bound to graph variables, as a gtsam factor (`factor`) and for reports (`residuals`).
 
     Built by `Model.on`, which says what the fields are. `weights` (n, m) multiply the whitened residuals.
 
@@ -109,7 +109,7 @@ class BoundModel:
 
     @property
     def factor(self) -> gtsam.CustomFactor:
-        """A gtsam factor that evaluates this model and keeps it alive.
+        """Build a gtsam factor that evaluates this model and keeps the model alive.
 
         It is not kept here: the two would keep each other for good, since Python's garbage collector cannot see what
         gtsam holds.
@@ -121,20 +121,20 @@ class BoundModel:
         return self._at(values).residuals
 
     def rows(self, values: gtsam.Values) -> tuple[Array, Array]:
-        """Residuals (n * m,) and their Jacobian (n * m, d) on the keys, outliers in full."""
+        """Residuals (n * m,) and their Jacobian (n * m, d) by the keys, outliers at full weight."""
         augmented = self._augmented(values, None)
         return -augmented[:, -1], augmented[:, :-1]
 
     def linearized(self, values: gtsam.Values) -> gtsam.JacobianFactor:
-        """Linear factor as of `factor.linearize`, in a third of the time: that has gtsam take Jacobians key by key."""
+        """Linearise as `factor.linearize` does, but in a third of the time, without gtsam's copies key by key."""
         return jacobian_factor(self.keys, [*self.widths, 1], self._augmented(values, self.loss))
 
     def used(self, values: gtsam.Values) -> Mask:
-        """Which of the n measurements the loss lets count; all of them without one."""
+        """Mask (n,) of the measurements that the loss does not reject; all True without a loss."""
         return self._counts(self.residuals(values), self.loss) > 0.5
 
     def under(self, loss: TruncatedLoss | None) -> BoundModel:
-        """This model under another loss; unchanged where it has none."""
+        """Return the model with another loss; unchanged if the model has none."""
         if self.loss is None or self.loss == loss:
             return self
         other = copy(self)
@@ -142,7 +142,7 @@ class BoundModel:
         return other
 
     def weighed(self, weights: Array) -> BoundModel:
-        """This model with its whitened residuals multiplied by weights (m,) or (n, m): noise of 1 / weights.
+        """Multiply the whitened residuals by weights (m,) or (n, m): noise of 1 / weights.
 
         They take the place of those it has.
         """
@@ -152,7 +152,7 @@ class BoundModel:
         return other
 
     def only(self, kept: Mask) -> BoundModel:
-        """The model of some of its n measurements. Only for a model that names what is `stacked`."""
+        """Restrict the model to some of its n measurements; its class must declare `stacked`."""
         rows = np.flatnonzero(kept)
         tied = [column if isinstance(column, int) else [column[i] for i in rows] for column in self.columns]
         weights = None if self.weights is None else self.weights[rows]
@@ -160,15 +160,15 @@ class BoundModel:
 
     @property
     def divisible(self) -> bool:
-        """Whether `only` serves."""
+        """Whether the model can be restricted by `only`."""
         return hasattr(self.model, "stacked") and self.model.divisible
 
     def _counts(self, residuals: Array, loss: TruncatedLoss | None) -> Array:
-        """(n,) by how much the loss lets measurements count."""
+        """Robust weights (n,) of the measurements, from whitened residuals (n, m)."""
         return np.ones(len(residuals)) if loss is None else loss.weight(np.square(residuals).sum(axis=1))
 
     def _at(self, values: gtsam.Values) -> _Evaluation:
-        """The model at the values.
+        """Evaluate the model at the values, with a cache of the last evaluation.
 
         The last evaluation is kept: a solver asks for the error, then for the Jacobians at the same values, and a
         smoother asks again and again while its linearisation point stays.
@@ -183,7 +183,7 @@ class BoundModel:
         return self._last[1]
 
     def _arrays(self, variables: list[Any]) -> Iterator[Array]:
-        """For each column its variables' values, (n, width)."""
+        """Yield the values of each column's variables, (n, width)."""
         n = len(self.model.time)
         start = 0
         for column, block in zip(self.columns, self.blocks, strict=True):
@@ -193,7 +193,7 @@ class BoundModel:
             start = stop
 
     def _evaluate(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        """The error of the gtsam factor, and its Jacobians by key where they are asked for."""
+        """Return the whitened error of the gtsam factor, and write its Jacobians by key if requested."""
         if jacobians is None:
             residuals = self._at(values).residuals
             if self.loss is None:
@@ -208,7 +208,7 @@ class BoundModel:
         return np.asarray(-augmented[:, -1])
 
     def _augmented(self, values: gtsam.Values, loss: TruncatedLoss | None) -> Array:
-        """The linear system [A, b] (n * m, d + 1) by all keys under a loss."""
+        """Linear system [A, b] (n * m, d + 1) by all keys, weighted by a loss."""
         at = self._at(values)
         residuals, blocks = at.residuals, at.jacobians
         if loss is not None:
@@ -230,7 +230,7 @@ class BoundModel:
 
 
 def jacobian_factor(keys: list[int], widths: list[int], augmented: Array) -> gtsam.JacobianFactor:
-    """The linear factor of a whole system [A, b] (m, width); `widths` of its keys' columns, one after the other, and b.
+    """Build a linear factor from a whole system [A, b] (m, width); `widths` of each key's columns and of b.
 
     Only a conditional, here of nothing, can be made of a whole matrix in Python.
     """
@@ -240,7 +240,7 @@ def jacobian_factor(keys: list[int], widths: list[int], augmented: Array) -> gts
 
 @dataclass(frozen=True)
 class _Whitened(WrappedModel):
-    """A model whose residuals are whitened here.
+    """A model whose residuals this wrapper whitens.
 
     Attributes:
         model: whose residuals are not.
@@ -251,7 +251,7 @@ class _Whitened(WrappedModel):
 
     @classmethod
     def by(cls, model: Model, noise: gtsam.noiseModel.Base) -> _Whitened:
-        """Whitened by a Gaussian noise model of one measurement."""
+        """Whiten a model with a Gaussian noise model of one measurement."""
         gaussian, name = gtsam.noiseModel.Gaussian, type(model).__name__
         if not isinstance(noise, gaussian) or isinstance(noise, gtsam.noiseModel.Constrained):
             raise ValueError(f"{name}: the noise model must be Gaussian and no constraint; for outliers give a `loss`")
@@ -265,7 +265,7 @@ class _Whitened(WrappedModel):
 
 
 def _read(values: gtsam.Values, keys: Sequence[int], block: Block) -> list[Any]:
-    """Values of variables of one kind."""
+    """Read the values of variables of one kind from gtsam."""
     if block is ROT3:
         return [values.atRot3(key) for key in keys]
     if block is POSE3:
@@ -278,7 +278,7 @@ def _read(values: gtsam.Values, keys: Sequence[int], block: Block) -> list[Any]:
 
 
 def _array(variables: Sequence[Any], block: Block) -> Array:
-    """Values of variables, (n, width)."""
+    """Convert the values of variables to an array (n, width)."""
     if not isinstance(block, int):
         out = np.empty((len(variables), width(block)))
         rotations = list(variables) if block is ROT3 else [pose.rotation() for pose in variables]
@@ -290,7 +290,7 @@ def _array(variables: Sequence[Any], block: Block) -> Array:
 
 
 def value_at(values: gtsam.Values, key: int) -> gtsam.Rot3 | Array:
-    """A variable that is a rotation or a vector."""
+    """Read a variable that is a rotation or a vector from gtsam values."""
     try:
         return values.atRot3(key)
     except RuntimeError:
@@ -298,16 +298,16 @@ def value_at(values: gtsam.Values, key: int) -> gtsam.Rot3 | Array:
 
 
 def _name(key: int) -> str:
-    """A variable as people write it."""
+    """Name of a variable for error messages."""
     symbol = gtsam.Symbol(key)
     return str(symbol.string()) if symbol.chr() else str(key)
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether two values of a variable are equal to the last bit."""
+    """Whether two values of a variable are identical to the last bit."""
     return a.tobytes() == b.tobytes() if isinstance(a, np.ndarray) else bool(a.equals(b, 0.0))
 
 
 def _scaled(blocks: Sequence[Array], by: Array) -> tuple[Array, ...]:
-    """Jacobians (n, m, d) with rows multiplied by (n, m) or (n, 1)."""
+    """Multiply the rows of Jacobians (n, m, d) by (n, m) or (n, 1)."""
     return tuple(by[..., None] * block for block in blocks)

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 @lru_cache(maxsize=4096)
 def quantile(probability: float, dof: float) -> float:
-    """x with P(chi-square of dof degrees of freedom <= x) = probability; 0 without degrees of freedom."""
+    """Quantile of the chi-square distribution with dof degrees of freedom; 0 for dof = 0."""
     # Importing it takes longer than most commands that need no quantile.
     from scipy.special import gammaincinv
 
@@ -16,7 +16,7 @@ def quantile(probability: float, dof: float) -> float:
 
 
 def interval(probability: float, dof: float) -> tuple[float, float]:
-    """A true variance lies between these multiples of its estimate with this probability; infinite where unbounded.
+    """Confidence interval of a variance, as multiples of its estimate; infinite where unbounded.
 
     The estimate has dof (equivalent) degrees of freedom.
     """
@@ -26,12 +26,12 @@ def interval(probability: float, dof: float) -> tuple[float, float]:
 
 
 def gate(rows: int) -> float:
-    """Norm of `rows` whitened residuals that one good measurement in 10,000 exceeds."""
+    """Norm of `rows` whitened residuals that a good measurement exceeds with probability 1e-4."""
     return quantile(1.0 - 1e-4, rows) ** 0.5
 
 
 def student(z: float, dof: float) -> float:
-    """The number that Student's t exceeds as often as a standard normal number exceeds z > 0."""
+    """Quantile of Student's t with the same tail probability as a standard normal number z > 0."""
     from scipy.special import ndtr, stdtrit
 
     return abs(float(stdtrit(dof, ndtr(-z))))

@@ -41,7 +41,7 @@ def nominal_of(raw: Array, numbers: Array) -> Array:
 
 
 def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
-    """Mean distance (n,) of raw (n, 3) from the ellipsoid of rows of K and b (12,), for noise of sigma (n,).
+    """Mean distance (n,) of noisy readings (n, 3) from the ellipsoid of K and b (12,), for noise sigma (n,).
 
     With f = |K raw + b| of gradient g and second derivatives H it is sigma^2 (tr H / (2 |g|) - g'Hg / |g|^3).
     """
@@ -54,7 +54,7 @@ def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
 
 
 def sagitta(raw: Array, scatter: Array, numbers: Array) -> Array:
-    """Depth (n,) inside the ellipsoid of the means raw (n, 3) of its points with covariances (n, 3, 3).
+    """Depth (n,) inside the ellipsoid of means (n, 3) of points on it with covariances (n, 3, 3).
 
     In the symbols of `excess` it is tr (H scatter) / (2 |g|).
     """
@@ -69,7 +69,7 @@ def sagitta(raw: Array, scatter: Array, numbers: Array) -> Array:
 
 @dataclass(frozen=True)
 class StrengthFactor(Model):
-    """The length of a vector measured in any attitude: |K raw + b - drift| = s.
+    """Length s of a vector measured in any attitude: |K raw + b - drift| = s.
 
     Blocks: triad (9 or 12), s (1) and, of a sensor whose offset has drivers, what these do (m), see `drifted`.
 
@@ -136,7 +136,7 @@ class StrengthFactor(Model):
 
 @dataclass(frozen=True)
 class DipFactor(Model):
-    """The angle between two constant vectors, up and the field, measured together in any attitude: u . f = -sin dip.
+    """Angle between two constant vectors, up and the field, measured together in any attitude: u . f = -sin dip.
 
     u and f have the directions of K raw + b of the accelerometer and of the magnetometer. Blocks: both triads (9 or 12
     each), dip (1; rad, the field's inclination, positive down) and what the accelerometer's drivers do (m), as of the
@@ -189,7 +189,7 @@ class DipFactor(Model):
 
 
 def drifted(triads: Array, drivers: Array | None, slopes: Sequence[Array]) -> Array:
-    """Triads (n, 9 or 12) with b less the drift of their drivers; as they are where there are none.
+    """Subtract the drivers' drift from b of triads (n, 9 or 12); unchanged without drivers.
 
     Drivers (n, m) are three to each cause, along the axes of b: a temperature three times, or squares of what is felt.
     What they do, the last of `slopes` (n, m), is in the unit of b for each of theirs.
@@ -201,14 +201,14 @@ def drifted(triads: Array, drivers: Array | None, slopes: Sequence[Array]) -> Ar
 
 
 def by_slope(by_triad: Array, drivers: Array | None) -> tuple[Array, ...]:
-    """The Jacobian by what drivers do that goes with one by such triads, (n, d, 9 or 12); none where there are none."""
+    """Jacobian by the drivers' effects, from that by the drifted triads (n, d, 9 or 12); empty without drivers."""
     if drivers is None:
         return ()
     return (-np.tile(by_triad[..., -3:], drivers.shape[1] // 3) * drivers[:, None],)
 
 
 def _polar(raw: Array, triads: Array, symmetric: bool) -> tuple[Array, Array, Array]:
-    """Matrix K (n, 3, 3) of triads, and length (n,) and direction (n, 3) of the calibrated readings K raw + b."""
+    """Matrix K (n, 3, 3) of triads, length (n,) and direction (n, 3) of the calibrated readings K raw + b."""
     numbers = triads @ entries(symmetric).T
     vectors = nominal_of(raw, numbers)
     length = np.maximum(np.linalg.norm(vectors, axis=1), _LEAST)
@@ -216,6 +216,6 @@ def _polar(raw: Array, triads: Array, symmetric: bool) -> tuple[Array, Array, Ar
 
 
 def _by_triad(along: Array, raw: Array, symmetric: bool) -> Array:
-    """Jacobian (n, 1, d) of the component of K raw + b along vectors (n, 3) by the variable."""
+    """Jacobian (n, 1, d) of the component of K raw + b along vectors (n, 3), by the triad variable."""
     by_rows = np.concatenate([np.einsum("ni,nj->nij", along, raw).reshape(-1, 9), along], axis=1)
     return (by_rows @ entries(symmetric))[:, None]

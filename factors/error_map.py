@@ -12,7 +12,7 @@ from alidade.factors.model import Array, Block, Residuals, WrappedModel
 
 @dataclass(frozen=True)
 class ErrorMapFactor(WrappedModel):
-    """A model of measurements with an error that is linear in known functions of where each was made.
+    """Measurement model plus an error linear in given functions of the place of measurement.
 
     The first `axes` numbers of measurement i are larger by e_i = sum_j f_ij c_j, so that its residual is that of the
     model less sqrt_information e_i; of a rotation to first order in e_i times the noise. Blocks: those of the model,
@@ -30,11 +30,11 @@ class ErrorMapFactor(WrappedModel):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Blocks of the model and c."""
+        """Blocks of the model, then the map's coefficients c."""
         return (*self.model.blocks, self.functions.shape[1] * self.axes)
 
     def __call__(self, *blocks: Array) -> Residuals:
-        """Residual (n, m) and its Jacobians."""
+        """Residual (n, m) of the model minus the map's error, with Jacobians."""
         *own, c = blocks
         residuals, jacobians = self.model(*own)
         weight = self.model.sqrt_information[:, :, : self.axes]

@@ -28,7 +28,7 @@ _BLOCK = 10_000
 
 
 class GimbalPath:
-    """Gimbal angles at any time: the cubic through the two encoder samples on either side.
+    """Gimbal angles at any time, by cubic interpolation of two encoder samples on either side.
 
     Args:
         t: (G,) stamps, s, increasing, G >= 4.
@@ -42,7 +42,7 @@ class GimbalPath:
             raise ValueError(f"needs stamps (G,) and angles (G, 2), G >= 4; got {self.t.shape} and {self.angles.shape}")
 
     def weights(self, at: ArrayLike) -> tuple[Index, Array]:
-        """The four samples (n, 4) around each time and their weights (n, 4), Lagrange's polynomials."""
+        """Indices (n, 4) of the four samples around each time, and Lagrange weights (n, 4)."""
         at = np.asarray(at, dtype=float)
         first = np.clip(np.searchsorted(self.t, at, side="right") - 2, 0, len(self.t) - 4)
         samples = first[:, None] + np.arange(4)
@@ -64,7 +64,7 @@ class GimbalPath:
 
 @dataclass(frozen=True)
 class LocalMotion(Stacked):
-    """Smoothed motion of gyro and gimbal around the stamps of n pictures.
+    """Smoothed motion of gyro and gimbal near the stamps of n pictures.
 
     A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion
     is no larger than what noise puts into rates, and the gimbal follows the noise of the gyro that drives it. So the
@@ -101,7 +101,7 @@ class LocalMotion(Stacked):
         drivers: Array | None = None,
         before: LocalMotion | None = None,
     ) -> LocalMotion:
-        """The motion around times (n,), s, of a gyro's samples (N,), (N, 3), and drivers (N, d), and of a gimbal.
+        """Fit the motion of a gyro (N, 3), its drivers (N, d) and a gimbal around times (n,), s.
 
         Of a recording that grows windows and following stay as they were `before`.
         """
@@ -125,16 +125,16 @@ class LocalMotion(Stacked):
         )
 
     def turned(self, begin: Array, end: Array) -> Array:
-        """Rotation vectors (n, 3), rad, of the gyro between times (n, 1) from the stamps, s."""
+        """Gyro rotation vectors (n, 3), rad, between two times (n, 1), s, relative to the stamps."""
         powers = np.arange(1, _DEGREE + 2)
         return np.einsum("nk,nki->ni", (end**powers - begin**powers) / powers, self.rate)
 
     def turning(self, at: Array) -> Array:
-        """Rates (n, 3), rad/s, of the gyro at times (n, 1) from the stamps, s."""
+        """Gyro rates (n, 3), rad/s, at times (n, 1), s, relative to the stamps."""
         return np.einsum("nk,nki->ni", at ** np.arange(_DEGREE + 1), self.rate)
 
     def moved(self, read: Array, late: Array, delay: Array) -> tuple[Array, Array, Array]:
-        """Angles (n, 2), rad, at times `late` (n, 1) from the stamps, and their derivatives by late and delay.
+        """Gimbal angles (n, 2), rad, `late` (n, 1) s after the stamps, and derivatives by late and delay.
 
         What is read at a stamp, (n, 2), the gimbal reaches `delay` (n, 1) later. From there it moves by its commands,
         after the midpoint rule, and by what it does beyond them.
@@ -160,7 +160,7 @@ class LocalMotion(Stacked):
 
 
 def command(rate: Array, angles: Array) -> Array:
-    """Rates of azimuth and elevation (n, 2), rad/s, that hold the line of sight still at carrier rates (n, 3), rad/s.
+    """Azimuth and elevation rates (n, 2), rad/s, that keep the line of sight fixed at carrier rates (n, 3), rad/s.
 
     CN102288133B, of a gyro and a camera mounted straight; angles (n, 2) are azimuth and elevation, rad.
     """
@@ -170,7 +170,7 @@ def command(rate: Array, angles: Array) -> Array:
 
 
 def _command_change(rate: Array, angles: Array, by: Array) -> Array:
-    """Change (n, 2) of the commands at carrier rates (n, 3) with changes `by` (n, 2) of the angles."""
+    """Change (n, 2) of the commanded rates, rad/s, at carrier rates (n, 3), for angle changes `by` (n, 2), rad."""
     s, c, tangent = np.sin(angles[:, 0]), np.cos(angles[:, 0]), np.tan(angles[:, 1])
     ahead, right = c * rate[:, 1] - s * rate[:, 0], c * rate[:, 0] + s * rate[:, 1]
     azimuth, elevation = by.T
@@ -178,7 +178,7 @@ def _command_change(rate: Array, angles: Array, by: Array) -> Array:
 
 
 def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
-    """Angles through which the gimbal has been commanded since the first sample, and their derivative by a delay.
+    """Integrated commanded angles of the gimbal since the first sample, and their derivative by a delay.
 
     Returns:
         (N, 4) rad and rad/s: azimuth, elevation, and by how much more each is with the gyro read so much later.
@@ -194,7 +194,7 @@ def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
 
 
 def _following(gimbal: GimbalPath, commanded: GimbalPath) -> float:
-    """Share of commanded angles that a gimbal follows, 0 to 1, by its motion within tenths of a second.
+    """Share, 0 to 1, of commanded motion that the gimbal performs, from motion within tenths of a second.
 
     The sway in slower motion hides the gyro's noise, and faster motion is lost in the noise of pictures. Least absolute
     deviations of third differences, on which slews to another target have next to no influence.
@@ -210,7 +210,7 @@ def _following(gimbal: GimbalPath, commanded: GimbalPath) -> float:
 
 
 def _smoothing(at: Array, t: Array, values: Array) -> float:
-    """Half width, s, of the windows: the longest in which samples (N, d) between the times are predicted about best.
+    """Half width, s, of the smoothing windows: the longest that predicts samples (N, d) about best.
 
     Each sample by the others; of the squared errors the median, so that a few samples beside a slew do not count.
     """
@@ -226,12 +226,12 @@ def _smoothing(at: Array, t: Array, values: Array) -> float:
 
 
 def _count(t: Array, half: float) -> int:
-    """Samples in a window."""
+    """Number of samples in a window of half width `half`, s."""
     return int(np.clip(np.round(2.0 * half / np.median(np.diff(t))), 2 * _DEGREE + 1, len(t)))
 
 
 def _local_cubics(at: Array, t: Array, values: Array, half: float) -> Array:
-    """Coefficients (n, 4, d), lowest first, of cubics about the times fitted to the samples (N, d) within `half` s."""
+    """Coefficients (n, 4, d), lowest first, of cubics fitted to samples (N, d) within `half` s of each time."""
     count, scale = _count(t, half), half ** np.arange(_DEGREE + 1)
     out = np.empty((len(at), _DEGREE + 1, values.shape[1]))
     stamps, rows = sliding_window_view(t, count), sliding_window_view(values, count, axis=0)

@@ -37,7 +37,7 @@ _ROW, _COLUMN = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 
 
 def symmetric(numbers: Array) -> Array:
-    """The matrices (..., 3, 3) of the numbers xx yy zz xy xz yz, (..., 6)."""
+    """Symmetric matrices (..., 3, 3) from the numbers xx yy zz xy xz yz, (..., 6)."""
     out = np.empty((*numbers.shape[:-1], 3, 3))
     out[..., _ROW, _COLUMN] = numbers
     out[..., _COLUMN, _ROW] = numbers
@@ -45,7 +45,7 @@ def symmetric(numbers: Array) -> Array:
 
 
 def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tuple[Array, Derivatives]:
-    """Increments (n, 4) with the errors of their gyro taken off, and how these turn them further (on the right).
+    """Correct increments (n, 4) for the gyro's errors; also return right-side derivatives by these errors.
 
     Args:
         turns: n increments, with their scale_jacobian if there are errors and their driver_jacobian if D is among them.
@@ -79,26 +79,26 @@ def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tup
 
 
 def error_blocks(own: int, platform: bool) -> tuple[int, ...]:
-    """Sizes of the blocks of a gyro's errors, if it has `own`, and of those of a platform's gyro."""
+    """Sizes of the error blocks: the gyro's `own` numbers, if any, and those of a platform's gyro."""
     return (*([own] if own else []), *([PLATFORM] if platform else []))
 
 
 def parted(blocks: Sequence[Array], own: bool) -> tuple[Array | None, Array | None]:
-    """A gyro's errors, if it has its own, and those of a platform's gyro, None for a perfect one, from their blocks."""
+    """Split blocks into a gyro's own errors and those of a platform's gyro; None for an ideal gyro."""
     rest = list(blocks)
     errors = rest.pop(0) if own else None
     return errors, rest[0] if rest else None
 
 
 def platform_errors(gyro: GyroPath, variable: Array | None, n: int) -> tuple[Array, Array | None]:
-    """Bias (n, 3) and errors (n, 6) of a platform's gyro, which are one variable (n, 9); None: perfect."""
+    """Split a platform gyro's variable (n, 9) into bias (n, 3) and errors (n, 6); None for an ideal gyro."""
     if variable is None:
         return np.broadcast_to(gyro.bias_hat, (n, 3)), None
     return variable[:, :3], variable[:, 3:]
 
 
 def by_platform_errors(derivatives: Derivatives, variable: Array | None) -> tuple[Array, ...]:
-    """Derivatives by the variable of the platform gyro's errors."""
+    """Derivatives by the platform gyro's error variable."""
     return () if variable is None else (np.concatenate(derivatives(), axis=2),)
 
 
@@ -111,7 +111,7 @@ def carried(
     errors: Array | None,
     turns: Increments | None = None,
 ) -> tuple[Array, Array, Derivatives]:
-    """Increments over windows so short that what the gyro reads too much is constant in them.
+    """Gyro increments over windows so short that the gyro's error is constant within each.
 
     Args:
         gyro: the stream.
@@ -144,7 +144,7 @@ def carried(
 
 @dataclass(frozen=True)
 class GyroIncrementFactor(Model):
-    """Attitudes joined by what a gyro measured between them, over n windows: iRm_j = iRm_i dV(bias, errors).
+    """Gyro increments between attitudes over n windows: iRm_j = iRm_i dV(bias, errors).
 
     Equal to gtsam's AHRSFactor where the errors are zero. On a platform that turns and has a gyro of its own the
     attitudes are those on the platform: bRm_j = dB(platform)^T bRm_i dV. Blocks: attitudes i and j (rotations), gyro
@@ -178,7 +178,7 @@ class GyroIncrementFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitudes, bias and, where they are variables, errors and those of the platform."""
+        """Blocks of the variables: attitudes, bias, gyro errors and platform gyro errors, where variable."""
         platform = self.platform_turns is not None and self.platform_turns.scale_jacobian is not None
         return ROT3, ROT3, 3, *error_blocks(self.errors, platform)
 
@@ -220,7 +220,7 @@ class GyroIncrementFactor(Model):
     def _units(
         self, errors: Array | None, platform: Array | None, j: Array, error: Array
     ) -> tuple[Array, Callable[[], Array], Callable[[], Array], Callable[[], Array | float]]:
-        """The matrices from true units to those of white noise (n or 1, 3, 3), and what they add to derivatives.
+        """Matrices (n or 1, 3, 3) from true units to those of white noise, and their derivatives' contributions.
 
         Returns:
             The matrices, and the derivatives of matrix times error by the gyro's errors, by those of the platform's
@@ -256,14 +256,14 @@ class GyroIncrementFactor(Model):
 
 
 def _by_scale(vectors: Array) -> Array:
-    """Derivatives (n, 3, 6) of S v by the numbers of S, v (n, 3)."""
+    """Derivatives (n, 3, 6) of S v by the numbers of S, for vectors v (n, 3)."""
     return by_symmetric(np.eye(3)[:, :, None] * vectors[:, None, None, :])
 
 
 def rate_error(
     bias_error: Array, errors: Array | None, rate: Array, drivers: Array | None
 ) -> tuple[Array, Derivatives]:
-    """Error (n, 3), rad/s, of a gyro's reading, given the reading and its drivers, and its derivatives.
+    """Error (n, 3), rad/s, of a gyro's reading, by the reading and its drivers, with derivatives.
 
     Args:
         bias_error: (n, 3), the bias beyond what was taken off the rates.
@@ -294,28 +294,28 @@ def rate_error(
 
 
 def _inverse(errors: Array) -> tuple[Array, Array, Array]:
-    """S, N = (I + S)^-1 and I - N, all symmetric, (n, 3, 3) each, or (1, 3, 3) when all rows are one."""
+    """Symmetric matrices S, N = (I + S)^-1 and I - N, (n, 3, 3) each, or (1, 3, 3) if all rows are one variable."""
     S = symmetric(_distinct(errors)[:, :SCALE])
     N = np.linalg.inv(np.eye(3) + S).astype(float, copy=False)
     return S, N, N @ S
 
 
 def _driven(errors: Array) -> Array | None:
-    """D, (n or 1, 3, d), if it is among the errors."""
+    """Driver matrix D (n or 1, 3, d) among a gyro's errors; None if absent."""
     numbers = _distinct(errors)[:, SCALE:]
     count = numbers.shape[1]
     return (numbers @ _entries(count).T).reshape(len(numbers), 3, -1) if count else None
 
 
 def _by_driven(by_entry: Array, errors: Array) -> Array:
-    """Derivatives by the entries of D, (n, 3, 3, d), to those by its numbers among the errors."""
+    """Convert derivatives by the entries of D, (n, 3, 3, d), to derivatives by D's numbers."""
     entries = _entries(errors.shape[1] - SCALE)
     return np.asarray(by_entry.reshape(-1, len(entries)) @ entries).reshape(len(by_entry), 3, -1)
 
 
 @cache
 def _entries(numbers: int) -> Array:
-    """What each number of D adds to its entries by rows, (3 d, numbers): 9 of G, 3 of c, 1 of a dead band."""
+    """Matrix (3 d, numbers) from the numbers of D to its entries by rows: 9 of G, 3 of c, 1 of a dead band."""
     from scipy.linalg import block_diag
 
     parts = [np.eye(9).reshape(3, 3, 9)] if numbers >= 9 else []
@@ -325,12 +325,12 @@ def _entries(numbers: int) -> Array:
 
 
 def _distinct(rows: Array) -> Array:
-    """One row instead of many that are one variable."""
+    """Reduce rows broadcast from one variable to a single row."""
     return rows[:1] if rows.strides[0] == 0 else rows
 
 
 def needed(given: Array | None) -> Array:
-    """The optional input of a model, which its variables need. Raises ValueError where it is None."""
+    """Return an optional model input that its variables need. Raises ValueError if it is None."""
     if given is None:
         raise ValueError(
             "errors of a gyro need increments with scale=True and, for D, drivers; its slope over temperature needs "
@@ -344,7 +344,7 @@ def _apply(matrices: Array, vectors: Array) -> Array:
 
 
 def by_symmetric(by_entry: Array) -> Array:
-    """Derivatives by the entries of a matrix, (n, 3, 3, 3), to those by the numbers of a symmetric one, (n, 3, 6)."""
+    """Convert derivatives by matrix entries (n, 3, 3, 3) to those by a symmetric matrix's six numbers (n, 3, 6)."""
     out = by_entry[..., _ROW, _COLUMN]
     out[..., 3:] += by_entry[..., _COLUMN[3:], _ROW[3:]]
     return out

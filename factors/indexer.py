@@ -78,13 +78,13 @@ class PlatformRates:
     noise: Array
 
     def parts(self, encoder: Array) -> Array:
-        """The three parts (n, part, 3) with the encoders' errors, (5,) or (n, 5)."""
+        """Rate parts (n, part, 3) corrected for encoder errors (5,) or (n, 5)."""
         parts = np.stack([self.fixed, self.cosine, self.sine], axis=1)
         return parts + np.einsum("npie,ne->npi", self.by_encoder, np.broadcast_to(encoder, (len(parts), 5)))
 
 
 class AxisPath:
-    """The encoder stream integrated once; the platform's mean rate over any window then costs a look-up.
+    """Integrated encoder stream, which gives the platform's mean rate over any window by look-up.
 
     Between samples both axes are taken to turn uniformly; the angles at a window's ends are interpolated to third
     order.
@@ -138,7 +138,7 @@ class AxisPath:
         return PlatformRates(edges, mean[:, 0], mean[:, 1], mean[:, 2], by_encoder, np.hstack(columns))
 
     def _by_encoder(self, edges: Array, angles: Array, speed: Array) -> Array:
-        """Derivatives of the mean rates' parts by the encoders' errors, (n, part, 3, 5), from what holds at the edges.
+        """Derivatives (n, part, 3, 5) of the mean rate parts by the encoder errors, from values at the edges.
 
         Errors of the axes' angles turn the platform by phi, and a turned body's rate w grows by phi' + w x phi: the
         first integrates to the edges, the second is summed over the samples between them.
@@ -182,7 +182,7 @@ class AxisPath:
         return np.asarray(total / np.diff(edges)[:, None, None, None])
 
     def _interpolation(self, at: Array, i: Index) -> tuple[Array, Index]:
-        """Weights and indexes (n, 4) of the samples that make the angles at the times, in the intervals i.
+        """Weights and sample indices (n, 4) for cubic interpolation of the angles at times in the intervals i.
 
         Cubic: the straight line between the two neighbours, corrected by the curvature that the next two show.
         """
@@ -195,7 +195,7 @@ class AxisPath:
         return np.stack([-bend, 1.0 - share + bend, share + bend, -bend], axis=1), samples
 
     def _arc(self, duration: Array, begin: Array, end: Array) -> Array:
-        """Integrals (n, part, 3) of the platform's rate while both axes turn uniformly from begin to end (n, 2)."""
+        """Integrals (n, part, 3) of the platform rate for uniform rotation of both axes from begin to end (n, 2)."""
         turned = end - begin
         middle, half = begin[:, 1] + 0.5 * turned[:, 1], 0.5 * turned[:, 1]
         by_outer = (turned[:, 0] * np.sinc(half / np.pi))[:, None]
@@ -208,18 +208,18 @@ class AxisPath:
         return out
 
     def _base_rate_in_platform(self, angles: Array) -> Array:
-        """The base's rate in t, as its three parts, (n, part, 3)."""
+        """Inertial rate of the base in t, as its three parts, (n, part, 3), rad/s."""
         return _in_platform(self._base_rate_turned(angles[:, 0]), angles[:, 1])
 
     def _base_rate_turned(self, outer: Array) -> Array:
-        """The base's rate behind the outer axis, (n, 3)."""
+        """Inertial rate of the base in the frame behind the outer axis, (n, 3), rad/s."""
         x, y, z = self._base_rate
         c, s = np.cos(outer), np.sin(outer)
         return np.stack([np.full_like(c, x), c * y + s * z, c * z - s * y], axis=1)
 
 
 def _in_platform(vectors: Array, inner: Array) -> Array:
-    """Vectors (n, 3) behind the outer axis seen in t, as their parts, (n, part, 3)."""
+    """Rotate vectors (n, 3) from the frame behind the outer axis to t, as parts (n, part, 3)."""
     vx, vy, vz = vectors.T
     c, s = np.cos(inner), np.sin(inner)
     zero = np.zeros_like(vx)
@@ -228,13 +228,13 @@ def _in_platform(vectors: Array, inner: Array) -> Array:
 
 
 def gyro_edges(t: Array) -> Array:
-    """Edges (N + 1,) of the intervals that gyro samples at the stamps (N,) are the means of: halfway between stamps."""
+    """Edges (N + 1,), s, of the averaging intervals of gyro samples at stamps (N,): midpoints of stamps."""
     middle = 0.5 * (t[1:] + t[:-1])
     return np.concatenate([[2.0 * t[0] - middle[0]], middle, [2.0 * t[-1] - middle[-1]]])
 
 
 def gyro_means(edges: Array, rate: Array, cuts: Index) -> Array:
-    """Mean gyro rates (n, 3) over the samples from cut to cut (n + 1,), weighed with the intervals between edges."""
+    """Mean gyro rates (n, 3) between consecutive cuts (n + 1,), weighted by the intervals between edges."""
     edges = edges[cuts[0] : cuts[-1] + 1]
     moved = rate[cuts[0] : cuts[-1]] * np.diff(edges)[:, None]
     at = cuts - cuts[0]
@@ -243,7 +243,7 @@ def gyro_means(edges: Array, rate: Array, cuts: Index) -> Array:
 
 @dataclass(frozen=True)
 class IndexerAverageFactor(Model):
-    """Mean gyro rate over n adjoining windows against the mean that the encoders and the earth's rate say.
+    """Mean gyro rate over n adjoining windows against the mean rate by encoders and earth.
 
         gyro = (I + S) mRt w + bias + c dT,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
 
@@ -283,7 +283,7 @@ class IndexerAverageFactor(Model):
         theta_unit: float = 1.0,
         temperature: Array | None = None,
     ) -> IndexerAverageFactor:
-        """A factor whose sqrt_information follows from the noise of the sensors.
+        """Build a factor with sqrt_information from the noise of the sensors.
 
         Args:
             gyro, rates, options, theta_unit, temperature: as the attributes.
@@ -305,7 +305,7 @@ class IndexerAverageFactor(Model):
 
     @property
     def time(self) -> Array:
-        """Ends of the windows (n,), s."""
+        """End times of the windows (n,), s."""
         return self.rates.edges[1:]
 
     @property
@@ -350,12 +350,12 @@ class IndexerAverageFactor(Model):
         return self._whiten(error[..., None])[..., 0], jacobians
 
     def _whiten(self, block: Array) -> Array:
-        """sqrt_information times a block (n, 3, d), all windows together."""
+        """Multiply blocks (n, 3, d) by sqrt_information."""
         return np.asarray((self.sqrt_information @ block.reshape(-1, block.shape[2])).reshape(block.shape))
 
 
 def _angle_axes(theta: Array) -> Array:
-    """Axes in m, as columns (n, 3, 3), about which m turns in t when theta_x, theta_y, theta_z grow."""
+    """Rotation axes in m, columns (n, 3, 3), for increments of theta_x, theta_y, theta_z."""
     about_x = so3.exp(-theta[:, :1] * _EX)
     about_y = so3.multiply(about_x, so3.exp(-theta[:, 1:2] * _EY))
     axes = [np.broadcast_to(_EX, theta.shape), so3.rotate(about_x, _EY), so3.rotate(about_y, _EZ)]

@@ -58,7 +58,7 @@ _PLACES = {
 
 @dataclass(frozen=True)
 class LosContext(Stacked):
-    """Motion and times of n pictures, which the derivatives by sensor errors need.
+    """Motion and times of n pictures, required for derivatives by sensor errors.
 
     Attributes:
         motion: of gyro and gimbal near the stamps.
@@ -74,13 +74,13 @@ class LosContext(Stacked):
     stacked: ClassVar = ("motion", "elapsed", "tracked", "stamp_shift")
 
     def late(self, sight: Array) -> Array:
-        """Time (n,), s, from the shifted stamps to the exposures, by SIGHT_ERRORS (n, 10)."""
+        """Delay (n,), s, from the shifted stamps to the exposures, by SIGHT_ERRORS (n, 10)."""
         return np.asarray(sight[:, 0] - sight[:, 1] * self.elapsed - self.stamp_shift)
 
 
 @dataclass(frozen=True)
 class LosDirectionFactor(Model):
-    """LOS errors of one target, exact for mounting angles of any size.
+    """LOS errors of one target, exact for arbitrarily large mounting angles.
 
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
@@ -116,12 +116,12 @@ class LosDirectionFactor(Model):
 
     @property
     def rows(self) -> int:
-        """Numbers of a residual: 2, or 3 with the roll."""
+        """Number of rows of a residual: 2, or 3 with the roll."""
         return self.measured.shape[1]
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Blocks of the variables: tRm, the angles and, with a context, bias, SIGHT_ERRORS and the gyro's errors."""
+        """Blocks of the variables: tRm, mounting angles; with a context also bias, SIGHT_ERRORS and gyro errors."""
         if self.context is None:
             return ROT3, len(self.names)
         return ROT3, len(self.names), 3, len(SIGHT_ERRORS), *([self.errors] if self.errors else [])
@@ -171,7 +171,7 @@ class LosDirectionFactor(Model):
         return residual, jacobians
 
     def _gimbal(self, move: LocalMotion, encoder: Array, late: Array, delay: Array) -> tuple[Array, ...]:
-        """Angles (n, 2) at times `late` (n, 1), and derivatives by late, delay (n, 2), s and c (n, 2, 2).
+        """True angles (n, 2) `late` (n, 1) s after the stamps; derivatives by late, delay (n, 2), s, c (n, 2, 2).
 
         The errors (n, 4) are s and c of each encoder; angle + s sin(angle) + c cos(angle) = reading is solved by a step
         of fixed-point iteration and one of Newton's, which leaves s^4.
@@ -196,7 +196,7 @@ class LosDirectionFactor(Model):
 
     @cached_property
     def _places(self) -> tuple[list[str], Array]:
-        """The turns that matter, and what each angle adds to each of them."""
+        """Names of the elementary rotations in use, and each mounting angle's sign in these (turns, angles)."""
         touched = {_PLACES[name][0] for name in self.names} | {"azimuth", "elevation"}
         turns = [turn for turn in _TURNS if turn in touched]
         places = np.zeros((len(turns), len(self.names)))
@@ -206,7 +206,7 @@ class LosDirectionFactor(Model):
         return turns, places
 
     def _camera(self, tRm: Array, angles: Array, gimbal: Array) -> Array:
-        """cRt and beside it the axes of the turns in c, (3, 3 + turns, n)."""
+        """Camera matrix cRt with the elementary rotations' axes in c beside, (3, 3 + turns, n)."""
         turns, places = self._places
         angle = places @ angles.T
         angle[turns.index("azimuth")] += gimbal[:, 0]
@@ -226,7 +226,7 @@ class LosDirectionFactor(Model):
     def _residuals(
         self, tRm: Array, angles: Array, gimbal: Array, scale: Array | float
     ) -> tuple[Array, Array, Callable[[], tuple[Array, Array, Array]]]:
-        """Residuals with phx, phz measured larger by `scale` (n, 1), phx, phz and roll, and derivatives.
+        """Residuals with measured phx, phz scaled by `scale` (n, 1); phx, phz, roll; derivatives on demand.
 
         The derivatives are by tRm, angles and gimbal angles.
         """
@@ -253,7 +253,7 @@ class LosDirectionFactor(Model):
 def _carried(
     motion: LocalMotion, late: Array, bias: Array, errors: Array | None
 ) -> tuple[Array, Array, Callable[[], list[Array]]]:
-    """Turns (n, 4) of the gyro from the stamps to times `late` (n,) after them, and how they turn on (on the right).
+    """Gyro rotations (n, 4) from the stamps to `late` (n,) s after these, with derivatives on the right.
 
     Returns:
         The turns, and their derivatives by `late` (n, 3, 1) and by bias and errors.
@@ -276,14 +276,14 @@ def _carried(
 
 
 def _picture(cRt: Array) -> Array:
-    """phx, phz, roll, (n, 3), of the target in cameras cRt (3, 3, n)."""
+    """LOS errors and roll phx, phz, roll, (n, 3), rad, of the target for camera attitudes cRt (3, 3, n)."""
     x, y, z = cRt[:, 1]
     roll = np.arctan2(cRt[2, 0] - cRt[0, 2], cRt[0, 0] + cRt[2, 2])
     return np.stack([-np.arctan2(z, y), np.arctan2(x, y), roll], axis=1)
 
 
 def _picture_jacobian(cRt: Array) -> Array:
-    """Derivative (n, 3, 3) of phx, phz, roll by xi in Exp(xi) cRt."""
+    """Derivative (n, 3, 3) of phx, phz, roll by the left perturbation xi in Exp(xi) cRt."""
     x, y, z = cRt[:, 1]
     out = np.empty((cRt.shape[2], 3, 3))
     yz, xy = y * y + z * z, x * x + y * y

@@ -11,7 +11,7 @@ from alidade.factors.model import Array
 
 @dataclass(frozen=True)
 class TruncatedLoss:
-    """Truncated least squares on each measurement's whitened norm, or a relaxation of it.
+    """Truncated least squares on each measurement's whitened norm, or a relaxation by `mu`.
 
     Beyond `gate` a measurement costs gate**2 / 2, whatever its size, without influence. `mu` = inf is that loss; a
     small mu is a convex surrogate, mu = 0 its limit, plain least squares. Graduated non-convexity goes from one to the
@@ -23,7 +23,7 @@ class TruncatedLoss:
     mu: float = np.inf
 
     def __post_init__(self) -> None:
-        """Raises ValueError where gate <= 0 or mu < 0."""
+        """Raise ValueError where gate <= 0 or mu < 0."""
         if not self.gate > 0.0 or not self.mu >= 0.0:
             raise ValueError(f"TruncatedLoss: gate {self.gate:g} must be above 0, mu {self.mu:g} not below")
 

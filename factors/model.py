@@ -29,7 +29,7 @@ Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
 
 
 class LieGroup(Enum):
-    """Variables of a Lie group other than vectors."""
+    """Kinds of Lie group variables other than vectors."""
 
     ROT3 = "ROT3"
     POSE3 = "POSE3"
@@ -50,15 +50,15 @@ Keys = int | Sequence[int] | NDArray[np.integer]
 
 
 class Stacked:
-    """A dataclass whose fields named by `stacked` hold something for each of n rows; `[rows]` selects some of them."""
+    """Dataclass with per-row fields, named by `stacked`; `[rows]` selects rows of all these."""
 
     def __getitem__(self, rows: Any) -> Self:
-        """The same of the selected rows."""
+        """Select rows of all `stacked` fields."""
         return cast(Self, select_rows(self, rows))
 
 
 class Model:
-    """n measurements of m rows each, predicted from blocks of variables; base class of all vectorised models.
+    """Measurement model: n measurements of m rows, predicted from blocks of variables. Base of vectorised models.
 
     A subclass, best a frozen dataclass, has
 
@@ -82,7 +82,7 @@ class Model:
     shapes: ClassVar[Mapping[str, tuple[int, ...]]] = {}
 
     def __post_init__(self) -> None:
-        """Of a dataclass, which calls it when it is made. Raises ValueError, see above."""
+        """Validate the fields of a new instance. Raises ValueError for an invalid one."""
         try:
             _make_sound(self)
         except ValueError as error:
@@ -92,18 +92,18 @@ class Model:
 
         @property
         def time(self) -> Array:
-            """(n,) s."""
+            """Times of the measurements (n,), s."""
 
         @property
         def rows(self) -> int:
-            """m."""
+            """Number m of rows of a measurement."""
 
         @property
         def blocks(self) -> tuple[Block, ...]:
-            """What the variables are."""
+            """Kinds of the variable blocks."""
 
         def __call__(self, *blocks: Any, **_: Any) -> Residuals:
-            """Residuals and Jacobians."""
+            """Return whitened residuals (n, m), and a function that gives their Jacobians (n, m, d) by each block."""
 
     def without_noise(self, *_: Any) -> Model:
         """Return the model of the nearest measurements whose residuals are zero, if noise enters the Jacobians."""
@@ -115,7 +115,7 @@ class Model:
         loss: TruncatedLoss | None = None,
         noise: gtsam.noiseModel.Base | None = None,
     ) -> BoundModel:
-        """The model tied to variables; its `.factor` is what a gtsam graph takes.
+        """Bind the model to variables; the result's `factor` is for gtsam graphs.
 
         Args:
             keys: for each block one key that all measurements share, or a key for each of the n.
@@ -132,7 +132,7 @@ class Model:
 
 @dataclass(frozen=True)
 class WrappedModel(Model):
-    """A model made of another one, with its measurements, rows and blocks unless it says otherwise.
+    """Model that wraps another one, and by default has its measurements, rows and blocks.
 
     Attributes:
         model: the other one.
@@ -142,27 +142,27 @@ class WrappedModel(Model):
 
     @property
     def time(self) -> Array:
-        """(n,) s."""
+        """Times of the measurements (n,), s."""
         return np.asarray(self.model.time)
 
     @property
     def rows(self) -> int:
-        """Rows of a measurement."""
+        """Number of rows of a measurement."""
         return int(self.model.rows)
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """What the variables are."""
+        """Kinds of the variable blocks."""
         return tuple(self.model.blocks)
 
     @property
     def sqrt_information(self) -> Array:
-        """Square-root information (n, m, m) of the measurements, where the other one has it."""
+        """Square-root information (n, m, m) of the measurements, if the wrapped model has it."""
         return np.asarray(self.model.sqrt_information)
 
 
 def width(block: Block) -> int:
-    """Number of values with which a model receives a variable."""
+    """Number of values that represent one variable in a model's input."""
     return block if isinstance(block, int) else {ROT3: 4, POSE3: 7}[block]
 
 
@@ -172,7 +172,7 @@ def dimension(block: Block) -> int:
 
 
 def retract(values: Array, block: Block, delta: Array) -> Array:
-    """Variables (n, width) moved by tangent vectors (dimension,) or (n, dimension)."""
+    """Retract variables (n, width) along tangent vectors (dimension,) or (n, dimension)."""
     if block is ROT3:
         return so3.multiply(values, so3.exp(delta))
     if block is POSE3:
@@ -182,7 +182,7 @@ def retract(values: Array, block: Block, delta: Array) -> Array:
 
 
 def check(model: Model) -> None:
-    """Evaluate a model once near the origin, to see that residuals and Jacobians are as it declares.
+    """Evaluate a model once near the origin, to verify the declared shapes of residuals and Jacobians.
 
     Of many measurements that may be evaluated by themselves a hundred are tried.
 
@@ -216,7 +216,7 @@ def check(model: Model) -> None:
 
 
 def _make_sound(model: Any) -> None:
-    """Make arrays of a model's fields that hold numbers, and raise ValueError where one is not as it declares."""
+    """Convert a model's array fields to float arrays, and raise ValueError for an invalid one."""
     for field in fields(model):
         name, value = field.name, getattr(model, field.name)
         if str(field.type).partition(" ")[0] == "Array" and value is not None:
@@ -246,7 +246,7 @@ def _make_sound(model: Any) -> None:
 
 
 def _require_numbers(name: str, array: Any) -> None:
-    """Raise ValueError where an array of floats has one that is not finite, or is a sigma that is not above zero."""
+    """Raise ValueError for an array with a number that is not finite, or a sigma that is not positive."""
     if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
         return
     is_sigma = name in _SIGMAS
@@ -260,7 +260,7 @@ def _require_numbers(name: str, array: Any) -> None:
 
 
 def stacking_key(model: Model) -> Hashable:
-    """Equal for models that `stack_models` can make one of: all but what is `stacked` is alike."""
+    """Key that is equal for models that `stack_models` can combine: those that differ in `stacked` fields only."""
     stacked = getattr(model, "stacked", None)
     if stacked is None:
         return id(model)
@@ -272,7 +272,7 @@ def stacking_key(model: Model) -> Hashable:
 
 
 def stack_models(parts: Sequence[Any]) -> Any:
-    """One model, array or list of several, their `stacked` fields one after the other."""
+    """Concatenate models, arrays or lists along their rows; of models the `stacked` fields."""
     first = parts[0]
     if first is None or len(parts) == 1:
         return first
@@ -284,7 +284,7 @@ def stack_models(parts: Sequence[Any]) -> Any:
 
 
 def select_rows(whole: Any, rows: Index) -> Any:
-    """The measurements of a model, an array or a list at some rows."""
+    """Select rows of a model's measurements, of an array, or of a list."""
     if whole is None or isinstance(whole, np.ndarray):
         return whole if whole is None else whole[rows]
     if isinstance(whole, list):

@@ -45,7 +45,7 @@ _TOGETHER = 20_000
 
 @dataclass(frozen=True)
 class Increments(Stacked):
-    """Rotations over n windows: aRb with a the sensor at a window's start, b at its end.
+    """Rotations aRb over n windows; a: sensor frame at a window's start, b: at its end.
 
     Attributes:
         duration: (n,), s.
@@ -70,7 +70,7 @@ class Increments(Stacked):
 
 
 class GyroPath:
-    """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
+    """Integrated gyro stream, which gives the rotation over any window by look-up.
 
     It is integrated block by block. The first blocks looked at are kept, three million samples, and the others of a
     longer stream are integrated anew when they are needed. Stamps and rates as given stay at hand as `t` and `read`,
@@ -117,11 +117,11 @@ class GyroPath:
             self._starts.append(self._block(number).attitude[-1:].copy())
 
     def with_rate(self, rate: Array) -> GyroPath:
-        """The same stream with other rates (N, 3), rad/s."""
+        """Return the same stream with other rates (N, 3), rad/s."""
         return GyroPath(self.t, rate, self.bias_hat, self._driving, self._density, self._hidden)
 
     def _block(self, number: int) -> _Block:
-        """The integrated block of sample intervals with this number."""
+        """Return one integrated block of sample intervals, by its number."""
         if number not in self._kept:
             begin = number * _BLOCK
             end = min(begin + _BLOCK, len(self.t) - 1)
@@ -139,7 +139,7 @@ class GyroPath:
         return self._kept[number]
 
     def _found(self, i: Index, of: Callable[[_Block], Array], adds: bool = False) -> Array:
-        """Per-sample values (n, ...) from the blocks of samples (n,).
+        """Gather per-sample values (n, ...) from the blocks that hold the samples (n,).
 
         Args:
             i: the samples.
@@ -166,13 +166,13 @@ class GyroPath:
         return out
 
     def attitude(self, at: ArrayLike) -> Array:
-        """Attitude (n, 4) of the sensor at the times, in its frame at the first stamp."""
+        """Attitude (n, 4) at the times, relative to the sensor frame at the first stamp."""
         i, s = self._place(np.asarray(at, dtype=float))
         rate, slope = self._line(i, _rates)
         return so3.multiply(self._found(i, _attitudes), so3.exp(_arc(rate, slope, s)))
 
     def rate(self, at: ArrayLike) -> Array:
-        """Rate (n, 3) at the times, linear between samples, bias_hat taken off, rad/s."""
+        """Rate (n, 3), rad/s, at the times, interpolated linearly, minus bias_hat."""
         i, s = self._place(np.asarray(at, dtype=float))
         rate, slope = self._line(i, _rates)
         return np.asarray(rate + slope * s)
@@ -188,7 +188,7 @@ class GyroPath:
         return (rate[n:] - rate[:n]) / (2.0 * half), (slope[n:] - slope[:n]) / (2.0 * half)
 
     def drivers(self, at: ArrayLike) -> Array | None:
-        """The drivers (n, d) at the times; None without."""
+        """Interpolated drivers (n, d) at the times; None without drivers."""
         if not self._driving.shape[1]:
             return None
         i, s = self._place(np.asarray(at, dtype=float))
@@ -196,11 +196,11 @@ class GyroPath:
         return np.asarray(before + slope * s)
 
     def unseen(self, start: Array, stop: Array) -> Array:
-        """`Increments.unseen` (n,) over windows, rad^2 per axis."""
+        """Variance (n,) of `Increments.unseen` over windows, rad^2 per axis."""
         return np.abs(np.interp(stop, *self._unseen) - np.interp(start, *self._unseen))
 
     def increments(self, start: ArrayLike, stop: ArrayLike, scale: bool = False) -> Increments:
-        """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
+        """Rotations over the windows [start, stop], (n,) each, s; windows may be empty or run backwards.
 
         Beyond the first and the last stamp the outermost rates are continued; callers keep windows inside.
 
@@ -249,7 +249,7 @@ class GyroPath:
         return replace(turned, scale_jacobian=by[0], driver_jacobian=by[1] if len(by) == 2 else None)
 
     def _moments(self, i: Index, s: Array, begun: Array, vector: Callable[[_Block], Array]) -> Array:
-        """Integral over windows of the attitude matrix times each component of a vector, (n, 3, 3 d): [i, d a + b].
+        """Integral of attitude matrix times vector components over windows, (n, 3, 3 d): [i, d a + b].
 
         Within a sample interval the attitude's integral is taken with the vector's mean, which leaves out a twelfth of
         how both change in it.
@@ -266,19 +266,19 @@ class GyroPath:
         return np.asarray(stop - start)
 
     def _line(self, i: Index, vector: Callable[[_Block], Array]) -> tuple[Array, Array]:
-        """A vector (n, d) of the blocks' at samples, and its slope until the next."""
+        """Vector values (n, d) at samples, and the slopes to the next samples."""
         before = self._found(i, vector)
         return before, (self._found(i + 1, vector) - before) / (self.t[i + 1] - self.t[i])[:, None]
 
     def _place(self, at: Array) -> tuple[Index, Array]:
-        """The sample intervals that hold the times, (n,), and the time since their start, (n, 1), s."""
+        """Index (n,) of the sample interval at each time, and time since its start (n, 1), s."""
         i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
         return i, (at - self.t[i])[:, None]
 
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Consecutive samples of a gyro.
+    """Consecutive gyro samples, integrated together.
 
     Attributes:
         t: (n,) s.
@@ -294,26 +294,26 @@ class _Block:
 
     @property
     def arc(self) -> Array:
-        """Rotation vectors (n - 1, 3) over the intervals."""
+        """Rotation vectors (n - 1, 3), rad, over the sample intervals."""
         step = np.diff(self.t)[:, None]
         return _arc(self.rate[:-1], np.diff(self.rate, axis=0) / step, step)
 
     @cached_property
     def attitude(self) -> Array:
-        """At the samples, (n, 4), in the sensor's frame at the stream's first."""
+        """Attitudes (n, 4) at the samples, relative to the sensor frame at the stream's first sample."""
         turned = so3.multiply(self.start, running_product(so3.exp(self.arc)))
         return np.concatenate([self.start, so3.normalize(turned)])
 
     @cached_property
     def integral(self) -> Array:
-        """Integral (n, 3, 3) of the attitude matrix until each sample: every window's bias Jacobian follows from it."""
+        """Cumulative integral (n, 3, 3) of the attitude matrix at each sample, for bias Jacobians of windows."""
         integral = np.zeros((len(self.t), 3, 3))
         pieces = np.diff(self.t)[:, None, None] * so3.right_jacobian(-self.arc)
         np.cumsum(so3.matrix(self.attitude[:-1]) @ pieces, axis=0, out=integral[1:])
         return integral
 
     def moments(self, vector: Callable[[_Block], Array]) -> Array:
-        """Integral (n, 3, 3, d) of the attitude matrix times each component of a vector until each sample."""
+        """Cumulative integral (n, 3, 3, d) of the attitude matrix times each component of a vector, at each sample."""
         values = vector(self)
         mean = np.ascontiguousarray(0.5 * (values[1:] + values[:-1]).T)
         turned = np.ascontiguousarray(np.diff(self.integral, axis=0).reshape(-1, 9).T)
@@ -327,7 +327,7 @@ _rates, _drivers, _attitudes, _integrals = map(attrgetter, ("rate", "drivers", "
 
 
 def trapezoid_excess(t: Array, mean: Array) -> Array:
-    """Rate error of trapezoids on interval means: d2 / 8 - 3 d4 / 128, of central differences.
+    """Rate error (N, 3) of trapezoids on interval means: d2 / 8 - 3 d4 / 128, by central differences.
 
     Zero at the ends and where the stamps are not even, as beside a gap; next to such places the second alone.
     """
@@ -342,7 +342,7 @@ def trapezoid_excess(t: Array, mean: Array) -> Array:
 
 
 def _unseen_variance(t: Array, mean: Array, density: float | None, hidden: Array | None) -> tuple[Array, Array]:
-    """Cumulative variance of what samples do not show, rad^2 per axis, (m,), at times (m,), s; times first.
+    """Times (m,), s, and cumulative variance (m,), rad^2 per axis, of rotation that samples miss.
 
     Between these times it grows in proportion to time; there are none but the ends of intervals that have any. In gaps
     a line over T is off by T^3 w'' / 12, w'' as large as between samples; but never by more than T times the spread of
@@ -373,7 +373,7 @@ def _unseen_variance(t: Array, mean: Array, density: float | None, hidden: Array
 
 
 def _interpolation_variance(t: Array, mean: Array, density: float) -> Array:
-    """Variance (N - 1,) of the rotation over each sample interval h, rad^2 per axis: (_ERROR h^5 w'''')^2.
+    """Interpolation error over each sample interval h: variance (N - 1,), rad^2 per axis: (_ERROR h^5 w'''')^2.
 
     w'''' is 24 times the divided difference of five samples, of which white noise is taken off, squares averaged
     over the four samples around the interval.
@@ -391,18 +391,18 @@ def _interpolation_variance(t: Array, mean: Array, density: float) -> Array:
 
 
 def _arc(w0: Array, a: Array, s: Array) -> Array:
-    """Rotation vectors after the times s of rates w0 + a s."""
+    """Rotation vectors (n, 3), rad, after times s under rates w0 + a s."""
     return w0 * s + a * (0.5 * s**2) + so3.cross(w0, a) * (s**3 / 12.0)
 
 
 def _rate(w0: Array, a: Array, s: Array, arc: Array) -> Array:
-    """Rates of the attitude Exp(arc) after the times s, in the turned frame."""
+    """Rates, in the rotated frame, of the attitude Exp(arc) after times s under rates w0 + a s."""
     speed = w0 + a * s + so3.cross(w0, a) * s**2 / 4.0
     return np.einsum("nij,nj->ni", so3.right_jacobian(arc), speed)
 
 
 def running_product(q: Array) -> Array:
-    """q0, q0 q1, q0 q1 q2, ...: in blocks, vectorised over the blocks, so that the loop is as long as one block."""
+    """Cumulative products q0, q0 q1, q0 q1 q2, ... of quaternions (n, 4), vectorised over blocks."""
     n = len(q)
     if n < 2:
         return so3.normalize(q)

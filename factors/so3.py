@@ -30,7 +30,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Array])
 
 
 def _in_cache(function: _Function) -> _Function:
-    """The function, evaluated some rows at a time where arrays (n, d) have many, which takes half the time."""
+    """Decorate a function to evaluate large arrays (n, d) in cache-sized blocks, in half the time."""
 
     @wraps(function)
     def some_at_a_time(*given: ArrayLike) -> Array:
@@ -51,12 +51,12 @@ def _in_cache(function: _Function) -> _Function:
 
 
 def _complex(v: Array) -> Complex:
-    """Numbers (..., 2 k) taken in pairs as complex ones (..., k), a view where it can be."""
+    """View consecutive pairs of numbers (..., 2 k) as complex ones (..., k), without a copy if possible."""
     return np.asarray((v if v.strides[-1] == v.itemsize else v.copy()).view(complex))
 
 
 def _pair(q: Array) -> tuple[Complex, Complex]:
-    """The complex numbers a = w + x i and b = y + z i of quaternions a + b j.
+    """Split quaternions a + b j into complex numbers a = w + x i and b = y + z i.
 
     A product takes four multiplications of these in place of sixteen, since j c is c* j.
     """
@@ -65,7 +65,7 @@ def _pair(q: Array) -> tuple[Complex, Complex]:
 
 
 def _by_conjugate(a: Complex, b: Complex) -> Complex:
-    """a b*.
+    """Product a b* of complex arrays, always by the same rounding.
 
     As a call: of many, numpy would write `a * b.conj()` into the conjugate, and round otherwise than of few.
     """
@@ -73,13 +73,13 @@ def _by_conjugate(a: Complex, b: Complex) -> Complex:
 
 
 def _square(v: Array) -> Array:
-    """Squared lengths (...) of vectors (..., 3); a sum over so short an axis takes numpy longer."""
+    """Squared lengths (...) of vectors (..., 3), faster than numpy's sum over a short axis."""
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     return np.asarray(x * x + y * y + z * z)
 
 
 def identity(shape: int | tuple[int, ...] = ()) -> Array:
-    """Identity rotations, shape (*shape, 4)."""
+    """Identity quaternions, (*shape, 4)."""
     shape = (shape,) if isinstance(shape, int) else shape
     q = np.zeros((*shape, 4))
     q[..., 0] = 1.0
@@ -87,19 +87,19 @@ def identity(shape: int | tuple[int, ...] = ()) -> Array:
 
 
 def normalize(q: ArrayLike) -> Array:
-    """Unit quaternions: q scaled to length one."""
+    """Scale quaternions to unit length."""
     q = np.asarray(q, dtype=float)
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def inverse(q: ArrayLike) -> Array:
-    """Inverse rotations: aRb -> bRa."""
+    """Inverse rotations, aRb -> bRa."""
     return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 @_in_cache
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
-    """Product of two rotations: aRb, bRc -> aRc."""
+    """Product of two rotations, aRb, bRc -> aRc."""
     # (a + b j) (c + d j).
     (a, b), (c, d) = _pair(np.asarray(p, dtype=float)), _pair(np.asarray(q, dtype=float))
     first, second = a * c, a * d
@@ -120,7 +120,7 @@ def compose(*rotations: ArrayLike) -> Array:
 
 @_in_cache
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
-    """Coordinates in a of the vectors v, shape (..., 3), given in b; q is aRb."""
+    """Rotate vectors v (..., 3) from b to a by q = aRb."""
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     # v is x i + c j. Of q v q* the part by j is a^2 c + b^2 c* - 2 i a b x, the other (|a|^2 - |b|^2) x + 2 Im(a b* c).
     (a, b), x, c = _pair(q), v[..., 0], _complex(v[..., 1:])[..., 0]
@@ -136,7 +136,7 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
 
 @_in_cache
 def cross(a: Array, b: Array) -> Array:
-    """Cross product of (..., 3) arrays (numpy's own spends most of its time moving axes)."""
+    """Cross product of arrays (..., 3), faster than numpy's own."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
     bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     x = ay * bz - az * by
@@ -176,7 +176,7 @@ def exp(phi: ArrayLike) -> Array:
 
 
 def log(q: ArrayLike) -> Array:
-    """Quaternions -> rotation vectors, shape (..., 3), of length pi at most."""
+    """Rotation vectors (..., 3), rad, of quaternions, with length pi at most."""
     q = np.asarray(q, dtype=float)
     w, v = q[..., 0], q[..., 1:]
     sine = np.sqrt(_square(v))
@@ -203,7 +203,7 @@ def matrix(q: ArrayLike) -> Array:
 
 
 def from_matrix(r: ArrayLike) -> Array:
-    """Rotation matrices, shape (..., 3, 3) -> quaternions with w >= 0."""
+    """Quaternions, w >= 0, of rotation matrices (..., 3, 3)."""
     r = np.asarray(r, dtype=float)
     xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     wx, wy, wz = (r[..., 2, 1] - r[..., 1, 2]), (r[..., 0, 2] - r[..., 2, 0]), (r[..., 1, 0] - r[..., 0, 1])
@@ -223,7 +223,7 @@ def from_matrix(r: ArrayLike) -> Array:
 
 @_in_cache
 def right_jacobian(phi: ArrayLike) -> Array:
-    """J with Exp(phi + d) = Exp(phi) * Exp(J d) to first order, shape (..., 3, 3).
+    """Right Jacobian J (..., 3, 3): Exp(phi + d) = Exp(phi) * Exp(J d) to first order.
 
     Solà, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143, with hat(phi)^2 = phi phi' - phi'phi I.
     """
@@ -243,7 +243,7 @@ def right_jacobian(phi: ArrayLike) -> Array:
 
 @_in_cache
 def right_jacobian_inverse(phi: ArrayLike) -> Array:
-    """J with Log(Exp(phi) * Exp(d)) = phi + J d to first order (same source, eq. 144)."""
+    """Inverse right Jacobian J: Log(Exp(phi) * Exp(d)) = phi + J d to first order (same source, eq. 144)."""
     phi = np.asarray(phi, dtype=float)
     square = _square(phi)
     b = 1.0 / 12.0 + square / 720.0
@@ -256,7 +256,7 @@ def right_jacobian_inverse(phi: ArrayLike) -> Array:
 
 
 def _polynomial(phi: Array, a: Array, b: Array) -> Array:
-    """I + a hat(phi) + b hat(phi)^2, (..., 3, 3), of phi (..., 3) and a, b (...)."""
+    """Matrices I + a hat(phi) + b hat(phi)^2, (..., 3, 3), for phi (..., 3) and a, b (...)."""
     x, y, z = phi[..., 0], phi[..., 1], phi[..., 2]
     ax, ay, az, bx, by, bz = a * x, a * y, a * z, b * x, b * y, b * z
     xx, yy, zz, xy, yz, zx = bx * x, by * y, bz * z, bx * y, by * z, bz * x
@@ -268,7 +268,7 @@ def _polynomial(phi: Array, a: Array, b: Array) -> Array:
 
 
 def align(a: ArrayLike, b: ArrayLike, weights: ArrayLike = 1.0) -> Array:
-    """The rotation aRb (..., 4) that minimises the sum of weights |a - aRb b|^2 over n vectors, (..., n, 3) each.
+    """Rotation aRb (..., 4) that minimises the sum of weights |a - aRb b|^2 over n vectors, (..., n, 3) each.
 
     Vectors in one plane determine it, those along one line leave the turn about that line to chance. Positions are to
     be given less their means. Kabsch, Acta Crystallographica A32 (1976) 922.
@@ -285,7 +285,7 @@ def align(a: ArrayLike, b: ArrayLike, weights: ArrayLike = 1.0) -> Array:
 
 
 def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
-    """Attitudes at the times `at` on the constant-rate arcs between the samples (t, q), t increasing.
+    """Interpolate attitudes at times `at` on constant-rate arcs between the samples (t, q), t increasing.
 
     Outside the samples the nearest arc is followed on.
     """
@@ -296,7 +296,7 @@ def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
 
 
 def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
-    """gtsam rotations -> unit quaternions with w >= 0, shape (n, 4).
+    """Convert gtsam rotations to unit quaternions (n, 4), w >= 0.
 
     gtsam normalises neither the product of matrices nor the quaternion of one: rounding would grow from state to state.
     """
@@ -306,7 +306,7 @@ def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
 
 
 def to_gtsam(q: ArrayLike) -> gtsam.Rot3:
-    """The gtsam.Rot3 of one quaternion (4,)."""
+    """Convert one quaternion (4,) to gtsam.Rot3."""
     import gtsam
 
     w, x, y, z = np.asarray(q, dtype=float).tolist()

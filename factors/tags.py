@@ -17,7 +17,7 @@ from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 
 @dataclass(frozen=True)
 class TagAttitudeFactor(Model):
-    """Attitude of the body by the corners of its tags: nRb = Exp(said) nRB BRC cRb, cRb seen through the corners.
+    """Attitude of the body by tag corners: nRb = Exp(said) nRB BRC cRb, cRb observed through the corners.
 
     A corner at q in the tag's frame stands at P = cRb (position of the tag + bRt D q) + p in the camera's frame and is
     seen at (Px, Py) / Pz. All tags seen in one pose share nRb and p, so they settle the attitude together. Blocks: nRb
@@ -54,7 +54,7 @@ class TagAttitudeFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Body, its place, reference, what it says, mount, tag, its position; with `by_lens` these."""
+        """Blocks of the variables: body, position, reference, its correction, mount, tag, tag position, lens."""
         return (ROT3, 3, ROT3, 3, ROT3, ROT3, 3, *([] if self.by_lens is None else [3]))
 
     def __call__(

@@ -12,7 +12,7 @@ from alidade.factors.model import Array, Model, check, dimension, retract
 def assert_jacobians(
     model: Model, blocks: Sequence[Array], steps: Sequence[float] | None = None, rtol: float = 2e-6
 ) -> None:
-    """Assert that analytic Jacobians equal central differences.
+    """Assert that a model's analytic Jacobians equal central differences.
 
     Args:
         model: n measurements.

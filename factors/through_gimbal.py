@@ -49,7 +49,7 @@ Error = tuple[int, int, float, int, Array, Array]
 
 @dataclass(frozen=True)
 class GimbalErrors(Stacked):
-    """Errors of a gimbal's mounting and encoders.
+    """Error model of a gimbal's mounting and encoders.
 
     Attributes:
         names: mounting angles that are variables.
@@ -62,11 +62,11 @@ class GimbalErrors(Stacked):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """The mounting angles, rad, and SIGHT_ERRORS."""
+        """Sizes of the variable blocks: mounting angles, rad, and SIGHT_ERRORS."""
         return len(self.names), len(SIGHT_ERRORS)
 
     def each(self, gimbal: Array) -> Iterator[Error]:
-        """The errors at gimbal angles (n, 2); what an encoder reads is larger by s sine + c cosine."""
+        """Yield the errors at gimbal angles (n, 2), rad; an encoder reads s sine + c cosine too much."""
         for column, name in enumerate(self.names):
             if name in _TURNS:
                 yield 0, column, self.mount[column], _TURNS[name], np.ones(1), np.zeros((1, 2))
@@ -80,7 +80,7 @@ class GimbalErrors(Stacked):
 
 @dataclass(frozen=True)
 class GimbalMap(Stacked):
-    """LOS errors that depend on the gimbal angles, see alidade.factors.error_map.
+    """LOS error map over the gimbal angles, see alidade.factors.error_map.
 
     Attributes:
         functions: (n, k) of each measurement.
@@ -93,11 +93,11 @@ class GimbalMap(Stacked):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """The numbers c, of phx and phz function by function."""
+        """Size of the variable block: coefficients c, of phx and phz function by function."""
         return (2 * self.functions.shape[1],)
 
     def each(self, _: Array) -> Iterator[Error]:
-        """The errors; phx and phz are measured larger, as if the camera had turned."""
+        """Yield the map's errors, which increase the measured phx and phz as a camera rotation would."""
         for j in range(self.functions.shape[1]):
             for axis, turn in enumerate((_ELEVATION, _COLLIMATION)):
                 yield 0, 2 * j + axis, 0.0, turn, self.functions[:, j], self.slopes[:, j]
@@ -105,7 +105,7 @@ class GimbalMap(Stacked):
 
 @dataclass(frozen=True)
 class ThroughGimbalFactor(WrappedModel):
-    """Gyro increments, or pictures from a gimbal, whitened so that errors of the gimbal do not change their noise.
+    """Gyro increments, or gimbal pictures, whitened so that gimbal errors do not change their noise.
 
     Blocks: those of the model and, unless these are among them, those of the errors.
 
@@ -129,11 +129,11 @@ class ThroughGimbalFactor(WrappedModel):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Blocks of the model and of the errors."""
+        """Blocks of the wrapped model and of the errors."""
         return (*self.model.blocks, *(() if self.error_blocks else self.errors.blocks))
 
     def __call__(self, *blocks: Array) -> Residuals:
-        """Residual (1 + K)^-1 r of the model's r, (n, m)."""
+        """Residual (1 + K)^-1 r, (n, m), with r the residual of the wrapped model."""
         count = len(self.model.blocks)
         error_blocks = self.error_blocks or tuple(range(count, len(blocks)))
         residuals, jacobians = self.model(*blocks[:count])
@@ -159,7 +159,7 @@ class ThroughGimbalFactor(WrappedModel):
         return residuals, all_jacobians
 
     def _units(self) -> tuple[Array, Array]:
-        """Gimbal steps by whitened residuals (n, 2, m), and whitened residuals by turns of the camera (n, m, 3)."""
+        """Derivatives of gimbal steps by whitened residuals (n, 2, m), and of these by camera rotation (n, m, 3)."""
         (sa, se), (ca, ce) = np.sin(self.gimbal).T, np.cos(self.gimbal).T
         zero = np.zeros_like(sa)
         if self.encoder is None:
@@ -172,7 +172,7 @@ class ThroughGimbalFactor(WrappedModel):
         return (self.encoder**2)[:, None, None] * (to_residuals @ by_angles).swapaxes(1, 2), to_residuals
 
     def _by_steps(self, errors: list[tuple[int, Array, Array]]) -> Array:
-        """Y (errors, 3, 2, n), in the camera, of errors with turn, f and derivatives by the angles."""
+        """Matrices Y (errors, 3, 2, n), camera frame, of errors with rotation axis, function, angle derivatives."""
         se, ce = np.sin(self.gimbal[:, 1]), np.cos(self.gimbal[:, 1])
         out = np.zeros((len(errors), 3, 2, len(se)))
         for Y, (turn, value, slopes) in zip(out, errors, strict=True):

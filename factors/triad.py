@@ -24,18 +24,18 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 def triad(K: Array, b: Array) -> Array:
-    """The numbers (12,) of a triad, nominal = K raw + b, by K (3, 3) and b (3,)."""
+    """Numbers (12,) of a triad with nominal = K raw + b, from K (3, 3) and b (3,)."""
     A = np.linalg.inv(K)
     return np.concatenate([A.ravel(), -A @ b])
 
 
 def parts(triads: Array) -> tuple[Array, Array]:
-    """A, shape (..., 3, 3), and c, shape (..., 3), of triads (..., 12)."""
+    """Matrix A (..., 3, 3) and offset c (..., 3) of triads (..., 12)."""
     return triads[..., :9].reshape(*triads.shape[:-1], 3, 3), triads[..., 9:]
 
 
 def calibration(triads: Array) -> tuple[Array, Array]:
-    """Rows of K, then b, of triads (..., 12): shape (..., 12), and the Jacobian, shape (..., 12, 12).
+    """Calibration (..., 12) of triads (..., 12): rows of K, then b; with Jacobian (..., 12, 12).
 
     dK = -K dA K, db = -K (dA b + dc).
     """
@@ -75,7 +75,7 @@ class TriadPriorFactor(Model):
 
 @dataclass(frozen=True)
 class FieldPriorFactor(Model):
-    """What is known of a field beforehand: its strength, and its direction. Block: field (3), T in n.
+    """Prior on a field's strength and direction. Block: field (3), T in n.
 
     The strength is that of the field itself, not of its component along the direction that is known: a field that is
     1e-6 T off across it would else be read as 10 nT stronger.
@@ -109,7 +109,7 @@ class FieldPriorFactor(Model):
 
 @dataclass(frozen=True)
 class AccelFactor(Model):
-    """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c + s dT, raw = u + square u^2 + cube u^3, by axis.
+    """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c + s dT, raw = u + square u^2 + cube u^3, axis by axis.
 
     Blocks: nRb (rotations), triad (12); of one that is curved its terms (3 square, s^2/m, and 3 cube, (s^2/m)^2); of
     one whose temperature is known s (3, in the unit of raw per K).
@@ -135,7 +135,7 @@ class AccelFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, triad and, where there are such, curvature and slope over temperature."""
+        """Blocks of the variables: attitude, triad, optional nonlinearity and temperature slope."""
         return (ROT3, 12, *([6] if self.curved else []), *([] if self.temperature is None else [3]))
 
     def __call__(self, nRb: Array, triads: Array, *terms: Array) -> Residuals:
@@ -187,7 +187,7 @@ class GyroStaticFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, triad, wandered offset and, where there are such, G and slope over temperature."""
+        """Blocks of the variables: attitude, triad, wandering offset, optional G and temperature slope."""
         return (ROT3, 12, 3, *([] if self.gravity is None else [9]), *([] if self.temperature is None else [3]))
 
     def __call__(self, nRb: Array, triads: Array, wandered: Array, *terms: Array) -> Residuals:
@@ -233,14 +233,14 @@ class MagFactor(Model):
 
 
 def _drift(temperature: Array | None, sigma: Array, terms: Sequence[Array]) -> tuple[Array, tuple[Array, ...]]:
-    """Drift of the offset with temperature, (n or 1, 3), and its Jacobian by the slope, the model's last term."""
+    """Temperature drift of the offset, (n or 1, 3), and its Jacobian by the slope, the model's last term."""
     if temperature is None:
         return np.zeros((1, 3)), ()
     return temperature[:, None] * terms[-1], ((temperature / sigma)[:, None, None] * np.eye(3),)
 
 
 def _at_rest(raw: Array, sigma: Array, nRb: Array, triads: Array, vector: Array) -> Residuals:
-    """raw = A bRn v + c with Jacobians by nRb, the triad and v; v (3,) or (n, 3) in n."""
+    """Residuals of raw = A bRn v + c, with Jacobians by nRb, the triad and v, which is (3,) or (n, 3) in n."""
     A, c = parts(triads)
     nominal = so3.rotate(so3.inverse(nRb), vector)
     weight = 1.0 / sigma
@@ -254,7 +254,7 @@ def _at_rest(raw: Array, sigma: Array, nRb: Array, triads: Array, vector: Array)
 
 
 def _by_triad(nominal: Array, weight: Array) -> Array:
-    """Jacobian (n, 3, 12) of weight * (A nominal + c)."""
+    """Jacobian (n, 3, 12) of weight * (A nominal + c) by the triad."""
     J = np.zeros((len(nominal), 3, 12))
     for i in range(3):
         J[:, i, 3 * i : 3 * i + 3] = nominal * weight[:, None]

@@ -31,7 +31,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class FieldFactor(Model):
-    """The earth's field: raw = K^-1 (bRa(time + delay) aRn s (0, cos dip, -sin dip) - b).
+    """Earth's magnetic field in motion: raw = K^-1 (bRa(time + delay) aRn s (0, cos dip, -sin dip) - b).
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), gyro filter (1), triad (12), strength s (1), dip (1;
     rad, the field's inclination, positive down), delay (1; s by which a reading was taken later than its stamp says),
@@ -63,7 +63,7 @@ class FieldFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, bias, filter, triad, strength, dip, delay, the gyro's errors and the earth's rate."""
+        """Blocks of the variables: attitude, bias, filter, triad, strength, dip, delay, gyro errors, earth rate."""
         return (
             ROT3,
             3,
@@ -119,7 +119,7 @@ class FieldFactor(Model):
 
 @dataclass(frozen=True)
 class UpFactor(Model):
-    """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b + drift).
+    """Specific force in motion: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b + drift).
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), gyro filter (1), triad (12), strength s (1), unless
     the gyro is perfect its errors (6 to 19), of a sensor that is swung about a point arm (3; in b, from there to the
@@ -147,7 +147,7 @@ class UpFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, bias, filter, triad, strength, the gyro's errors, the arm, what drivers do, the earth's rate."""
+        """Blocks of the variables: attitude, bias, filter, triad, strength, gyro errors, arm, drivers, earth rate."""
         arm, slope = [] if self.unit is None else [3], [] if self.drivers is None else [self.drivers.shape[1]]
         earth = [] if self.earth is not None else [3]
         return ROT3, 3, 1, 12, 1, *([self.errors] if self.errors else []), *arm, *slope, *earth
@@ -184,7 +184,7 @@ class UpFactor(Model):
         return error, jacobians
 
     def _swung(self, bias: Array, errors: Array | None, arm: Array) -> tuple[Array, Derivatives]:
-        """(w' x arm + w x (w x arm)) / unit, (n, 3), and its derivatives by arm, bias and errors."""
+        """Lever-arm acceleration (w' x arm + w x (w x arm)) / unit, (n, 3); derivatives by arm, bias, errors."""
         per_unit = 1.0 / (self.unit or 1.0)
         read, slope, drivers, drivers_slope = self._read
         excess, by_excess = rate_error(bias - self.gyro.bias_hat, errors, read, drivers)
@@ -204,12 +204,12 @@ class UpFactor(Model):
 
     @cached_property
     def _turns(self) -> Increments:
-        """Increments from anchors to stamps, which no variable moves."""
+        """Increments from anchors to stamps, independent of the variables."""
         return self.gyro.increments(self.anchor, self.time)
 
     @cached_property
     def _read(self) -> tuple[Array, Array, Array | None, Array | None]:
-        """Rates and drivers at the stamps, each with its slope: a cubic's (Savitzky, Golay, Anal. Chem. 36, 1964).
+        """Rates and drivers at the stamps with time derivatives, by cubics (Savitzky, Golay, Anal. Chem. 36, 1964).
 
         Rates as read: those between which `GyroPath` draws lines make these lines' integral right, and are too sharp.
         """
@@ -224,7 +224,7 @@ class UpFactor(Model):
         )
 
     def _slope(self, of: Callable[[Array], Array | None]) -> Array:
-        """Derivative by time at the stamps."""
+        """Time derivative of a function at the stamps, by a local cubic."""
         step = self.gyro.interval
         m = max(2, round(_SPAN / step))
         points = np.arange(-m, m + 1)
@@ -242,7 +242,7 @@ def _carried(
     errors: Array | None,
     turns: Increments | None = None,
 ) -> tuple[Array, Array, Derivatives]:
-    """Increments (n, 4) from anchors to the times `at`, near stamps, with the gyro's filter (n, 1) undone.
+    """Increments (n, 4) from anchors to times `at` near the stamps, with the gyro's filter (n, 1) inverted.
 
     Returns:
         The increments, the rate at their ends (n, 3) in the turned frame, and how filter, bias and errors turn them
@@ -263,7 +263,7 @@ def _carried(
 def _earth_rotation(
     elapsed: Array, earth: Array | None, others: tuple[Array, ...]
 ) -> tuple[Array, Callable[[Array, Array, Array], tuple[Array, ...]]]:
-    """Rotation aRn (n, 4) after `elapsed` s, and a function that gives the Jacobian by the earth's rate, if a block.
+    """Earth rotation aRn (n, 4) after `elapsed` s, and a function for its Jacobian by the earth rate, if variable.
 
     A vector v of n is aRn v in a; with phi = elapsed w it moves by -aRn [v]x J_r(phi) elapsed dw (J_r: right Jacobian).
     """
@@ -278,7 +278,7 @@ def _earth_rotation(
 
 
 def _predicted(raw: Array, sigma: Array, triads: Array, nominal: Array) -> tuple[Array, Array, Callable[[], Array]]:
-    """Whitened error (n, 3), its Jacobian (n, 3, 3) by the nominal, and a function that gives that by the triad."""
+    """Whitened error (n, 3), Jacobian (n, 3, 3) by the nominal vector, function for the Jacobian by the triad."""
     inverse = np.linalg.inv(triads[:, :9].reshape(-1, 3, 3))
     weight = 1.0 / sigma[:, None]
     predicted = np.einsum("nij,nj->ni", inverse, nominal - triads[:, 9:])

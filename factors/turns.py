@@ -21,7 +21,7 @@ from alidade.factors.triad import parts
 
 @dataclass(frozen=True)
 class GyroRotationFactor(Model):
-    """A gyro's rotation between two attitudes, integrated with its whole triad: nRb_j = Exp(w_ie T)^T nRb_i dR(A, c).
+    """Gyro rotation between two attitudes, by the whole triad: nRb_j = Exp(w_ie T)^T nRb_i dR(A, c).
 
     Blocks: nRb_i, nRb_j (rotations), triad (12), d_i, d_j (3 each; how far the gyro's offset has wandered at both ends,
     in the unit of raw: their mean adds to c). Of a gyro that feels specific force also G by rows (9, rad/s per m/s^2)
@@ -58,7 +58,7 @@ class GyroRotationFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitudes, triad, wandered offsets; where there are such G with the accelerometer's triad, slopes, band."""
+        """Blocks of the variables: attitudes, triad, wandering offsets, optional G and triad, slopes, dead band."""
         of_force = [] if self.accel is None else [9, 12]
         slopes = [] if self.temperature is None else [3, 3] if self.drifts else [3]
         return (ROT3, ROT3, 12, 3, 3, *of_force, *slopes, *([] if self.beyond is None else [1]))
@@ -102,7 +102,7 @@ class GyroRotationFactor(Model):
 
     @cached_property
     def _joined(self) -> tuple[Array, Array | None, Array | None, Array | None]:
-        """Readings of gyro and accelerometer, temperature and sides of the dead band, concatenated over all turns."""
+        """Concatenate readings of gyro and accelerometer, temperature and dead-band sides over all turns."""
         others = (self.accel, self.temperature, self.beyond)
         accel, temperature, beyond = (None if each is None else np.concatenate(each) for each in others)
         return np.concatenate(self.raw), accel, temperature, beyond
@@ -110,7 +110,7 @@ class GyroRotationFactor(Model):
 
 @dataclass(frozen=True)
 class Samples:
-    """Stamps of the N samples of n turns, one turn after the other.
+    """Stamps of the N samples of n rotations, one rotation after the other.
 
     Attributes:
         t: (N,) stamps, s.
@@ -127,7 +127,7 @@ class Samples:
 
     @classmethod
     def of(cls, stamps: Sequence[Array]) -> Samples:
-        """Samples of turns from the stamps of each turn, two at least."""
+        """Build the samples of all turns from the stamps, s, of each turn, two at least."""
         counts = np.array([len(each) for each in stamps])
         t, ends = np.concatenate(stamps), np.cumsum(counts)
         step = np.diff(t)[:, None]
@@ -141,11 +141,11 @@ class Samples:
         return np.asarray(means - excess)
 
     def turned(self, matrices: Array, vectors: Array) -> Array:
-        """Product of each turn's matrix (n, 3, 3) and its samples' vectors (N, 3)."""
+        """Multiply each sample's vector (N, 3) by its turn's matrix (n, 3, 3)."""
         return np.einsum("kij,kj->ki", matrices[self.turn], vectors)
 
     def products(self, matrices: Array, vectors: Array) -> Array:
-        """Sum (n, 3, 3, d) over each turn of the samples' matrices (N, 3, 3) times each component of vectors (N, d)."""
+        """Sum products of sample matrices (N, 3, 3) and vector components (N, d) over each turn: (n, 3, 3, d)."""
         rows = matrices.reshape(-1, 9)
         slices = map(slice, self.first.tolist(), (self.last + 1).tolist())
         return np.array([rows[some].T @ vectors[some] for some in slices]).reshape(len(self.first), 3, 3, -1)
@@ -153,7 +153,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Turns:
-    """Rotations of turns, as a gyro with a given triad measures them.
+    """Rotations over n turns, integrated from a gyro with a given triad.
 
     Attributes:
         samples: the samples of all turns.
@@ -181,7 +181,7 @@ class Turns:
         accel_triads: Array | None = None,
         accel: Array | None = None,
     ) -> Turns:
-        """Turns from readings (N, 3) of gyro and, if it feels force, accelerometer, with G (n, 9), triads (n, 12)."""
+        """Integrate turns from gyro and optional accelerometer readings (N, 3), with G (n, 9), triads (n, 12)."""
         A, c = parts(triads)
         K, offset = np.asarray(np.linalg.inv(A), dtype=float), c[samples.turn]
         if sensitivity is None or accel_triads is None or accel is None:
@@ -194,7 +194,7 @@ class Turns:
 
     @property
     def rotation(self) -> Array:
-        """Rotation of each turn from its first stamp to its last, (n, 4)."""
+        """Rotation (n, 4) of each turn, from its first stamp to its last."""
         first, last = self._attitude[self.samples.first], self._attitude[self.samples.last]
         return so3.multiply(so3.inverse(first), last)
 
@@ -213,7 +213,7 @@ class Turns:
         return by_triad, _by_numbers(by_force, -self.K)[..., :9], by_accel
 
     def by_slopes(self, temperature: Array) -> tuple[Array, ...]:
-        """Derivatives of the rotations by the slopes over temperature of gyro and accelerometer, (n, 3, 3) each.
+        """Right-side derivatives (n, 3, 3) of the rotations by the temperature slopes of gyro and accelerometer.
 
         Without specific force only the gyro's. The temperature (N,) counts from that of the offsets, K.
         """
@@ -223,7 +223,7 @@ class Turns:
         return -by_rate @ self.K, by_rate @ self.K @ self.G @ self.accel_K
 
     def by_size(self, signs: Array) -> Array:
-        """Derivative (n, 3, 1) of the rotations by what is added to the readings with these signs (N, 3)."""
+        """Derivative (n, 3, 1) of the rotations by the size of an addition to readings with signs (N, 3)."""
         by_rate = self.samples.products(self._by_rate, self.samples.points(signs))
         return np.einsum("naij,nij->na", by_rate, self.K)[..., None]
 
@@ -251,12 +251,12 @@ class Turns:
         return by_rate
 
     def _sums(self, vectors: Array) -> Array:
-        """Sums (n, 3, 3, 4) over each turn: derivatives by rate times vectors (N, 3), then derivatives alone."""
+        """Sums (n, 3, 3, 4) over each turn of rate derivatives times vectors (N, 3), and of the derivatives alone."""
         return self.samples.products(self._by_rate, np.concatenate([vectors, np.ones((len(vectors), 1))], axis=1))
 
 
 def _by_numbers(sums: Array, matrices: Array) -> Array:
-    """Derivative (n, 3, 12) by a matrix D (rows) and an offset d, where dw = M (D v + d).
+    """Derivative (n, 3, 12) of rotations by a matrix D (rows) and an offset d, where dw = M (D v + d).
 
     Args:
         sums: (n, 3, 3, 4), derivatives by w times v, then the derivatives alone.
