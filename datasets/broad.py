@@ -43,7 +43,7 @@ sensors: {{camera: {{scale: 0}}, clock: {{skew: 0}}}}
 
 @dataclass(frozen=True)
 class Trial:
-    """One BROAD trial, all arrays at the same stamps.
+    """One trial of the BROAD data set, all arrays at common stamps.
 
     Attributes:
         t: (N,) s.
@@ -89,7 +89,7 @@ def gyro_bias_at_rest(trial: Trial) -> Array:
 
 
 def to_session(trial: Trial, seed: int, sigma: float = VISION_SIGMA) -> HeadData:
-    """The trial as a session; b is the motion capture's world, h its marker body, and v the IMU.
+    """Convert a trial to a session; b: the motion capture's world, h: its marker body, v: the IMU.
 
     Vision is the motion-capture sample nearest to each 1/25 s, at that sample's own stamp, times Exp(delta) with
     Gaussian delta of `sigma` rad an axis; without any the session states no covariance. The truth is the motion capture
@@ -121,7 +121,7 @@ def to_session(trial: Trial, seed: int, sigma: float = VISION_SIGMA) -> HeadData
 
 @dataclass(frozen=True)
 class Score:
-    """How a calibration of a trial's session compares with what was held back.
+    """Errors of a calibration of a trial's session against the withheld reference.
 
     Attributes:
         attitude_rms: rad, of the fused attitude against the undisturbed motion capture.
@@ -158,7 +158,7 @@ def score(trial: Trial, values: Mapping[str, float], attitude_t: Array, attitude
 def marker_attitudes(
     trial: Trial, values: Mapping[str, float], attitude_t: Array, attitude_wxyz: Array, at: Array
 ) -> Array:
-    """Attitudes bRh (n, 4) that motion capture shows at times (n,) of the gyro's clock, s.
+    """Marker attitudes bRh (n, 4) by motion capture at times (n,), s, of the gyro's clock.
 
     bRv carried by the gyro less its bias and errors, then the rotation that motion capture's own filter adds,
     Exp(vision_filter * angular acceleration), and the mount.
@@ -173,29 +173,29 @@ def marker_attitudes(
 
 
 def at_rest(trial: Trial, values: Mapping[str, float]) -> Array:
-    """(3,) rad/s that the gyro shows at rest: its bias and what gravity does to it."""
+    """Gyro reading (3,), rad/s, at rest by the calibration: bias plus g-sensitivity times gravity."""
     bias = np.array([values[f"gyro_bias_{axis}"] for axis in "xyz"])
     return np.asarray(bias + _g(values) @ trial.force[~trial.moving].mean(axis=0))
 
 
 def _g(values: Mapping[str, float]) -> Array:
-    """(3, 3) g-sensitivity, rad/s per m/s^2."""
+    """Matrix (3, 3) of g-sensitivity, rad/s per m/s^2, from parameter values."""
     return np.array([[values.get(f"gyro_g_{row}{column}", 0.0) for column in "xyz"] for row in "xyz"])
 
 
 def _rms(error: Array) -> float:
-    """Of rotation vectors (n, 3)."""
+    """Root mean square length of rotation vectors (n, 3)."""
     return float(np.sqrt((error**2).sum(axis=1).mean()))
 
 
 def _averaged(error: Array, n: int) -> Array:
-    """Means of n errors in a row."""
+    """Running means of errors over n consecutive samples."""
     sums = np.cumsum(np.concatenate([np.zeros((1, 3)), error]), axis=0)
     return np.asarray((sums[n:] - sums[:-n]) / n)
 
 
 def score_results(trial: Trial, folder: Path) -> Score:
-    """Score the folder that `alidade calibrate --out` wrote for the trial's session."""
+    """Score the output folder of `alidade calibrate --out` for a trial's session."""
     result = json.loads((folder / "result.json").read_text())
     values = {p["name"]: p["value"] for p in result["parameters"]}
     tum = np.loadtxt(folder / "attitude.tum", ndmin=2)
@@ -203,7 +203,7 @@ def score_results(trial: Trial, folder: Path) -> Score:
 
 
 def main() -> None:
-    """Convert one trial, or score the results of its session."""
+    """Convert one trial, or score the results of the trial's session."""
     parser = argparse.ArgumentParser(
         description="Turn a BROAD trial into a session of the head method, or score its calibration."
     )

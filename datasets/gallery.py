@@ -29,7 +29,7 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Recording:
-    """A public recording.
+    """A public recording, with its source and the commands that calibrate it.
 
     Attributes:
         method: that calibrates it.
@@ -57,12 +57,12 @@ class Recording:
 
     @property
     def source(self) -> str:
-        """Where it is."""
+        """Source of the recording: address, file, licence, checksum."""
         return f"{self.address}, {Path(self.file).name}, {self.licence}, {self.sha256[:16]}"
 
     @property
     def commands(self) -> str:
-        """As they are typed in the folder of the file."""
+        """Commands of the calibration, as typed in the folder of the file."""
         name = Path(self.argument or self.file).name
         if not self.convert:
             return f"`alidade calibrate {' '.join((name, *self.options))}`"
@@ -78,7 +78,7 @@ def _xyz(name: str, unit: float = 1.0) -> Callable[[Values], Array]:
 
 
 def _at_rest(values: Values) -> Array:
-    """What a gyro shows at rest with z up, deg/s: its bias and what gravity does to it."""
+    """Gyro reading at rest with z up, deg/s: bias plus the effect of gravity."""
     felt = np.array([values.get(f"gyro_g_{axis}z", 0.0) for axis in "xyz"])
     return np.asarray(np.rad2deg(_xyz("gyro_bias")(values) + GRAVITY * felt))
 
@@ -137,7 +137,7 @@ RECORDINGS = (
 
 
 def calibrated(recording: Recording, folder: Path) -> tuple[str, Array, Array]:
-    """Status, numbers (n,) and their sigmas (n,), by the commands; sigmas by first order."""
+    """Run the commands; return status, numbers (n,) and their sigmas (n,), propagated to first order."""
     with tempfile.TemporaryDirectory() as place:
         session = folder / recording.file
         if recording.convert:
@@ -159,7 +159,7 @@ def calibrated(recording: Recording, folder: Path) -> tuple[str, Array, Array]:
 
 
 def table(folder: Path) -> Iterator[str]:
-    """The lines of the table, of the recordings that are there."""
+    """Yield the table's lines, for the recordings that are present."""
     yield "| method | recording, licence, SHA-256 | commands | quantity | found | published |"
     yield "| --- | --- | --- | --- | --- | --- |"
     for each in RECORDINGS:
@@ -182,7 +182,7 @@ def _run(*command: str) -> None:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the gallery's table."""
     parser = argparse.ArgumentParser(description="Calibrate public recordings; print found and published numbers.")
     parser.add_argument("folder", type=Path, help="of the recordings, as `file` of each has them")
     for line in table(parser.parse_args().folder):

@@ -44,7 +44,7 @@ cube:
 
 @dataclass(frozen=True)
 class Sheet:
-    """The factory's calibration of one sensor of this very device, rounded as printed.
+    """Factory calibration of one sensor of this device, rounded as printed.
 
     raw = diag(scale) misalignment nominal + offset; scale in counts per m/s^2 or rad/s, offset in counts (the gyro's
     drifts with temperature and is not compared).
@@ -66,7 +66,7 @@ GYRO_SHEET = Sheet(
 
 
 def to_session(folder: Path) -> CubeData:
-    """The recording as a session, in counts.
+    """Convert the recording to a session, in counts.
 
     Raises:
         InputError: the files are not there or do not belong together.
@@ -87,7 +87,7 @@ def _table(path: Path) -> Array:
 
 
 def as_on_sheet(values: Mapping[str, float]) -> tuple[Sheet, Sheet]:
-    """Accelerometer and gyro as the sheet has them, from calibrated parameters by name.
+    """Convert calibrated parameters to the data sheet's form, for accelerometer and gyro.
 
     The body frame is turned so that the accelerometer's misalignment comes as near to the sheet's as a rotation can.
     """
@@ -103,7 +103,7 @@ def as_on_sheet(values: Mapping[str, float]) -> tuple[Sheet, Sheet]:
 
 
 def main() -> None:
-    """Convert the recording."""
+    """Convert the recording to a session file."""
     parser = argparse.ArgumentParser(description="Turn imu_tk's Xsens recording into a session of the cube method.")
     parser.add_argument("folder", type=Path, help="with xsens_acc.mat.gz and xsens_gyro.mat.gz")
     parser.add_argument("--out", type=Path, required=True, help="the session to write (.mcap)")

@@ -46,7 +46,7 @@ require: {theta_x: 2.0e-2, theta_y: 2.0e-2, theta_z: 2.0e-2, gyro_bias_x: 1.0e-3
 
 
 def read_parts(path: Path) -> dict[str, Array]:
-    """Gyro counts (n, 3) of each annotated part.
+    """Read the gyro counts (n, 3) of each annotated part.
 
     Raises:
         InputError: the file is not there or is not the annotated session.
@@ -65,7 +65,7 @@ def read_parts(path: Path) -> dict[str, Array]:
 
 
 def to_session(parts: dict[str, Array]) -> IndexerData:
-    """The parts one after the other, gyro and encoder at the same stamps."""
+    """Concatenate the parts to a session, gyro and encoder at the same stamps."""
     t: list[Array] = []
     angles: list[Array] = []
     now = 0.0
@@ -86,7 +86,7 @@ def to_session(parts: dict[str, Array]) -> IndexerData:
 
 
 def main() -> None:
-    """Convert the session."""
+    """Convert the parts to a session file."""
     parser = argparse.ArgumentParser(description="Turn imucal's Ferraris session into a session of the indexer method.")
     parser.add_argument("session", type=Path, help="annotated_session.csv")
     parser.add_argument("--out", type=Path, required=True, help="the session to write (.mcap)")

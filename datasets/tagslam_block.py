@@ -28,7 +28,7 @@ _CORNER_PX = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """The recording: its camera, the block as published, the tags found in each picture."""
+    """The block recording: camera, published layout, tags found in each picture."""
 
     camera: Camera
     published: TagBody
@@ -37,7 +37,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A layout against the published one, both laid over each other as well as can be, and against other pictures.
+    """Differences of a layout from the published one after alignment, and errors on held-out pictures.
 
     Attributes:
         position_mm, rotation_deg: root mean square over the tags.
@@ -54,7 +54,7 @@ class Comparison:
 
 
 def read_block(folder: Path) -> Block:
-    """Read the recording.
+    """Read the block recording.
 
     Raises:
         InputError: the files are not there or have other contents.
@@ -103,13 +103,13 @@ def compare(block: Block) -> tuple[Layout, Comparison]:
 
 
 def _reprojection(block: Block, body: TagBody) -> list[float]:
-    """Errors, px per axis, of the pictures left out of the estimate that show two tags or more."""
+    """Reprojection errors, px per axis, of held-out pictures with two tags or more."""
     poses = [estimate_pose(block.camera, body, found) for found in block.pictures[1::2]]
     return [pose.rms_px for pose in poses if pose is not None and len(pose.ids) > 1]
 
 
 def _apart(found: TagBody, published: TagBody, keep: Mask) -> tuple[float, float]:
-    """Root mean square distance (m) and angle (rad) between the tags of two layouts laid over each other."""
+    """Root mean square distance (m) and angle (rad) between the tags of two layouts after alignment."""
     a, b = found.corners.reshape(-1, 3), published.corners[keep].reshape(-1, 3)
     turn = so3.align(b - b.mean(axis=0), a - a.mean(axis=0))
     moved = so3.rotate(turn, found.position - a.mean(axis=0)) + b.mean(axis=0)
@@ -121,7 +121,7 @@ def _apart(found: TagBody, published: TagBody, keep: Mask) -> tuple[float, float
 
 
 def main() -> None:
-    """Estimate and compare."""
+    """Estimate the block's layout and print the comparison with the published one."""
     parser = argparse.ArgumentParser(description="Estimate the layout of TagSLAM's block from its detections.")
     parser.add_argument("folder", type=Path, help="with layout.json and detections.csv.gz")
     options = parser.parse_args()
