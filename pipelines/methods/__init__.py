@@ -151,7 +151,7 @@ class Method:
         config_yaml: str | None = None,
         pictures: Any = None,
     ) -> None:
-        """Write data as a recording, stamps rounded to ns; `read` gives them back where the first sample is at t = 0.
+        """Write data as a recording, stamps rounded to ns; `read` restores data that begin at t = 0.
 
         Raises InputError when the file cannot be written.
         """
@@ -179,7 +179,7 @@ class Method:
 
     @property
     def scenario(self) -> type[BaseModel]:
-        """Model of the simulator's settings. Raises InputError when there is no simulator."""
+        """Class of the simulator's settings. Raises InputError without a simulator."""
         return self.require_simulator().scenario
 
     def default_scenario(self, images: bool = False) -> str:
@@ -365,7 +365,7 @@ def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool
 
 
 def scenarios() -> dict[str, dict[str, Path]]:
-    """Method -> name -> file of the scenarios that are found by name; the name begins with the method's."""
+    """Files of the named scenarios, by method and name; a name begins with the method's."""
     from alidade.pipelines.simulation.scenario import shipped
 
     folders = {name: simulator.folder for name in names() if (simulator := method(name).simulator) is not None}
@@ -377,7 +377,7 @@ def scenarios() -> dict[str, dict[str, Path]]:
 
 @cache
 def _plugins() -> Mapping[str, EntryPoint]:
-    """Entry points of methods of other distributions, by name."""
+    """Entry points of other distributions' methods, by name."""
     return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in _BUILT_IN}
 
 

@@ -73,7 +73,7 @@ class Value:
 
     @classmethod
     def constant(cls, array: Array) -> Value:
-        """A number, a vector (3,) or a matrix (3, 3)."""
+        """Wrap a number, a vector (3,) or a matrix (3, 3) as a constant value."""
         return cls(_CONSTANTS[array.ndim], array)
 
 

@@ -44,7 +44,7 @@ _STEP = 1e-6
 def triad_specs(
     name: str, unit: str, gain: tuple[float, float], bias: tuple[float, float], per_recording: bool = False
 ) -> tuple[ParameterSpec, ...]:
-    """Parameter specifications of a triad sensor: entries of K on and off the diagonal, and its offset b.
+    """Declare the parameters of a triad: diagonal and off-diagonal entries of K, and offset b.
 
     Args:
         name: of the sensor.

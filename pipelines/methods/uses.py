@@ -107,7 +107,7 @@ def _field(true: Truth, dip: float) -> Array:
 
 
 def deviation_coefficients(e: Array) -> Array:
-    """Coefficients A to E (..., 5) of the deviation -e, first and second harmonic, of heading errors (..., U), rad.
+    """Deviation coefficients A to E (..., 5), rad, of heading errors (..., U), rad: first and second harmonic of -e.
 
     The first and the last error are of one heading. nan where the hard iron is stronger than the horizontal field,
     so that the compass does not turn once with the heading. Formula: Archibald Smith, in the Admiralty Manual for

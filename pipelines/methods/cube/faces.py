@@ -34,7 +34,7 @@ SIDES: dict[Side, tuple[float, float, float]] = {
 
 
 class Resting(ScenarioPart):
-    """An attitude to rest in: a side of the cube up, another one to the north, then the top leaned to the east."""
+    """Attitude of a resting cube: side up, side to the north, then the top leaned to the east."""
 
     up: Side
     north: Side

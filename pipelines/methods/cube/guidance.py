@@ -87,7 +87,7 @@ _SERIES, _SEED = 6, 0
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """Proposed changes of a scenario: a phrase and the changed scenario."""
+    """Yield changes of a scenario worth trying: a phrase, and the changed scenario."""
     single, series = next_poses(CubeScenario.model_validate(scenario), _SEED, _SERIES)
     for poses in (*([pose] for pose in single), series):
         more = [*scenario["attitudes"], *(pose.model_dump() for pose in poses)]
@@ -150,7 +150,7 @@ _UP: dict[str, Side] = {"x": "+x", "y": "+y", "z": "+z"}
 
 
 def advice(weights: Mapping[str, float]) -> Motion:
-    """The motion that would make a weak direction observable."""
+    """Motion that would make a weak direction observable."""
     if "mag_scale" in weights:
         return STRENGTH_ADVICE
     strongest = [name for name, w in weights.items() if abs(w) > 0.3] or list(weights)
@@ -190,7 +190,7 @@ class _FisherInformation:
 
 
 def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[Resting], list[Resting]]:
-    """Most informative single poses, of one sensor or of all, and the best sequence of a number of poses."""
+    """Most informative single poses, for one sensor or all, and the best sequence of a given number of poses."""
     field = None
     if scenario.magnetometer:
         place = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
@@ -212,7 +212,7 @@ def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[R
 
 
 def _choices(leans: Sequence[float]) -> list[Resting]:
-    """Attitudes along the axes, each with its top leaned by these angles, deg."""
+    """Axis-aligned resting attitudes, each with the top leaned by given angles, deg."""
     sides = [(up, north) for up in SIDES for north in SIDES if up[1] != north[1]]
     return [Resting(up=up, north=north, lean_deg=lean) for up, north in sides for lean in leans]
 

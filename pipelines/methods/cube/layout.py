@@ -29,7 +29,7 @@ _MOST_PICTURES = 800
 
 
 def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: bool = False) -> Layout:
-    """Poses of the cube's tags from pictures of all sides; the first config gives ids and sizes.
+    """Estimate the poses of the cube's tags from pictures of all sides; the first config gives ids and sizes.
 
     Of a long recording pictures are taken at even distances, a few hundred.
 
@@ -59,7 +59,7 @@ def _shots(recording: Recording, config: Config) -> Shots:
 
 
 def _tags(recording: Recording, config: Config) -> list[tuple[int, Detections]]:
-    """Stamp, ns, of each picture and the tags in it, in time order."""
+    """Detected tags of each picture with its stamp, ns, in time order."""
     topic = config.topic(IMAGE)
     if topic not in recording.topics:
         return _detections(recording, config)
@@ -90,7 +90,7 @@ def _detections(recording: Recording, config: Config) -> list[tuple[int, Detecti
 
 
 def layout_yaml(layout: Layout) -> str:
-    """The layout as a config with `cube.tags`, to be given to `calibrate --config`; sigmas stand in comments."""
+    """Config text (YAML) of a layout, with `cube.tags` for `calibrate --config` and sigmas in comments."""
     body = layout.body
     tags = {
         int(i): {"size": float(size), "rotation": bRt.tolist(), "position": position.tolist()}
@@ -114,7 +114,7 @@ def layout_yaml(layout: Layout) -> str:
 
 
 def _covariance(layout: Layout) -> dict[str, object]:
-    """Covariance in the form of the config's cube.covariance."""
+    """Convert a layout's covariance to the form of the config's cube.covariance."""
     known = layout.covariance if layout.with_camera is None else layout.with_camera
     rows = [" ".join(f"{x:.7g}" for x in row[: i + 1]) for i, row in enumerate(known.tolist())]
     tags: dict[str, object] = {"tags": [int(i) for i in layout.body.ids[1:]]}
@@ -122,7 +122,7 @@ def _covariance(layout: Layout) -> dict[str, object]:
 
 
 def _camera(camera: Camera) -> dict[str, object]:
-    """Camera in the form of the config's cube.camera."""
+    """Convert a camera to the form of the config's cube.camera."""
     return {
         "focal": camera.focal.tolist(),
         "centre": camera.centre.tolist(),

@@ -93,7 +93,7 @@ def layout_json(layout: Layout) -> str:
 
 
 def layout_report(layout: Layout, recordings: Sequence[str]) -> Report:
-    """The report of a layout."""
+    """Build the report of a layout."""
     steps = tuple(f"{capital(step)}." for step in advice(layout))
     tone: Tone = "warn" if steps else "good"
     apply = "Use the section `cube: tags` that was written, in the config of recordings of this cube."

@@ -81,7 +81,7 @@ _POSITION_PRIOR_SIGMA, _ATTITUDE_PRIOR_SIGMA = 10.0, np.pi
 
 
 def problem(data: CubeData, config: Config) -> Problem:
-    """The graph of a cube recording.
+    """Build the graph of a cube recording.
 
     Raises:
         InputError: there is no static pose, the position is unknown, the date is outside the field model, or no tag of
@@ -165,7 +165,7 @@ def _step(model: Model, k: int) -> Step:
 
 
 def _trajectory(model: Model, poses: Sequence[int], values: gtsam.Values) -> Attitudes:
-    """Attitudes nRb of the static poses, at their middles."""
+    """Attitudes nRb (P, 4) of the static poses, at their mid-times."""
     wxyz = so3.from_gtsam([values.atRot3(pose_key(k)) for k in poses])
     return Attitudes(model.poses.span[list(poses)].mean(axis=1), wxyz)
 
@@ -206,7 +206,7 @@ _LONGEST_GAP = 0.1
 
 @dataclass(frozen=True)
 class Turning:
-    """A turn's samples: stamps (N,), s, and gyro and accelerometer (N, 3) in nominal units.
+    """Samples of one turn: stamps (N,), s, and gyro and accelerometer (N, 3) in nominal units.
 
     beyond (N, 3): side of the gyro's dead band, 0 within or without one. temperature_rise (N,), K: temperature above
     the recording's first; None where nobody measures it.
@@ -226,7 +226,7 @@ class Turning:
 
 @dataclass(frozen=True)
 class Model:
-    """The recording prepared for the graph: what every step needs."""
+    """A recording prepared for the graph."""
 
     data: CubeData
     config: Config
@@ -256,14 +256,14 @@ class Model:
 
     @property
     def rest_error(self) -> float:
-        """Sigma of a mean rate at rest beyond noise, rad/s per axis.
+        """Repeatability of a mean rate at rest, beyond white noise, rad/s per axis.
 
         That of the earth rate left out, and of an offset within the dead band, uniform and the same in all poses.
         """
         return float(np.hypot(self.unknown_rate, self.dead_band * np.sqrt(len(self.poses) / 3.0)))
 
     def turn_error(self, samples: Turning) -> float:
-        """Sigma of the mean rate over a turn beyond noise, rad/s per axis.
+        """Repeatability of a mean rate over a turn, beyond white noise, rad/s per axis.
 
         That of the earth rate left out, and of rates within the gyro's dead band, uniform in it.
         """
@@ -271,7 +271,7 @@ class Model:
         return float(np.hypot(self.unknown_rate, self.dead_band * within / np.sqrt(3.0)))
 
     def temperature_rise(self, sensor: str, k: int) -> Array | None:
-        """Mean temperature in pose k above the first, (1,) K; None where a sensor's offset ignores it."""
+        """Mean temperature (1,), K, in pose k above the first one; None if the sensor's slope is no parameter."""
         warming, celsius = self.data.temperature, self.poses.celsius
         if warming is None or celsius is None or sensor not in self.parameters.slopes:
             return None
@@ -279,7 +279,7 @@ class Model:
 
 
 def prepare(data: CubeData, config: Config) -> Model:
-    """Poses, reference, parameters and first guesses of a recording; raises as the graph's `problem`."""
+    """Find poses, reference, parameters and initial values of a recording; raises as the graph's `problem`."""
     if data.latitude is None:
         raise InputError(
             "the place on the earth is unknown, and with it gravity and the earth's rate: record /reference/fix, or "
@@ -342,7 +342,7 @@ def _attitudes(
 
 
 def _levelled(nRb: Array, accel: Array) -> Array:
-    """nRb turned the shortest way so that the specific force points up."""
+    """Rotate nRb by the smallest angle that makes the specific force point up."""
     up = so3.rotate(nRb, accel / np.linalg.norm(accel))
     axis = so3.cross(up, np.array([0.0, 0.0, 1.0]))
     sine = float(np.linalg.norm(axis))
@@ -380,12 +380,12 @@ _FOCAL_STEP, _CENTRE_STEP = 1e-4, 0.1
 
 
 def pose_key(k: int) -> int:
-    """Variable of nRb in pose k, a Rot3."""
+    """Key of the attitude nRb (Rot3) in pose k."""
     return int(gtsam.symbol("x", k))
 
 
 def place_key(k: int) -> int:
-    """Variable of the cube's place in the camera in pose k, (3,) m."""
+    """Key of the cube's position in the camera frame in pose k, (3,) m."""
     return int(gtsam.symbol("p", k))
 
 
@@ -395,7 +395,7 @@ def reference_key(k: int) -> int:
 
 
 def sensor_factors(model: Model, k: int) -> list[Factor]:
-    """Accelerometer, gyro and magnetometer at rest in pose k."""
+    """Factors of accelerometer, gyro and magnetometer at rest in pose k."""
     poses, row = model.poses, slice(k, k + 1)
     time = 0.5 * poses.span[row].sum(axis=1)
     gyro_density, accel_density, mag_density = model.density
@@ -462,7 +462,7 @@ def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
 
 
 def _by_lens(camera: Camera, corners: Array) -> Array:
-    """Derivatives (n, 4, 2, 3) of the corners' z = 1 coordinates by the share of focal length and the centre in px."""
+    """Derivatives (n, 4, 2, 3) of the corners' z = 1 coordinates by focal-length share and principal point, px."""
     columns = []
     for step, moved in (
         (_FOCAL_STEP, np.append(camera.focal, [0.0, 0.0])),
@@ -533,7 +533,7 @@ class GaussMarkovDeviation:
 
     @classmethod
     def over(cls, poses: StaticPoses, walk: float) -> GaussMarkovDeviation:
-        """Deviation for a walk in rad/s/sqrt(s)."""
+        """Build the deviation of an offset with a random walk in rad/s/sqrt(s) over static poses."""
         start, stop = poses.span.T
         middle = 0.5 * (start + stop)
         length = float(stop[-1] - start[0])
@@ -543,7 +543,7 @@ class GaussMarkovDeviation:
         return cls(stationary * np.sqrt(1.0 - correlation**2), correlation, np.diff(edges) / length)
 
     def factors(self, k: int) -> list[Factor]:
-        """Factors of the offset's walk to pose k and of its mean so far; after the last, that c is the mean.
+        """Build the factors of the offset's walk to pose k and its running mean; for the last pose also a zero mean.
 
         The mean of the session is zero to `_STEADY`, in variance half by the steps of the sum and half by its end.
         """

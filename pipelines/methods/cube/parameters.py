@@ -104,17 +104,17 @@ _FRAME = ("accel_k21", "accel_k31", "accel_k32")
 
 
 def tag_key(tag: int) -> int:
-    """Variable of the correction of a tag's attitude on the cube, a Rot3."""
+    """Key of a tag's attitude correction on the cube (Rot3)."""
     return int(gtsam.symbol("T", tag))
 
 
 def tag_place_key(tag: int) -> int:
-    """Variable of the correction of a tag's position on the cube, (3,) m."""
+    """Key of a tag's position correction on the cube, (3,) m."""
     return int(gtsam.symbol("L", tag))
 
 
 def of_tag(spec: ParameterSpec, tag: int) -> ParameterSpec:
-    """Declaration of the parameters of one tag, from that of all tags."""
+    """Declare the parameters of one tag, from the declaration for all tags."""
     return replace(spec, axes=tuple(axis.replace("*", str(tag)) for axis in spec.axes))
 
 
@@ -163,11 +163,11 @@ class Parameters:
 
     @property
     def zeros(self) -> tuple[Parameter, ...]:
-        """The vector parameters with priors about zero."""
+        """Vector parameters with zero prior mean."""
         return tuple(p for p in (self.said, *self.places, *self.assumed) if p is not None)
 
     def initial(self, gyro_bias: Array) -> gtsam.Values:
-        """First values: nominal sensors but for the gyro's offset (3,), mounts as given, the model's field."""
+        """Initial values: nominal sensors except the gyro offset (3,), stated mounts, the field model."""
         values = gtsam.Values()
         for name, own in self.triads.items():
             b = -gyro_bias if name == "gyro" else np.zeros(3)
@@ -201,7 +201,7 @@ def cube_parameters(
     thermometer: bool = False,
     dead_band: bool = False,
 ) -> Parameters:
-    """The parameters of a recording, with the config's priors and requirements.
+    """Build the parameters of a recording, with the config's priors and requirements.
 
     Args:
         config: its priors and `cube`.
@@ -293,7 +293,7 @@ def _given(spec: ParameterSpec, config: Config) -> ParameterSpec:
 
 
 def _place(tag: int, fixed: bool, config: Config) -> Parameter:
-    """Correction of a tag's position; that of the tag which defines the body is fixed."""
+    """Parameter of a tag's position correction; that of the tag that defines the body frame is fixed."""
     return Parameter(tag_place_key(tag), quantities(of_tag(PLACE, tag), config, fixed))
 
 
@@ -304,7 +304,7 @@ def _slopes(config: Config) -> dict[str, Parameter]:
 
 
 def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConversion | None) -> Parameter:
-    """A triad as reported: nominal = K raw + b for the raw numbers as recorded.
+    """Parameter of a triad as reported: nominal = K raw + b, for raw numbers as recorded.
 
     With nominal = K' (raw - offset) scale + b' it is K = K' scale, b = b' - K (offset, offset, offset); the sigmas of
     priors and the accuracies wanted follow.

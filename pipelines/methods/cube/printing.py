@@ -26,7 +26,7 @@ def tag_size(edge: float) -> float:
 
 
 def print_cube(out: Path, edge: float, first_id: int = 16) -> None:
-    """Write a PDF with the six faces of a cube, and beside it, .yaml, the config of a cube with the tags as drawn.
+    """Write a PDF with a cube's six faces, and beside it the config (.yaml) of the cube with the tags as drawn.
 
     Each face has a page with its outline, its id, where it goes, and a ruler to check the scale.
 
@@ -60,12 +60,12 @@ def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
 
 
 def _side(axis: NDArray[np.float64]) -> str:
-    """The side of the cube that a vector points to."""
+    """Side of the cube nearest to the direction of a vector."""
     return max(SIDES, key=lambda side: float(np.dot(SIDES[side], axis)))
 
 
 def _face(edge: float, tag: int, bRt: NDArray[np.float64]) -> str:
-    """Drawing commands of one page."""
+    """Drawing commands of one page, the print of one face."""
     from alidade.pipelines.simulation.rendering import tag_bits
 
     bits = tag_bits(tag)
@@ -100,7 +100,7 @@ def _rectangle(x: float, y: float, width: float, height: float) -> str:
 
 
 def _document(pages: list[str]) -> bytes:
-    """A PDF of these pages (PDF 32000-1, sections 7.5 and 8.5)."""
+    """Assemble pages into a PDF document (PDF 32000-1, sections 7.5 and 8.5)."""
     count = len(pages)
     kids = " ".join(f"{4 + 2 * i} 0 R" for i in range(count))
     box = f"[0 0 {_points(_PAGE[0])} {_points(_PAGE[1])}]"

@@ -52,7 +52,7 @@ class TriadRegression:
 
 
 def regression(raw: Array, nominal: Array) -> TriadRegression:
-    """Regress nominal (P, 3) on raw (P, 3).
+    """Fit nominal = K raw + b to nominal (P, 3) and raw (P, 3) vectors by least squares.
 
     Raises:
         InputError: fewer than four poses, or all of them in a plane.
@@ -168,7 +168,7 @@ def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArr
 
 
 def _coverage(nRb: Array) -> str:
-    """Sentence: how often each face was up, against the published practice."""
+    """Sentence on how often each face was up, compared with the published practice."""
     up = so3.rotate(so3.inverse(nRb), np.array([0.0, 0.0, 1.0]))
     axis = np.argmax(np.abs(up), axis=1)
     sign = np.take_along_axis(up, axis[:, None], axis=1)[:, 0] > 0.0

@@ -90,7 +90,7 @@ class RefinedCamera(Section):
 
 
 class CubeConfig(Board, MethodSection):
-    """The cube: its tags and how well they are known, the camera on the reference, counts, date."""
+    """Section `cube` of a config: tags and their uncertainty, camera on the reference, counts, date."""
 
     key: ClassVar[str] = "cube"
 
@@ -125,7 +125,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Tags in the camera's pictures.
+    """Tags detected in the camera's pictures.
 
     Attributes:
         t: (F,) s, stamps of the pictures.
@@ -195,18 +195,18 @@ def computed_once(compute: Callable[[CubeData, Config], _Result]) -> Callable[[C
 
 
 def nominal(values: Array, conversion: RawConversion | None) -> Array:
-    """Counts converted as the config's `raw` says, in SI; what is recorded in SI as it is."""
+    """Convert readings to SI by the config's `raw`; readings without a conversion are SI already."""
     return values if conversion is None else (values - conversion.offset) * conversion.scale
 
 
 def recorded(values: Array, conversion: RawConversion | None) -> Array:
-    """Readings as recorded, from nominal units: the inverse of `nominal`."""
+    """Convert nominal units back to readings as recorded, the inverse of `nominal`."""
     return values if conversion is None else values / conversion.scale + conversion.offset
 
 
 def local_field(data: CubeData, config: Config) -> Array:
-    """The field where the reference is, (3,) T in n: of its model on the config's date or that of the stamps, of the
-    strength that was measured.
+    """Magnetic field (3,), T in n, at the reference: by the model on the config's date or that of the stamps, with the
+    measured strength if given.
 
     Raises InputError when the model does not hold there and then. `data` has latitude and longitude.
     """

@@ -22,7 +22,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Reference:
-    """Attitude of the frame B that carries the camera. Without a reference B is the camera C itself, standing still.
+    """Attitude of the frame B that carries the camera; without a reference, of the stationary camera C itself.
 
     Attributes:
         nRB: (P, 4) at each pose, all the same when it stands still.
@@ -38,12 +38,12 @@ class Reference:
 
     @property
     def nRC(self) -> Array:
-        """Attitude (P, 4) of the camera with the mount as given."""
+        """Attitudes nRC (P, 4) of the camera, with the mount as stated."""
         return so3.multiply(self.nRB, self.BRC)
 
 
 def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Array | None) -> Reference:
-    """The reference at each pose.
+    """Attitude of the reference at each pose.
 
     A reference that stands still is one attitude, the mean of all messages; one that moves has the mean of each pose.
 
@@ -83,7 +83,7 @@ def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Ar
 
 
 def _noise(errors: Array) -> Array:
-    """Covariance (N, 3, 3) of attitude errors (N, 3) whose noise nobody states, by their successive differences.
+    """Covariance (N, 3, 3), rad^2, of attitude errors (N, 3) without a stated noise, from successive differences.
 
     Those of a motion are small: von Neumann, "Distribution of the ratio of the mean square successive difference to the
     variance", Ann. Math. Stat. 1941.
@@ -94,7 +94,7 @@ def _noise(errors: Array) -> Array:
 
 
 def _mean(wxyz: Array) -> tuple[Array, Array]:
-    """Mean attitude (4,) and the errors (N, 3) of the samples about the axes of n: sample = Exp(error) mean."""
+    """Mean attitude (4,) and the samples' errors (N, 3) about the axes of n: sample = Exp(error) mean."""
     mean = wxyz[0]
     for _ in range(5):
         error = so3.log(so3.multiply(wxyz, so3.inverse(mean)))
@@ -103,18 +103,18 @@ def _mean(wxyz: Array) -> tuple[Array, Array]:
 
 
 def _squares(errors: Array, covariance: Array) -> float:
-    """Mean square of the errors whitened, 1 if they are as stated."""
+    """Mean square of whitened errors, 1 for the stated noise."""
     return float(np.einsum("ni,nij,nj->", errors, np.linalg.inv(covariance), errors) / errors.size)
 
 
 def _on_the_right(mean: Array, about_n: Array, copies: int) -> Array:
-    """Covariance (copies, 3, 3) of delta in mean Exp(delta), from the one about the axes of n."""
+    """Convert a covariance about the axes of n to that of delta in mean Exp(delta), (copies, 3, 3)."""
     R = so3.matrix(mean)
     return np.tile(R.T @ about_n @ R, (copies, 1, 1))
 
 
 def _camera_at_rest(poses: StaticPoses, field: Array | None) -> Array:
-    """First guess of nRC, the same at all poses: up from the accelerometer, north from the magnetometer, if any."""
+    """Initial nRC, equal at all poses: up by the accelerometer, north by the magnetometer, if any."""
     seen = [k for k, tags in enumerate(poses.tags) if tags is not None]
     cRb = np.array([tags.pose.cRb for tags in poses.tags if tags is not None])
     up = so3.rotate(cRb, poses.accel[seen]).mean(axis=0)
@@ -125,7 +125,7 @@ def _camera_at_rest(poses: StaticPoses, field: Array | None) -> Array:
 
 
 def from_vectors(up: Array, mag: Array | None, field: Array | None) -> Array:
-    """nRa (4,) of a frame a in which `up` is the specific force at rest and `mag` the field; else any heading."""
+    """Attitude nRa (4,) from specific force `up` at rest and field `mag` in a; without a field any heading."""
     if mag is None or field is None or not np.isfinite(mag).all():
         # Any direction across will do for north.
         mag, field = np.eye(3)[np.argmin(np.abs(up))], np.array([0.0, 1.0, 0.0])

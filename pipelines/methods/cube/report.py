@@ -107,14 +107,14 @@ def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
 
 
 def stated(config: Config) -> dict[str, Array]:
-    """The camera's mount and the tags' rotations as the config gives them, by their names in the formulas."""
+    """Stated camera mount and tag rotations, by their names in the formulas."""
     cube = config.section(CubeConfig)
     tags = {f"rotation_{tag}": np.array(each.rotation) for tag, each in cube.tags.items()}
     return tags if cube.camera_rotation is None else {**tags, "camera_rotation": np.array(cube.camera_rotation)}
 
 
 def _accelerometer(parameters: Collection[str], conversion: RawConversion | None) -> list[Formula]:
-    """Specific force, without nonlinearity and drift where these are among the parameters."""
+    """Formulas of the specific force, corrected for those nonlinearities and drifts that are parameters."""
     drift = _drift("accel", parameters)
     inputs = ("accel", *(["temperature"] if drift else []))
     if not any(name in parameters for each in (SQUARE, CUBE) for name in each.names):
@@ -137,7 +137,7 @@ def _accelerometer(parameters: Collection[str], conversion: RawConversion | None
 
 
 def _gyro(parameters: Collection[str], conversion: RawConversion | None) -> Formula:
-    """Rate, without g-sensitivity and drift where these are among the parameters."""
+    """Formula of the rate, corrected for g-sensitivity and drift where these are parameters."""
     feels = any(name in parameters for name in SENSITIVITY.names)
     felt = f"{matrix_text([SENSITIVITY.names[i : i + 3] for i in (0, 3, 6)], parameters)} * f_b" if feels else ""
     drift = _drift("gyro", parameters)
@@ -291,7 +291,7 @@ _ERRORS = {"accel": ("mg", 1e3 / 9.80665), "gyro": ("deg", np.rad2deg(1.0)), "ma
 
 
 def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
-    """The method's own figures and tables; those that the recording has no data for are left out."""
+    """Figures and tables of the method for which the recording has data."""
     config = calibration.config
     estimate = calibration.estimate
     values = calibration.problem.numbers(estimate)
@@ -458,7 +458,7 @@ def validate(data: CubeData, config: Config, values: Mapping[str, float]) -> lis
 
 
 def _turn_validation(data: CubeData, config: Config, poses: StaticPoses, values: Mapping[str, float]) -> Validation:
-    """Rotations by the gyro against those between poses that the camera sees one after the other.
+    """Compare gyro rotations with those between consecutive poses seen by the camera.
 
     The camera is taken to stand still; the earth's own turning, 0.1 mrad in two seconds, is not taken off.
     """
@@ -480,7 +480,7 @@ def calibrated(
     celsius: Array | None = None,
     accel: Array | None = None,
 ) -> Array:
-    """Readings (n, 3) of a sensor by the formulas of the calibration, along the cube's axes, SI.
+    """Calibrated readings (n, 3) of a sensor along the cube's axes, SI.
 
     Args:
         name: of the sensor.
@@ -512,7 +512,7 @@ def calibrated_rates(data: CubeData, config: Config, values: Mapping[str, float]
 
 
 def coverage(calibration: Calibration) -> Plot | None:
-    """Directions of up in the body, on an equal-area map of the sphere, with the gaps between them."""
+    """Plot the directions of up in the body on an equal-area map of the sphere, with the gaps between."""
     up = np.array([row["up"] for row in rows_of(calibration, "static_poses")])
     if not len(up):
         return None

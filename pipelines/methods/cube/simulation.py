@@ -58,13 +58,13 @@ _LEAST_COSINE = 0.3
 
 
 def simulate_cube(scenario: CubeScenario, seed: int) -> tuple[CubeData, dict[str, float]]:
-    """A session with tag detections and the true values of its parameters; a bias that walks is its mean."""
+    """Simulate a session with tag detections; return it with the true parameters (a walking bias as its mean)."""
     world = _World(scenario, seed)
     return world.data(), world.truth
 
 
 def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
-    """A session in memory; with pictures in place of the detections if asked for."""
+    """Simulate a session in memory, with pictures instead of detections if requested."""
     world = _World(scenario, seed)
     known = strength_measured(world.field, scenario.field.measured, seed) if scenario.magnetometer else {}
     config = cube_config(scenario, images, **known)
@@ -149,7 +149,7 @@ class _World:
         return model + error, float(np.deg2rad(heading_deg))
 
     def data(self) -> CubeData:
-        """Everything recorded; sets the truth."""
+        """Simulate all measurements, and set the truth."""
         s = self.scenario
         imu_t, gyro, accel = self._imu()
         data = CubeData(
@@ -308,7 +308,7 @@ _BUMP = 64.0 * Polynomial([0, 0, 0, 1]) * Polynomial([1, -1]) ** 3
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The cube's way: attitudes nRb (P, 4) and places (P, 3), m in C, of the poses, and the hand's detours between.
+    """Motion of the cube: attitudes nRb (P, 4), positions (P, 3), m in C, and detours of the hand between poses.
 
     start (P,), stop (P,): of the static poses, s. wobble (P - 1, 3) rad in b, detour (P - 1, 3) m.
     """
@@ -321,7 +321,7 @@ class Motion:
     detour: Array
 
     def _phase(self, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Index of the static pose before times t, s, the share (0 to 1) of the turn from it, and its duration, s."""
+        """Index of the last static pose at times t, s, share (0 to 1) of the following turn, and its duration, s."""
         k = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
         following = np.minimum(k + 1, len(self.start) - 1)
         duration = np.where(following > k, self.start[following] - self.stop[k], 1.0)
@@ -337,7 +337,7 @@ class Motion:
         return so3.compose(self.nRb[k], so3.exp(turn[k] * _STEP(u)[:, None]), so3.exp(wobble[k] * _BUMP(u)[:, None]))
 
     def position(self, t: Array, derivative: int = 0) -> Array:
-        """Place (N, 3) of the cube in C, m, or a derivative of it by time."""
+        """Position (N, 3), m, of the cube in C at times t, s, or a time derivative of it."""
         k, u, duration = self._phase(t)
         step, bump = (f.deriv(derivative) if derivative else f for f in (_STEP, _BUMP))
         after = np.append(self.place[1:], self.place[-1:], axis=0)
@@ -361,7 +361,7 @@ def drawn_attitudes(scenario: CubeScenario, rng: np.random.Generator) -> Array:
 
 
 def drawn_motion(s: CubeScenario, rng: np.random.Generator) -> Motion:
-    """Motion through the scenario's poses."""
+    """Draw a motion through the scenario's poses."""
     nRb = drawn_attitudes(s, rng)
     n = len(nRb)
     place = np.array([0.0, 0.0, s.distance]) + [0.04, 0.03, 0.05] * rng.uniform(-1, 1, (n, 3))

@@ -94,7 +94,7 @@ class StaticPoses:
 
 @computed_once
 def static_poses(data: CubeData, config: Config) -> StaticPoses:
-    """Find the static poses and average over them.
+    """Find the static poses and average all sensors over each.
 
     Raises:
         InputError: there is no static pose, no tag is seen in any though there is a camera, or a tag does not fit the
@@ -120,12 +120,12 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
 
 
 def turn(data: CubeData, start: float, stop: float) -> slice:
-    """The device's samples from one stamp to another, both included."""
+    """Slice of the device's samples from one stamp to another, both included."""
     return slice(int(np.searchsorted(data.imu_t, start)), int(np.searchsorted(data.imu_t, stop, side="right")))
 
 
 def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
-    """Means (P, d) over the spans, NaN over empty ones, and the time they are taken over (P,), s."""
+    """Means (P, d) over the spans, NaN over empty ones, and averaging time (P,), s."""
     first, last = np.searchsorted(t, span[:, 0]), np.searchsorted(t, span[:, 1], side="right")
     number = last - first
     # About the whole mean, so that cumulative sums of counts keep their digits.
@@ -199,7 +199,7 @@ def _stated_px(config: Config) -> float:
 
 
 def _tags_in(seen: Sightings, sigma: float, config: Config, start: float, stop: float) -> tuple[Detections, Array]:
-    """The tags in the pictures taken from start to stop, their corners averaged, and the stamps of these pictures.
+    """Average the tags' corners over the pictures from start to stop, s; also return these pictures' stamps.
 
     Where the corners move, as before a camera that does, all tags are averaged over the same pictures.
     """
@@ -219,7 +219,7 @@ def _tags_in(seen: Sightings, sigma: float, config: Config, start: float, stop: 
 
 
 def _away(corners: Array) -> Array:
-    """How far the corners (n, 4, 2) of each picture are from their median, (n,) px, at most."""
+    """Largest distance (n,), px, of each picture's corners (n, 4, 2) from their median over pictures."""
     return np.asarray(np.abs(corners - np.median(corners, axis=0)).max(axis=(1, 2)))
 
 
@@ -285,7 +285,7 @@ def _check_camera(
     disagree: bool,
     found: list[SeenTags | None],
 ) -> None:
-    """Raise InputError where tags do not fit and another description of the camera makes all of them fit."""
+    """Raise InputError if tags do not fit, but would all fit with another camera description."""
     from alidade.pipelines.methods.cube.camera_faults import camera_fault
 
     assert data.camera is not None
@@ -298,7 +298,7 @@ def _check_camera(
 
 
 def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
-    """Raise InputError if a tag disagrees with others more often than it agrees with others."""
+    """Raise InputError if a tag disagrees with other tags more often than not."""
     agrees = {tag: sum(len(seen.ids) > 1 and tag in seen.ids for seen in found if seen is not None) for tag in wrong}
     often = {tag: times for tag, times in wrong.items() if times > agrees[tag]}
     if not often:
@@ -314,7 +314,7 @@ def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
 
 @computed_once
 def static_intervals(data: CubeData, config: Config) -> Array:
-    """Beginnings and ends, (P, 2) s, of the device's static intervals. Raises InputError when there is none."""
+    """Start and end, (P, 2) s, of the device's static intervals. Raises InputError if there is none."""
     root_rate = float(np.median(np.diff(data.imu_t))) ** -0.5
     gyro_sigma, accel_sigma, _ = (density * root_rate for density in noise_densities(data, config))
     raw = config.section(CubeConfig).raw

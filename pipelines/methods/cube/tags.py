@@ -33,7 +33,7 @@ _OTHER_CAMERA = 0.05
 
 
 def read_camera(recording: Recording, config: Config) -> Camera:
-    """The camera that looks at the cube. Raises InputError when it, or the cube's tags, are not described."""
+    """Read the camera that observes the cube. Raises InputError if camera or tags are not described."""
     if not config.section(CubeConfig).tags:
         raise InputError(
             "the tags on the cube are not given: name them in the config as cube.tags {id: {size, rotation, position}}"
@@ -58,7 +58,7 @@ def _refined(camera: Camera, refined: RefinedCamera) -> Camera:
 
 
 def read_sightings(recording: Recording, data: CubeData, config: Config, dropped: dict[str, int]) -> Sightings:
-    """The cube's tags, found in the pictures of the device's static intervals, or else as recorded.
+    """Read the cube's tags from the pictures of static intervals, or else from recorded detections.
 
     Where both are there the config may name the detections under `topics`, and no pictures.
 
@@ -84,7 +84,7 @@ def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: di
 
 
 def _pictures(recording: Recording, config: Config, data: CubeData, dropped: dict[str, int]) -> Sightings:
-    """Tags found in the pictures of the static intervals; the others are not looked at."""
+    """Detect tags in the pictures of the static intervals only."""
     from alidade.pipelines.vision.tags import UNREADABLE, detections
 
     assert data.camera is not None
@@ -133,7 +133,7 @@ def _sightings(
     covariance: Array | None,
     dropped: dict[str, int],
 ) -> Sightings:
-    """The cube's tags among those seen, each at most once in a picture."""
+    """Select the cube's tags among detections; ids seen twice in a picture are dropped there."""
     known = np.isin(ids, list(config.section(CubeConfig).tags))
     if not known.any():
         raise InputError(

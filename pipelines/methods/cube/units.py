@@ -46,7 +46,7 @@ class Readings:
 
 
 def check_units(accel: Readings, gyro: Readings, mag: Readings | None = None) -> None:
-    """Raise InputError for sensors that are not in SI: names all of them, with conversions to be pasted."""
+    """Raise InputError for sensors not in SI; the message names all, with conversions to paste."""
     sensors = {"accel": accel, "gyro": gyro} | ({} if mag is None else {"mag": mag})
     wrong = {name: said for name, readings in sensors.items() if (said := _wrong(name, readings))}
     if not wrong:
@@ -90,7 +90,7 @@ def _section(found: dict[str, tuple[float, float]]) -> str:
 
 
 def _usual(name: str, scale: float) -> str:
-    """The usual unit or full scale nearest to a guess, empty if none is near."""
+    """Usual unit or full scale nearest to a guessed scale; empty if none is near."""
     away = {unit: abs(np.log(scale / si)) for unit, si in _USUAL[name].items()}
     best = min(away, key=lambda unit: away[unit])
     return best if away[best] < _NEAR[name] else ""
@@ -103,14 +103,14 @@ def _accel(values: Array) -> tuple[float, float] | None:
 
 
 def _mag(values: Array) -> tuple[float, float] | None:
-    """Conversion by the usual strength of the field over all directions; no offset, which may be hard iron."""
+    """Scale of a magnetometer count by the usual field strength; offset 0, as the offset may be hard iron."""
     low, high = np.quantile(values, [0.005, 0.995], axis=0)
     radius = 0.5 * float(np.median(high - low))
     return (_FIELD / radius, 0.0) if radius > 0.0 else None
 
 
 def _ball(values: Array) -> tuple[float, float]:
-    """Radius and offset, the same on all axes, of readings of a vector of one length in many directions."""
+    """Radius and per-axis offset of readings of a vector of constant length in many directions."""
     norms = np.linalg.norm(values, axis=1)
     middle = float(np.median(norms))
     if float(np.median(np.abs(norms - middle))) < _ROUND * middle:

@@ -22,7 +22,7 @@ _NOD, _MANOEUVRE = np.deg2rad(10.0), np.deg2rad(5.0)
 
 
 def checklist(data: HeadData, _: Config) -> Sequence[ChecklistItem]:
-    """Motion of the head, and of the platform where there is one."""
+    """Checklist of motion of the head and, if present, of the platform."""
     found = [ChecklistItem("vision", f"{1.0 / np.median(np.diff(data.vision_t)):.3g} attitudes/s")]
     found += swayed("head", turned(data.head_t, data.head_gyro), _NOD, "turn the head about its", "helmet")
     if data.platform_t is not None and data.platform_gyro is not None:
@@ -36,7 +36,7 @@ _SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """Proposed changes of a scenario: a phrase and the changed scenario."""
+    """Yield changes of a scenario worth trying: a phrase, and the changed scenario."""
     for key in ("head", "platform"):
         yield from sways(scenario, key, f"the {key}", _SWAY)
 

@@ -27,7 +27,7 @@ _MOUNT, _BIAS, _CLOCK = slice(0, 3), slice(3, 6), slice(6, 8)
 
 
 def guess(gyro: GyroPath, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:
-    """First guess of the gyro bias (3,) and vRh (4,) from rates: w_v = vRh w_h + bias over short windows.
+    """Initial gyro bias (3,) and mount vRh (4,) from mean rates over short windows: w_v = vRh w_h + bias.
 
     Rates seen by vision beyond what the gyro's length allows are outliers. The mount is the rotation between the
     rates when the motion is about more than one axis, else the identity.

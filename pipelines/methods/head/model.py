@@ -61,7 +61,7 @@ _AT_REST = "No platform IMU: the platform counts as at rest."
 
 @dataclass(frozen=True)
 class _Model:
-    """The recording prepared for the graph: what every step needs."""
+    """A recording prepared for the graph."""
 
     chain: GyroChain  # bRv at the keyframes
     carriers: tuple[GyroPath, GyroPath | None]  # of the helmet and the platform, without the noise at rest
@@ -82,7 +82,7 @@ class _Model:
 
 
 def problem(data: HeadData, config: Config) -> Problem:
-    """The graph of a head recording.
+    """Build the graph of a head recording.
 
     Raises:
         InputError: fewer than ten vision frames lie within the helmet gyro's record.
@@ -138,7 +138,7 @@ def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | 
 
 
 def _denser_graph(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
-    """The graph for noise levels with which pictures may share fewer keyframes; see Problem.denser_graph."""
+    """Build the graph with finer keyframes where the noise levels require it; see Problem.denser_graph."""
     noises = model.noises | {level.noise.name: level for level in levels}
     if _shared(data, noises) > 0.5 * model.origins[2]:
         return None
@@ -183,7 +183,7 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
 
 
 def _continuation(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
-    """The graph of the end of a growing recording; see Problem.continuation."""
+    """Build the graph of the end of a growing recording; see Problem.continuation."""
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time < data.vision_t[0]):
         return None
@@ -202,7 +202,7 @@ def _prepare(
     clock: Clock | None = None,
     noises: Mapping[str, Level] | None = None,
 ) -> _Model:
-    """The model of a recording, or of one that grows from a keyframe of its model until now on.
+    """Prepare the model of a recording, or of the end of a growing recording from a keyframe on.
 
     `noises` are those in force; None: as stated. `clock` has the times of the pictures. Those of a recording that
     grows count as taken at their stamps.
@@ -329,7 +329,7 @@ def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], confi
 
 
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
-    """The first keyframe with the calibration variables and their priors, then `chunk` keyframes at a time."""
+    """Yield the first keyframe with calibration variables and priors, then `chunk` keyframes at a time."""
     time = model.chain.time
     taken = int(np.searchsorted(time, after, side="right"))
     if taken == 0:
@@ -355,7 +355,7 @@ def _step(model: _Model, keyframes: range) -> Step:
 
 
 def _begin(model: _Model, step: Step) -> None:
-    """The calibration variables and their priors."""
+    """Add the calibration variables and their priors to the first step."""
     p = model.parameters
     step.initial.insert(p.helmet.key, so3.to_gtsam(model.helmet_guess))
     step.initial.insert(p.camera.key, so3.to_gtsam(so3.identity()))
@@ -412,7 +412,7 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
 
 
 def _advice(weights: Mapping[str, float]) -> Motion:
-    """The motion that would make a weak direction observable."""
+    """Motion that would make a weak direction observable."""
     strongest = {name.rsplit("_", 1)[0] if name != OFFSET.name else name for name, w in weights.items() if abs(w) > 0.3}
     platform = swaying("xy", "platform")
     if {CAMERA.name, HELMET.name} <= strongest:

@@ -77,7 +77,7 @@ PICTURE_SPECS = tuple(next(spec for spec in NUISANCE if spec.name == name) for n
 
 @dataclass(frozen=True)
 class HeadParameters:
-    """The variables that all measurements share.
+    """Variables that all measurements share.
 
     Attributes:
         bias: the helmet gyro's (3), rad/s, its first node.
@@ -103,7 +103,7 @@ class HeadParameters:
         stamp_sigma: float = 0.0,
         all_around: bool = False,
     ) -> HeadParameters:
-        """Parameters with the priors of the config; a camera without a moving platform is fixed by default.
+        """Build the parameters with the priors of the config; without a moving platform the camera is fixed by default.
 
         Motion capture has no scale of its angles, unless the config says something of it.
 

@@ -55,7 +55,7 @@ def euler_kalman_filter(
     bias_walk: float,
     vision_sigma: float,
 ) -> HeadFilterResult:
-    """Run the filter over a session, from the first vision frame to the last within the gyro's time span.
+    """Run the published filter over a session, from the first vision frame to the last within the gyro's record.
 
     Within 5 degrees of pitch +-90 the Euler rates are evaluated with |cos(pitch)| held at its value there. The filter
     then stays finite, but its covariance knows nothing of what the held cosine leaves out: the attitude is off by
@@ -133,7 +133,7 @@ def published_estimate(data: HeadData, config: Config, problem: Problem) -> Esti
 
 
 def _smooth(bias: Array, window: int, threshold: float) -> Array:
-    """Moving average of the last `window` rows, (K, 3), wherever their standard deviation exceeds the threshold.
+    """Replace rows by the mean of the last `window` rows, (K, 3), where their standard deviation exceeds a threshold.
 
     It is reported alone: fed back into the filter, the mean is the delay that sets an integral loop swinging (attitude
     error up to six times as large).
@@ -144,14 +144,14 @@ def _smooth(bias: Array, window: int, threshold: float) -> Array:
 
 
 def attitude(angles: ArrayLike) -> Array:
-    """Attitudes bRv (..., 4) of yaw, pitch, roll (..., 3), rad."""
+    """Attitudes bRv (..., 4) from yaw, pitch, roll (..., 3), rad."""
     yaw, pitch, roll = (np.asarray(angles, dtype=float)[..., i, None] for i in range(3))
     ex, ey, ez = np.eye(3)
     return so3.compose(so3.exp(yaw * ez), so3.exp(pitch * ey), so3.exp(roll * ex))
 
 
 def euler_angles(bRv: ArrayLike) -> Array:
-    """Attitudes, shape (..., 4) -> yaw, pitch, roll, shape (..., 3), rad, pitch within +-pi/2."""
+    """Yaw, pitch, roll (..., 3), rad, of attitudes (..., 4), with pitch within +-pi/2."""
     m = so3.matrix(bRv)
     yaw = np.arctan2(m[..., 1, 0], m[..., 0, 0])
     pitch = -np.arcsin(np.clip(m[..., 2, 0], -1.0, 1.0))
@@ -193,7 +193,7 @@ def euler_rates(angles: Array, w_iv: Array, w_ib: Array) -> tuple[Array, Array, 
 def _predict(
     x: Array, P: Array, dt: float, w_iv: Array, w_ib: Array, gyro_density: float, bias_walk: float
 ) -> tuple[Array, Array]:
-    """One first-order step of state and covariance."""
+    """Predict state and covariance by one first-order step."""
     rates, by_angles, by_rate = euler_rates(x[:3], w_iv - x[3:], w_ib)
     F = np.eye(6)
     F[:3, :3] += dt * by_angles
@@ -204,7 +204,7 @@ def _predict(
 
 
 def _nearest_angles(measured: Array, predicted: Array) -> Array:
-    """Measured minus predicted, taking the nearer of the two triples of Euler angles that are the same attitude."""
+    """Measured minus predicted Euler angles, for the nearer of the two equivalent triples."""
     yaw, pitch, roll = measured
     twins = np.array([measured, [yaw + np.pi, np.pi - pitch, roll + np.pi]])
     difference = (twins - predicted + np.pi) % (2.0 * np.pi) - np.pi

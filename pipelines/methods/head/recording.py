@@ -80,7 +80,7 @@ class HeadData:
 
 
 def read_head(recording: Recording, config: Config) -> HeadData:
-    """Read and check a head session; without vision attitudes they are taken from the pictures of the tag board.
+    """Read and check a head session; without recorded attitudes, measure these in pictures of the tag board.
 
     Raises InputError when a topic is missing or unusable, see alidade.pipelines.recording.checks, and when the topics
     have no time in common.
@@ -155,7 +155,7 @@ def head_topics(data: HeadData, pictures: series.Pictures | None = None) -> dict
 
 
 def _from_pictures(reader: StreamReader, config: Config) -> tuple[Array, Array, Array]:
-    """Attitudes of the helmet's tag board, seen in the pictures."""
+    """Measure attitudes of the helmet's tag board in the pictures."""
     from alidade.pipelines.vision.board import board_attitudes
     from alidade.pipelines.vision.pose import TagBody
 
@@ -202,7 +202,7 @@ _FEW, _QUIET = 25, 0.05
 
 
 def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
-    """The kind that rate, covariance, noise, type or name suggest, with the reason; nothing where none does."""
+    """Propose the kind of vision from rate, covariance, noise, type or name, with the reason; empty if undecided."""
     if "kind" in config.vision.model_fields_set:
         return ()
     name = config.topic(VISION_ATTITUDE)
@@ -227,7 +227,7 @@ def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
 
 
 def white_angle(wxyz: Array) -> float:
-    """Noise of attitudes (n, 4), rad per axis, where they turn least: fourth differences have motion in them, too."""
+    """White noise of attitudes (n, 4), rad per axis, from fourth differences where rotation is least."""
     turns = so3.log(so3.multiply(so3.inverse(wxyz[:-1]), wxyz[1:]))
     fourth = np.diff(turns, 3, axis=0)
     if len(fourth) < _FEW:

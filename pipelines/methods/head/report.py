@@ -76,7 +76,7 @@ def findings(data: HeadData, config: Config, _: Estimate) -> Findings:
 
 
 def head_plots(data: HeadData, calibration: Calibration) -> list[Plot]:
-    """Attitude bRv with what vision says of it, and their differences; nothing without a trajectory."""
+    """Plots of the attitude bRv with that by vision, and their differences; none without a trajectory."""
     attitudes = calibration.estimate.attitudes
     if attitudes is None or len(attitudes.time) < 2:
         return []
@@ -198,7 +198,7 @@ class _Applied:
 
     @classmethod
     def of(cls, data: HeadData, values: Mapping[str, float]) -> _Applied:
-        """Corrections from parameter values; missing ones are zero."""
+        """Apply parameter values to a recording; missing ones are zero."""
         known = dict.fromkeys(_MOUNTS, 0.0) | dict(values)
         mounts = apply([each for each in formulas(known) if not each.inputs], known, {})
         helmet, platform = helmet_gyro(data, known), _platform_gyro(data, known)
@@ -321,7 +321,7 @@ REPORT = Report(
 
 
 def at_gyro_rate(data: HeadData, attitudes: Attitudes, values: Mapping[str, float]) -> Attitudes:
-    """bRv at each sample of the helmet's gyro from the first of the attitudes to the last; see `carried`."""
+    """Attitudes bRv at the samples of the helmet's gyro, from the first known attitude to the last; see `carried`."""
     if not len(attitudes.time):
         return attitudes
     at = data.head_t[(data.head_t >= attitudes.time.min()) & (data.head_t <= attitudes.time.max())]
@@ -370,6 +370,6 @@ def _platform_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath | No
 
 
 def _rate(name: str, values: Mapping[str, float], measured: Mapping[str, Array | None]) -> Array:
-    """A rate (n, 3) by its formula, rad/s."""
+    """Evaluate the formula of a rate: (n, 3), rad/s."""
     own = next(each for each in formulas(values) if each.name == name)
     return apply([own], values, {each: measured[each] for each in own.inputs})[name]

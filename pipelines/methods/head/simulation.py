@@ -66,7 +66,7 @@ def _board(*tags: tuple[float, float, float, float]) -> Board:
 
 
 class HeadPictures(ScenarioPart):
-    """The camera, its pictures, the tag board and where it is: a pinhole camera with plumb_bob distortion."""
+    """Settings of camera, pictures and tag board: a pinhole camera with plumb_bob distortion."""
 
     width: Annotated[int, Field(gt=0)] = 640
     height: Annotated[int, Field(gt=0)] = 480
@@ -85,7 +85,7 @@ class HeadPictures(ScenarioPart):
 def draw(
     settings: HeadPictures, t: Array, t_ns: NDArray[np.int64], cRh: Array, rng: np.random.Generator
 ) -> tuple[series.CameraInfo, series.ImageSeries]:
-    """The camera's description and its pictures, drawn one by one as they are taken.
+    """Return the camera's description and its pictures, rendered one by one.
 
     Args:
         settings: camera and board.
@@ -110,7 +110,7 @@ def draw(
 def _exposures(
     settings: HeadPictures, camera: Camera, cRh: Array, position: Array, rng: np.random.Generator
 ) -> Iterator[bytes]:
-    """The files of the pictures."""
+    """Yield the pictures' files."""
     renderer = Renderer(camera)
     for attitude, origin in zip(cRh, position, strict=True):
         quads = [
@@ -174,7 +174,7 @@ class HeadScenario(ScenarioPart):
 
 
 def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str, float]]:
-    """A session and the true values of its parameters (rad/s, rad, s; the bias is its mean over the session)."""
+    """Simulate a session; return it with the true parameters (rad/s, rad, s; a walking bias as its mean)."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     noise = scenario.noise
@@ -216,7 +216,7 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
 
 
 def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
-    """The pictures from which the attitudes of such a session can be measured; drawn one by one as they are taken.
+    """Render the pictures behind the attitudes of `simulate_head` with the same seed, one by one.
 
     Raises:
         InputError: the scenario has outliers, which are made of attitudes, or impossible distortion.
@@ -231,7 +231,7 @@ def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraI
 
 
 def head_config(scenario: HeadScenario, images: bool = False) -> str:
-    """The recording's config (YAML): the noise that was simulated, the scenario's priors and, of pictures, the board.
+    """Config (YAML) of the recording: simulated noise, the scenario's priors and, with pictures, the tag board.
 
     Attitudes from pictures bring their own covariance.
     """
@@ -245,7 +245,7 @@ def head_config(scenario: HeadScenario, images: bool = False) -> str:
 
 
 def _platform_attitude(scenario: HeadScenario, t: Array) -> Array:
-    """iRb, shape (N, 4)."""
+    """Attitudes iRb (N, 4) of the platform."""
     if scenario.latitude_deg is None:
         iRn = so3.identity(len(t))
     else:
@@ -254,7 +254,7 @@ def _platform_attitude(scenario: HeadScenario, t: Array) -> Array:
 
 
 def _gyro(scenario: HeadScenario, rate_hz: float, phase: float, helmet: bool) -> tuple[Array, Array]:
-    """Stamps and error-free samples of the helmet's gyro (in v) or the platform's (in b), rad/s."""
+    """Stamps, s, and error-free rates, rad/s, of the helmet's gyro (in v) or the platform's (in b)."""
     t = sample_times(scenario.duration_s, rate_hz, phase)
     edges: Array = (np.arange(len(t) + 1, dtype=float) + (phase - 0.5)) / rate_hz
     attitude = _platform_attitude(scenario, edges)
@@ -283,7 +283,7 @@ def _walking_bias(scenario: HeadScenario, n: int, rng: np.random.Generator) -> A
 
 
 def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array, Array, Array]:
-    """Stamps of what vision sees, true times, and cRh without noise, shape (K, 4)."""
+    """Stamps and true times of vision, s, and attitudes cRh (K, 4) without noise."""
     t = sample_times(scenario.duration_s, scenario.vision_rate_hz, scenario.vision_phase)
     seen = np.ones(len(t), dtype=bool)
     for start, end in scenario.vision_outages_s:
@@ -307,7 +307,7 @@ def _acceleration(scenario: HeadScenario, at: Array, h: float = 2e-3) -> Array:
 def _vision(
     scenario: HeadScenario, effects: Mapping[str, float], rng: np.random.Generator, seed: int
 ) -> tuple[Array, Array]:
-    """Stamps and measured cRh, shape (K, 4)."""
+    """Stamps, s, and measured attitudes cRh (K, 4)."""
     t, _, cRh = _sights(scenario, effects)
     if scenario.vision_map:
         seen = so3.matrix(cRh).reshape(-1, 9)
@@ -327,7 +327,7 @@ def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
 
 
 def simulated(scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
-    """Simulated head session in memory, with pictures if asked for.
+    """Simulate a head session in memory, with pictures if requested.
 
     Raises:
         InputError: its pictures cannot be drawn.

@@ -19,7 +19,7 @@ _EZ = np.array([0.0, 0.0, 1.0])
 
 
 def uses(_true: Truth, _config: Config, noise: Mapping[str, float]) -> Sequence[Use]:
-    """Attitude over head azimuth, and over the time since the last picture."""
+    """Uses of a head calibration: attitude over head azimuth, and over the time since the last picture."""
     density, walk = noise.get("gyro_density", 0.0), noise.get("gyro_bias_walk", 0.0)
     gained = density**2 * _OUTAGE_S + walk**2 * _OUTAGE_S**3 / 3.0
     attitude = Use(

@@ -55,7 +55,7 @@ def checklist(data: IndexerData, _: Config) -> Sequence[ChecklistItem]:
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """Proposed changes of a scenario: a phrase and the changed scenario."""
+    """Yield changes of a scenario worth trying: a phrase, and the changed scenario."""
     for axis in ("outer", "inner"):
         for other in (0.0, 90.0, 180.0, 270.0):
             position = {"axis": axis, "other_deg": other, "turns": 3.0}

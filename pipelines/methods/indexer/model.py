@@ -77,7 +77,7 @@ _CERTAIN = 2.0
 
 @dataclass(frozen=True)
 class _Model:
-    """The recording prepared for the graph: what every step needs."""
+    """A recording prepared for the graph."""
 
     data: IndexerData
     motion: AxisMotion
@@ -102,7 +102,7 @@ class _Model:
 
 
 def problem(data: IndexerData, config: Config) -> Problem:
-    """The graph of an indexer recording.
+    """Build the graph of an indexer recording.
 
     Raises:
         InputError: an unknown parameter in the config, no rotation, no latitude although the windows need it, or gyro
@@ -214,7 +214,7 @@ def _steps(model: _Model, _: int) -> Iterator[Step]:
 
 
 def _begin(model: _Model, step: Step) -> None:
-    """The calibration variables and their priors."""
+    """Add the calibration variables and their priors to the first step."""
     for parameter in model.parameters:
         size = len(parameter.quantities)
         if parameter.key == KEYS["theta"]:
@@ -271,7 +271,7 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
 
 
 def _advice(weights: Mapping[str, float]) -> Motion:
-    """The motion that would make a weak direction observable."""
+    """Motion that would make a weak direction observable."""
     strongest = {name for name, w in weights.items() if abs(w) > 0.3}
     outer = turning("outer", 0.0)
     if strongest & set(EPSILON):
@@ -360,7 +360,7 @@ def agreeing(
 
 
 def _fit(w: Array, gyro: Array, weight: Array) -> tuple[Array, Array]:
-    """A (3, 3) near the identity and b (3,) near zero with gyro = A w + b in weighted least squares."""
+    """Fit gyro = A w + b by weighted least squares, with A (3, 3) near the identity and b (3,) near zero."""
     rows = np.column_stack([w, np.ones(len(w))])
     # What no rotation excites stays with the prior: a mounting of some degrees, a bias below 1e-3 rad/s.
     hold = 1e-6 * weight.sum() * np.array([*[np.mean((w**2).sum(axis=1))] * 3, 1.0])

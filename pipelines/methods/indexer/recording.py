@@ -113,7 +113,7 @@ def indexer_topics(data: IndexerData, _pictures: None = None) -> dict[str, serie
 
 
 def _latitude(recording: Recording, config: Config) -> float | None:
-    """Degrees: from the config, else the median of the fixes, else None."""
+    """Latitude, deg: from the config, else the median of the fixes, else None."""
     if config.latitude_deg is not None or not wanted(recording, config, FIX):
         return config.latitude_deg
     return median_fix(recording, config.topic(FIX))[0]

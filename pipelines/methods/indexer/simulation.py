@@ -39,7 +39,7 @@ Vector = tuple[float, float, float]
 
 
 class Position(ScenarioPart):
-    """Turns about one axis, forward and back, the other axis standing at an angle."""
+    """Turns about one axis, forward and back, with the other axis at a fixed angle."""
 
     axis: Literal["outer", "inner"]
     other_deg: float
@@ -119,7 +119,7 @@ class _Drive:
 
 
 def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData, dict[str, float]]:
-    """A session and the true values of its parameters (rad, rad/s; the bias is its mean over the session)."""
+    """Simulate a session; return it with the true parameters (rad, rad/s; a walking bias as its mean)."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng = np.random.default_rng(seed)
     rng_of_sensors = np.random.default_rng([seed, 1])
@@ -160,12 +160,12 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
 
 
 def simulated(scenario: IndexerScenario, seed: int, _images: bool = False) -> Simulated:
-    """Simulated indexer session in memory."""
+    """Simulate an indexer session in memory."""
     return Simulated(*simulate_indexer(scenario, seed), indexer_config(scenario))
 
 
 def indexer_config(scenario: IndexerScenario) -> str:
-    """The recording's config (YAML): the noise that was simulated, the base's attitude and the scenario's priors.
+    """Config (YAML) of the recording: simulated noise, attitude of the base, the scenario's priors.
 
     The encoder's noise takes in all errors of the angles, RMS: white noise, harmonics, the axes' wobble, quantisation.
     """

@@ -35,7 +35,7 @@ _ADDED_SWAY = {"amplitude_deg": 5.0, "frequency_hz": 0.29}
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    """Proposed changes of a scenario: a phrase and the changed scenario."""
+    """Yield changes of a scenario worth trying: a phrase, and the changed scenario."""
     yield from sways(scenario, "carrier", "the carrier", _ADDED_SWAY)
     # Another target from the middle of the longest segment of one target.
     found = sorted([0.0, *(loss["end_s"] for loss in scenario["losses"]), scenario["duration_s"]])

@@ -74,7 +74,7 @@ _NEAR = 0.02
 
 @dataclass(frozen=True)
 class _Model:
-    """The recording prepared for the graph: what every step needs."""
+    """A recording prepared for the graph."""
 
     chain: GyroChain  # tRm at the keyframes, which are the pictures used; a new chain for every target found
     mount: Array  # first guess of the mounting angles
@@ -97,7 +97,7 @@ class _Model:
 
 
 def problem(data: LosData, config: Config) -> Problem:
-    """The graph of a los recording.
+    """Build the graph of a los recording.
 
     Raises:
         InputError: an unknown parameter in the config, only one of delta_pz and delta_gz, or fewer than ten pictures
@@ -158,7 +158,7 @@ def _noises(data: LosData, config: Config) -> dict[str, Level]:
 
 
 def _continuation(config: Config, model: _Model, data: LosData, time: float) -> Problem | None:
-    """The graph of the end of a growing recording; see Problem.continuation."""
+    """Build the graph of the end of a growing recording; see Problem.continuation."""
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time not in data.image_t):
         return None
@@ -177,7 +177,7 @@ def _prepare(
     clock: Clock | None = None,
     guessed: tuple[Array, Array, float] | None = None,
 ) -> tuple[_Model, dict[str, int]]:
-    """The model of a recording, or of one that grows from a keyframe of its model until now on.
+    """Prepare the model of a recording, or of the end of a growing recording from a keyframe on.
 
     `clock`, `guessed` with mounting angles, bias and delay, moved the data's stamps already. Those of a recording that
     grows stay where they are, and so do its keyframes.

@@ -100,7 +100,7 @@ class LosData:
 
 
 def read_los(recording: Recording, config: Config) -> LosData:
-    """Read and check a los session; without LOS errors they are taken from the pictures.
+    """Read and check a los session; without recorded LOS errors, measure these in the pictures.
 
     Raises InputError when a topic is missing or unusable (see alidade.pipelines.recording.checks), when the topics have
     no time in common, when the target was never found, when an encoder is in degrees, the elevation beyond 80 deg or
@@ -160,7 +160,7 @@ def los_topics(data: LosData, pictures: series.Pictures | None = None) -> dict[s
 
 
 def check_gimbal(topic: str, data: LosData) -> None:
-    """Raise InputError if an encoder stands still while the carrier turns and the picture does not move.
+    """Raise InputError if an encoder is constant while the carrier rotates and the picture does not move.
 
     A gimbal locked on purpose differs from a frozen encoder in the LOS error, which then moves with the carrier.
     """

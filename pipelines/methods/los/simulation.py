@@ -83,7 +83,7 @@ class Loss(ScenarioPart):
 
 
 class LosCamera(ScenarioPart):
-    """Pictures of the target: a pinhole camera with plumb_bob distortion, what it looks at, and how well."""
+    """Settings of pictures of the target: pinhole camera with plumb_bob distortion, scene, image quality."""
 
     width: Annotated[int, Field(gt=0)] = 640
     height: Annotated[int, Field(gt=0)] = 480
@@ -174,7 +174,7 @@ class LosMotion:
 
 
 def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, float]]:
-    """A session and the true values of its parameters (rad, rad/s, s; the bias is its mean over the session)."""
+    """Simulate a session; return it with the true parameters (rad, rad/s, s; a walking bias as its mean)."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     effects = true_values(NUISANCE, scenario, rng_of_sensors)
@@ -287,7 +287,7 @@ def camera_attitude(scenario: LosScenario, gimbal: Array, effects: Mapping[str, 
 
 
 def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulated:
-    """Simulated los session in memory, with pictures if asked for.
+    """Simulate a los session in memory, with pictures if requested.
 
     Raises:
         InputError: its pictures cannot be drawn.

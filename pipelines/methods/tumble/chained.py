@@ -35,7 +35,7 @@ _ANY_ATTITUDE, _FIXED = np.pi, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Graph:
-    """What every step needs: sensors by name, the chain, variables that all share, and how outliers are weighed."""
+    """Common inputs of all steps: sensors by name, chain, shared variables, robust loss."""
 
     sensors: Mapping[str, Sensor]
     turning: Turning
@@ -186,7 +186,7 @@ def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -
 
 
 def advice(weights: Mapping[str, float]) -> Motion:
-    """The motion that would make a weak direction observable."""
+    """Motion that would make a weak direction observable."""
     if "mag_scale" in weights:
         return STRENGTH_ADVICE
     strong = [name for name, weight in weights.items() if abs(weight) > 0.3] or list(weights)

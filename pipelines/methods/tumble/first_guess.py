@@ -20,7 +20,7 @@ _UNIT = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
 
 
 def first_guess(raw: Array, strength: float | None, offset: float) -> tuple[Array, Array]:
-    """S and centre of the likeliest ellipsoid |S (raw - centre)| = 1.
+    """Estimate S and centre of the most likely ellipsoid |S (raw - centre)| = 1.
 
     The starts are the algebraic ellipsoid and spheres. Readings on a ring determine only some of the nine numbers; the
     others are the prior's.

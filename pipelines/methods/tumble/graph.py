@@ -42,7 +42,7 @@ _STRETCH = 0.5
 
 
 def problem(data: TumbleData, config: Config) -> Problem:
-    """The graph of a tumble recording.
+    """Build the graph of a tumble recording.
 
     Raises:
         InputError: too few readings or attitudes, the config names no such parameter, or the date is outside the field
@@ -132,7 +132,7 @@ def _rows(time: Array, low: float, high: float) -> slice:
 
 
 def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]:
-    """Strength factors of a sensor's readings in a slice of rows."""
+    """Strength factors of a sensor's readings, for a slice of rows."""
     if rows.start == rows.stop:
         return []
     drivers = None if sensor.drivers is None else sensor.drivers[rows]
@@ -144,7 +144,7 @@ def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]
 
 
 def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: TruncatedLoss) -> list[Factor]:
-    """Factors of the angles between field and gravity in a slice of rows."""
+    """Factors of the angle between field and gravity, for a slice of rows."""
     if rows.start == rows.stop:
         return []
     drivers = None if moments.drivers is None else moments.drivers[rows]

@@ -27,7 +27,7 @@ _TURN = {"mag": "turn the device so that the field goes along", "accel": "rest i
 
 
 def checklist(data: TumbleData, config: Config) -> Sequence[ChecklistItem]:
-    """Directions covered, and where to turn the device next; rests of the accelerometer."""
+    """Checklist of directions covered, the next rotation of the device, and rests of the accelerometer."""
     found = []
     for sensor in prepare(data, config).sensors:
         share, (gap, where) = share_near(sensor.directions), widest_gap(sensor.directions)

@@ -190,7 +190,7 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The recording prepared for the graph.
+    """A recording prepared for the graph.
 
     Attributes:
         sensors: accelerometer first.
@@ -302,7 +302,7 @@ def relative_scatter(raw: Array) -> float:
 
 
 def _about_one_axis(mag: Sensor) -> list[str]:
-    """Note on a magnetometer that was turned about one axis: hard iron across it, its sigma, ratio of the ellipse."""
+    """Note on a magnetometer rotated about one axis: transverse hard iron with sigma, and ellipse ratio."""
     found = ring(mag.raw)
     if found is None:
         return []
@@ -393,7 +393,7 @@ def _contradicts(sine: float, dip: float) -> bool:
 
 
 def _is_mounted_straight(rotation: Array) -> bool:
-    """Whether the axes that a rotation (3, 3) brings together have the same names.
+    """Whether a rotation (3, 3) aligns axes of the same name.
 
     Of a contradicted dip the accelerometer with all signs inverted is then the one cause, one axis that is not another.
     """
@@ -628,8 +628,7 @@ def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[ND
 
 
 def _mounting(up: Array, field: Array) -> tuple[Array, float, bool]:
-    """R (3, 3), proper, and s with up . R field = -s for unit vectors (n, 3), and whether R is unique; else no
-    rotation.
+    """Solve up . R field = -s for a rotation R (3, 3) and s, from unit vectors (n, 3); also whether R is unique.
 
     Linear in the nine entries of R and in s, with one solution up to a factor, whose sign is R's determinant.
     """

@@ -37,7 +37,7 @@ _REQUIRE_GAIN, _REQUIRE_BIAS, _REQUIRE_DIP = 5e-3, {"accel": 2e-3, "mag": 1e-2},
 
 @dataclass(frozen=True)
 class Variable:
-    """A graph variable, its parameter, its first guess, and its prior without unit: mean and sigma."""
+    """Graph variable with its parameter, initial value, and dimensionless prior mean and sigma."""
 
     parameter: Parameter
     start: Array

@@ -31,7 +31,7 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class Ellipsoid:
-    """|S (raw - centre)| = 1, S (3, 3) symmetric; `covariance` (9, 9) of Q's xx xy xz yy yz zz and u in `scaled` raw.
+    """Ellipsoid |S (raw - centre)| = 1, S (3, 3) symmetric, with covariance (9, 9) of its quadric coefficients.
 
     Attributes:
         S, centre: as above, in the unit of raw.

@@ -119,7 +119,7 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
 
 
 def _check_gravity(topic: str, accel: Array) -> None:
-    """Raise InputError where gravity, which calibrates an accelerometer, is not in its readings."""
+    """Raise InputError if an accelerometer's readings lack gravity, the reference of its calibration."""
     if lacks_gravity(np.linalg.norm(accel, axis=1)):
         raise InputError(f"topic {topic}: {GRAVITY_REMOVED}")
 

@@ -106,7 +106,7 @@ def findings(data: TumbleData, config: Config, estimate: Estimate) -> Findings:
 
 
 def directions(sensor: Sensor, values: Mapping[str, float]) -> Array:
-    """Unit vectors (n, 3) in the body of a sensor's calibrated readings."""
+    """Unit vectors (n, 3) of a sensor's calibrated readings in the body frame."""
     K, b = triad_of(sensor.name, values)
     vectors = sensor.raw @ K.T + b
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -11,7 +11,7 @@ from alidade.pipelines.simulation.sensors import Warming, recording_config
 
 
 class TumbledMagnetometer(ScenarioPart):
-    """The magnetometer, with the iron about it."""
+    """Settings of the simulated magnetometer, with hard and soft iron."""
 
     rate_hz: Positive = 50.0
     density: Positive = 5e-8  # T/sqrt(Hz)
@@ -20,7 +20,7 @@ class TumbledMagnetometer(ScenarioPart):
 
 
 class TumbledAccelerometer(ScenarioPart):
-    """The accelerometer."""
+    """Settings of the simulated accelerometer."""
 
     rate_hz: Positive = 100.0
     density: Positive = 1.5e-3  # m/s^2/sqrt(Hz)
@@ -33,7 +33,7 @@ class TumbledAccelerometer(ScenarioPart):
 
 
 class TumbledGyro(ScenarioPart):
-    """The gyro, which samples when the accelerometer does, if there is one."""
+    """Settings of the simulated gyro, sampled with the accelerometer if there is one."""
 
     rate_hz: Positive = 100.0
     density: Positive = 1e-4  # rad/s/sqrt(Hz)
@@ -64,7 +64,7 @@ class TumbleScenario(ScenarioPart):
 
 
 def tumble_config(scenario: TumbleScenario, **more: object) -> str:
-    """The recording's config, YAML: the noise simulated, the scenario's priors, other keys."""
+    """Config (YAML) of the recording: simulated noise, the scenario's priors, other keys."""
     noise = {}
     if scenario.magnetometer is not None:
         noise["mag_density"] = scenario.magnetometer.density

@@ -33,7 +33,7 @@ _FIELD, _LATITUDE = np.array([0.0, 2.2e-5, -4.2e-5]), np.deg2rad(45.0)
 
 
 def simulated(scenario: TumbleScenario, seed: int, _images: bool = False) -> Simulated:
-    """Data and the true values of the parameters. Raises InputError when there is no sensor."""
+    """Simulate data; return them with the true parameters. Raises InputError without a sensor."""
     if scenario.magnetometer is None and scenario.accelerometer is None:
         raise InputError("tumble: magnetometer or accelerometer is needed, or both")
     rng = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ class _Motion:
 
 
 def _drawn(rng: np.random.Generator, gain: float, bias: float) -> tuple[Array, Array]:
-    """A symmetric K (3, 3) about the identity, and b (3,)."""
+    """Draw a symmetric K (3, 3) near the identity, and b (3,)."""
     K = gain * rng.standard_normal((3, 3))
     K = np.triu(K) + np.triu(K, 1).T
     return np.eye(3) + K, bias * rng.standard_normal(3)
@@ -163,7 +163,7 @@ def _gyro(
     g: float,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, dict[str, float]]:
-    """Stamps, readings (I + S) w + G f + bias, and the true values of S, G and bias."""
+    """Stamps, readings (I + S) w + G f + bias, and true S, G and bias."""
     rate_hz = sensor.rate_hz if beside is None else beside.rate_hz
     t = sample_times(motion.duration, rate_hz, 0.3)
     before, now, after = (motion.attitude(t + step) for step in (-_STEP, 0.0, _STEP))
@@ -191,7 +191,7 @@ def _accelerometer(
 
 
 def _force(motion: _Motion, sensor: TumbledAccelerometer, g: float, t: Array) -> Array:
-    """Specific force (n, 3) in b where the accelerometer is."""
+    """Specific force (n, 3), m/s^2, in b at the accelerometer."""
     arm = np.array([sensor.arm, 0.0, 0.0])
     before, now, after = (so3.rotate(motion.attitude(t + step), arm) for step in (-_STEP, 0.0, _STEP))
     force = (before - 2.0 * now + after) / _STEP**2 + np.array([0.0, 0.0, g])

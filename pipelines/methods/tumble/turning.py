@@ -73,7 +73,7 @@ _GAIN = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Directions that a sensor measured: time (n,) s, direction (n, 3) in b, and all samples, `whole` (m, 3) in b, SI.
+    """Measured directions of a sensor: time (n,) s, unit direction (n, 3) in b, and all samples `whole` (m, 3), SI.
 
     swung: whether it is used while it moves.
     """
@@ -133,7 +133,7 @@ class FieldGuess:
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """Chain of the attitudes aRb at keyframes.
+    """Chain of attitudes aRb at keyframes.
 
     Attributes:
         chain: the keyframes, joined by the gyro.

@@ -59,7 +59,7 @@ def unturned(sensor: Sensor) -> Sensor:
 
 
 def check_turned(sensor: Sensor, config: Config) -> None:
-    """Raise InputError if readings, or the means of `unturned`, show too few attitudes for any of the numbers."""
+    """Raise InputError if readings, or their means by `unturned`, cover too few attitudes for a parameter."""
     few = not sensor.rested and len(sensor.raw) < FEWEST
     # Counts may have any offset: those of a device that rests are a cloud of noise, and so is their ellipsoid.
     still = relative_scatter(sensor.raw) < TURNED and (sensor.is_si or sensor.sample_scatter > _CLOUD)
