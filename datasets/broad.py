@@ -84,7 +84,7 @@ def read_trial(path: Path) -> Trial:
 
 
 def gyro_bias_at_rest(trial: Trial) -> Array:
-    """Mean gyro over the samples at rest, (3,) rad/s: the bias, earth rate included."""
+    """Mean gyro reading (3,), rad/s, over the samples at rest: the bias, earth rate included."""
     return np.asarray(trial.gyro[~trial.moving].mean(axis=0))
 
 

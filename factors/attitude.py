@@ -27,7 +27,7 @@ FADE = np.deg2rad(150.0)
 
 @dataclass(frozen=True)
 class VisionAttitudeFactor(Model):
-    """Attitudes of the helmet's marker frame seen by the platform's camera, at an unknown time.
+    """Attitudes of the helmet's marker frame in the platform's camera, at uncertain times.
 
     Predicted: cRh = cRb bRv(at) vRh with bRv(at) = dB(anchor, at)^T bRv(anchor) dV(anchor, at), the gyros' own samples
     carrying the attitude from the time of the variable to that of the picture. Blocks: bRv at the anchors (rotations),

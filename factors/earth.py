@@ -29,7 +29,7 @@ _CENTRIFUGAL_RATIO = 3.449786506841e-3  # omega^2 a^2 b / GM
 
 
 def earth_rate(latitude: ArrayLike) -> Array:
-    """Angular rate of the earth in n, shape (..., 3), rad/s, at latitudes of shape (...)."""
+    """Angular rate of the earth (..., 3), rad/s, in n, at latitudes (...), rad."""
     latitude = np.asarray(latitude, dtype=float)
     return EARTH_RATE * np.stack([np.zeros_like(latitude), np.cos(latitude), np.sin(latitude)], axis=-1)
 
@@ -46,7 +46,7 @@ def gravity(latitude: ArrayLike, height: ArrayLike = 0.0) -> Array:
 
 
 def magnetic_field(latitude: float, longitude: float, height: float, year: float) -> Array:
-    """World Magnetic Model in n, shape (3,), T, by the edition that holds in that year (2010 to 2029).
+    """Magnetic field (3,), T, in n by the World Magnetic Model edition of the year (2010 to 2029).
 
     Args:
         latitude, longitude: rad.

@@ -30,7 +30,7 @@ _LEAST = 1e-12
 
 
 def entries(symmetric: bool) -> Array:
-    """Matrix (12, 9) or (12, 12) from the variable's numbers to the rows of K and b."""
+    """Matrix (12, 9) or (12, 12) from a triad variable's numbers to K by rows and b."""
     return _SYMMETRIC if symmetric else np.eye(12)
 
 

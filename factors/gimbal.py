@@ -52,7 +52,7 @@ class GimbalPath:
         return samples, factors.prod(axis=2)
 
     def at(self, at: ArrayLike) -> Array:
-        """Angles (n, 2), rad, at the times."""
+        """Gimbal angles (n, 2), rad, at the times."""
         at = np.asarray(at, dtype=float)
         out = np.empty((len(at), 2))
         # Weights of all at once would take fifty times the memory of the times.

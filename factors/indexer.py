@@ -44,7 +44,7 @@ def mounting(theta: ArrayLike) -> Array:
 
 
 def mounting_angles(tRm: ArrayLike) -> Array:
-    """tRm, shape (..., 4) -> angles theta, shape (..., 3), rad, theta_y within +-pi/2."""
+    """Angles theta (..., 3), rad, of mounting rotations tRm (..., 4), with theta_y within +-pi/2."""
     m = so3.matrix(tRm)
     y = -np.arcsin(np.clip(m[..., 2, 0], -1.0, 1.0))
     return np.stack([np.arctan2(m[..., 2, 1], m[..., 2, 2]), y, np.arctan2(m[..., 1, 0], m[..., 0, 0])], axis=-1)
@@ -106,7 +106,7 @@ class AxisPath:
         self._integral = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(pieces, axis=0)])
 
     def rates(self, edges: ArrayLike) -> PlatformRates:
-        """Mean rates over the adjoining windows between the edges, (n + 1,), s, increasing, within the stamps.
+        """Mean platform rates over the windows between increasing edges (n + 1,), s, within the stamps.
 
         Raises:
             ValueError: an edge lies beyond the stamps, or a window is empty.

@@ -186,12 +186,12 @@ class LosDirectionFactor(Model):
         return angle, gain * by_late, gain * by_delay, -np.stack([gain * sine, gain * cosine], axis=2)
 
     def camera(self, angles: Array) -> Array:
-        """Camera attitudes cRm (n, 4) at the stamps and mounting angles (n, d), rad."""
+        """Camera attitudes cRm (n, 4) at the stamps, for mounting angles (n, d), rad."""
         turned = self._camera(so3.identity(len(angles)), angles, self.gimbal)
         return so3.from_matrix(turned[:, :3].transpose(2, 0, 1))
 
     def predict(self, tRm: Array, angles: Array) -> Array:
-        """phx, phz and roll, (n, 3), rad, at attitudes tRm (n, 4) and angles (n, d)."""
+        """LOS errors and roll phx, phz, roll (n, 3), rad, at attitudes tRm (n, 4) and mounting angles (n, d)."""
         return _picture(self._camera(tRm, angles, self.gimbal)[:, :3])
 
     @cached_property

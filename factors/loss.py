@@ -28,7 +28,7 @@ class TruncatedLoss:
             raise ValueError(f"TruncatedLoss: gate {self.gate:g} must be above 0, mu {self.mu:g} not below")
 
     def weight(self, square: Array) -> Array:
-        """Weights in [0, 1] of measurements with squared norms `square`."""
+        """Robust weights in [0, 1] of measurements with squared norms `square`."""
         inside, outside = self._limits()
         if self.mu == 0.0:
             return np.ones_like(square)

@@ -28,7 +28,7 @@ class SplitHalf:
 
     @property
     def step(self) -> float:
-        """Difference of the estimates, second half less first."""
+        """Difference of the two estimates, second minus first."""
         return self.second - self.first
 
     @property
@@ -115,7 +115,7 @@ def _solved(
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """Error of one kind before and after compensation; a method may have several.
+    """Errors of one kind before and after compensation; a method may have several kinds.
 
     Attributes:
         name: what is compared with what.

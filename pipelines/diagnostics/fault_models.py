@@ -14,7 +14,7 @@ from alidade.pipelines.settings import Config
 
 @dataclass(frozen=True)
 class ScaleFactor:
-    """A number of the config that may be off by an unknown factor.
+    """A number of the config with a possibly wrong scale.
 
     Attributes:
         label: the fault in words, with {factor}.

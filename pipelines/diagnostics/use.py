@@ -91,7 +91,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Numbers that describe a curve of a scalar error: `of` maps errors (..., U) to (..., k), nan where undefined."""
+    """Coefficients that summarise a curve of scalar errors: `of` maps (..., U) to (..., k), nan if undefined."""
 
     names: tuple[str, ...]
     of: Callable[[Array], Array]
@@ -207,7 +207,7 @@ class UseBands:
 
     @property
     def coefficients(self) -> dict[str, dict[str, dict[str, float]]] | None:
-        """Line -> name -> before, before_sigma, after, after_sigma, in the use's unit; None where the use has none."""
+        """Coefficients of each line: before, before_sigma, after, after_sigma, in the use's unit; None if undefined."""
         if self.use.coefficients is None:
             return None
         columns = ("before", "before_sigma", "after", "after_sigma")

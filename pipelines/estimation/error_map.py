@@ -122,7 +122,7 @@ class ErrorMap:
         return ThroughGimbalFactor(mapped, gimbal, errors, model.encoder, error_blocks=(len(model.blocks),))
 
     def error(self, c: Array) -> Array:
-        """Errors (n, axes) of the measurements."""
+        """Evaluate the map's errors (n, axes) of the measurements."""
         return np.asarray(self.functions @ c.reshape(self.functions.shape[1], -1))
 
     def added_to(self, problem: Problem) -> Problem:

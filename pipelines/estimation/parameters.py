@@ -111,7 +111,7 @@ def check_parameters(
 def gyro_scale(
     sensor: str, sheet: str, sigma: float, skew_sigma: float | None = None, of: str = "Gyro"
 ) -> tuple[ParameterSpec, ParameterSpec]:
-    """The six numbers of a gyro's S, in the order of factors.gyro: measured = (I + S) w; skew as scale if not given."""
+    """Declare a gyro's S, in the order of factors.gyro: measured = (I + S) w; default skew sigma that of scale."""
     skew_sigma = sigma if skew_sigma is None else skew_sigma
     return (
         ParameterSpec(f"{sensor}_scale", "", sigma, f"{of} scale-factor error, {{axis}}.", f"{sheet}.scale"),
@@ -127,7 +127,7 @@ def gyro_scale(
 
 
 def g_sensitivity(sigma: float) -> ParameterSpec:
-    """The nine numbers of a gyro's G, by rows: measured = w + G f."""
+    """Declare the nine numbers of a gyro's g-sensitivity G, by rows: measured = w + G f."""
     return ParameterSpec(
         "gyro_g",
         "rad/s/(m/s^2)",
@@ -139,7 +139,7 @@ def g_sensitivity(sigma: float) -> ParameterSpec:
 
 
 def temperature_slope(sensor: str, unit: str, sigma: float) -> ParameterSpec:
-    """The three slopes of a sensor's bias over its temperature, `unit`/K."""
+    """Declare the three temperature slopes of a sensor's bias, `unit`/K."""
     return ParameterSpec(
         f"{sensor}_temperature",
         f"{unit}/K",
@@ -157,18 +157,18 @@ CLOCK_SKEW = scalar("clock_skew", "", 1e-4, "Clock skew, camera against gyro.", 
 
 
 def gyro_bias(prior: float, require: float) -> ParameterSpec:
-    """Bias of a gyro, rad/s."""
+    """Declare the bias of a gyro, rad/s."""
     return ParameterSpec("gyro_bias", "rad/s", prior, "Gyro bias about {axis}.", require=require, per_recording=True)
 
 
 def time_offset(prior: float, require: float = math.inf, data_sheet: str = "") -> ParameterSpec:
-    """Time offset of pictures, s."""
+    """Declare the time offset of pictures, s."""
     text = "Camera time offset (exposure minus stamp, on the gyro's clock)."
     return scalar("time_offset", "s", prior, text, data_sheet, require=require, per_recording=True)
 
 
 def accel_square(sigma: float) -> ParameterSpec:
-    """The three square terms of an accelerometer that reads u + square u^2."""
+    """Declare the three square terms of an accelerometer that reads u + square u^2."""
     return ParameterSpec(
         "accel_square", "s^2/m", sigma, "Accelerometer quadratic nonlinearity, {axis}.", "accel.square", axes="123"
     )

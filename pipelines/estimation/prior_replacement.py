@@ -51,7 +51,7 @@ def with_priors(problem: Problem, gaussian_priors: Sequence[GaussianPrior]) -> P
 def _about_alone(
     factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values, names: Collection[str]
 ) -> Mask:
-    """Mask (m,) of rows of a linearised prior about the named numbers and no others, except fixed ones."""
+    """Mask (m,) of rows of a linearised prior that involve named numbers and, beside fixed ones, no others."""
     A, _ = factor.jacobian()
     blocks = dict(zip(factor.keys(), _by_key(A, factor.keys(), values), strict=True))
     own = [p for p in parameters if p.key in blocks]
@@ -261,7 +261,7 @@ class _PriorFactors:
 
 
 def conditional_root(covariance: Array, sigmas: Array) -> Array:
-    """Lower triangular R (n, n) with R'R the information: row i is number i given those before it.
+    """Lower triangular square root R (n, n) of information R'R: row i conditions number i on those before.
 
     Args:
         covariance: (n, n) of the numbers; fixed ones have rows of zeros.

@@ -70,7 +70,7 @@ class NearRotationVector:
     reference: tuple[float, float, float]
 
     def __call__(self, values: gtsam.Values, key: int) -> tuple[Array, Array]:
-        """Rotation vector, rad, and its Jacobian by the variable."""
+        """Rotation vector (3,), rad, and its Jacobian by the variable."""
         phi, J = rotation_vector_coordinates(values, key)
         angle = float(np.linalg.norm(phi))
         turns = round((float(phi @ self.reference) / angle - angle) / (2.0 * np.pi)) if angle > 0.0 else 0
@@ -257,7 +257,7 @@ class Factor:
 
 @dataclass(frozen=True)
 class Step:
-    """Addition to the graph at one moment. A method builds it by adding to its collections, then leaves it alone.
+    """Addition to the graph at one moment; read-only once a method has filled its collections.
 
     Attributes:
         time: s from the session's start.
@@ -442,14 +442,14 @@ class ChiSquare:
 
 @dataclass(frozen=True)
 class History:
-    """Estimates over time: times (k,), values and sigmas (k, n) in the order of Estimate.names."""
+    """Estimates over time: times (k,), s, values and sigmas (k, n), in the order of Estimate.names."""
 
     time: Array
     values: Array
     sigmas: Array
 
     def inflated(self, by: Array) -> History:
-        """The history with sigmas multiplied by factors (n,)."""
+        """Multiply the history's sigmas by factors (n,)."""
         return replace(self, sigmas=self.sigmas * by)
 
 
@@ -471,13 +471,13 @@ class PosteriorHistory:
 
     @property
     def history(self) -> History:
-        """The history with sigmas in place of covariances."""
+        """Convert the covariances of the history to sigmas."""
         return History(self.time, self.values, np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
 
 
 @dataclass(frozen=True)
 class InfluentialMeasurement:
-    """Influence of a measurement on the parameter that it shifts most.
+    """Influence of a measurement on the parameter that the measurement shifts most, in sigmas.
 
     Attributes:
         family: of the measurement.

@@ -95,7 +95,7 @@ class WalkingBias:
         return self.key(0) if node == 0 else int(gtsam.symbol("m", node))
 
     def begin(self, step: Step, node: int, guess: Array) -> None:
-        """Add a node to a step; `guess` is (3,) rad/s. What determines the first is the caller's to add."""
+        """Add a node to a step, with `guess` (3,) rad/s; the caller adds factors that determine the first node."""
         step.initial.insert(self.key(node), guess)
         if node > 0:
             step.factors.append(self._walk_factor(node))

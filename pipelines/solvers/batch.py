@@ -162,7 +162,7 @@ def solve_batch(
     engine: EngineName = "auto",
     error_map: bool = False,
 ) -> Estimate:
-    """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
+    """Compute the maximum a-posteriori estimate with the joint covariance of all parameters.
 
     Args:
         problem: to be solved.
@@ -217,7 +217,7 @@ def _best(compiled: Compiled, solution: Solution, config: LevenbergConfig) -> tu
 
 
 def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple[str, Problem]] = ()) -> Estimate:
-    """Complete estimate of a solution, with covariance and diagnostics; see `solve_batch`."""
+    """Compute the complete estimate of a solution, with covariance and diagnostics; see `solve_batch`."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, posterior.at
     names = tuple(q.name for q in problem.quantities)

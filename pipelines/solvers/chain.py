@@ -52,7 +52,7 @@ class IndeterminateError(Exception):
 
 
 class IndeterminateStateError(IndeterminateError):
-    """A state is determined neither by measurements nor by its neighbours."""
+    """Neither measurements nor its neighbours determine a state."""
 
 
 class Chain(ABC):
@@ -151,7 +151,7 @@ class ChainSystem(Chain):
         return len(self.measured)
 
     def part(self, begin: int, end: int) -> ChainSystem:
-        """Rows about some consecutive states, as views."""
+        """Slice the rows about some consecutive states, as views."""
         piece, some = None if self.piece is None else self.piece[begin:end], slice(begin, end)
         measured, between, beside = self.measured[some], self.between[some], self.beside[some]
         return replace(self, measured=measured, between=between, beside=beside, piece=piece)
@@ -297,7 +297,7 @@ class Factorization(ABC):
 
     @property
     def minimum(self) -> float:
-        """Sum of squares of the rows at the solution."""
+        """Sum of squares of all rows at the solution."""
         return float(self.root[-1, -1] ** 2)
 
     def solve(self) -> tuple[Array, Array, Array]:
@@ -336,7 +336,7 @@ class ChainFactorization(Factorization):
 
     @classmethod
     def of(cls, chain: Chain) -> ChainFactorization:
-        """Eliminate all but the shared unknowns and the last node. Raises IndeterminateStateError."""
+        """Eliminate a chain down to the last node and the shared unknowns. Raises IndeterminateStateError."""
         own, tail, levels, keyframes = chain.d, chain.c, list[_Level | None](), np.arange(len(chain))
         while len(chain) > SEQUENTIAL_STATES or (own == 0 and chain.walk is not None):
             if chain.walk is not None and len(chain) == len(chain.walk):
@@ -398,8 +398,8 @@ class ChainFactorization(Factorization):
 
     @property
     def shared_roots(self) -> Array:
-        """(c + s, s) columns whose squares sum to the covariance of the last node and the shared unknowns, but for
-        what the last node has of its own."""
+        """Columns (c + s, s) whose squares sum to the shared unknowns' part of the covariance of the last node and the
+        shared unknowns."""
         return np.asarray(np.linalg.inv(self.root[:-1, :-1])[:, self.c :])
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
@@ -458,7 +458,7 @@ class _TimeOrder:
 
     @classmethod
     def eliminate(cls, chain: ChainSystem, keyframes: Index, own: int) -> tuple[_TimeOrder, Array]:
-        """The states of a chain, and R of (last node, shared unknowns, right side); the first `own` numbers go last."""
+        """Eliminate a chain's states down to R of (last node, shared, right side); the first `own` numbers go last."""
         d, c, w, count = chain.d, chain.c, chain.border, len(chain.measured)
         piece = np.zeros(count, dtype=np.intp) if chain.piece is None else chain.piece
         rows, heads, piles, begin = list[Array](), list[Array](), list[Array](), 0
@@ -545,7 +545,7 @@ def _block(matrices: Array, some: Index) -> Array:
 def _last_of_piece(
     head: Array, known: Array, between: Array, walk: Array, d: int, c: int
 ) -> tuple[Array, Array, Array]:
-    """Eliminate a state and its node: R, rows carried to the next state, rows about the next node and shared unknowns.
+    """Eliminate a state with its node: R, rows on the next state, rows on the next node and shared unknowns.
 
     Columns: head [x | z | rest], known [z | rest], between [x | x' | z' | rest], walk [z' | z | right side].
     """
@@ -611,7 +611,7 @@ def _inner(chain: ChainSystem, lasts: Index, rows: Array) -> tuple[Array, Array,
 
 
 def _swapped(rows: Array, d: int) -> Array:
-    """Rows with the columns of the first two states swapped."""
+    """Swap the columns of the first two states in rows."""
     return np.concatenate([rows[..., d : 2 * d], rows[..., :d], rows[..., 2 * d :]], axis=-1)
 
 
@@ -640,7 +640,7 @@ def _reduced(piles: list[Array], columns: int) -> Array:
 
 
 def _triangle(rows: Array) -> Array:
-    """R (..., r, columns) of rows (..., m, columns), without the copies that numpy's mode "r" makes.
+    """Triangle R (..., r, columns) of rows (..., m, columns), without the copies of numpy's mode "r".
 
     Many rows go by blocks that fit the cache, then what these leave (Demmel et al., "Communication-optimal parallel and
     sequential QR and LU factorizations", SIAM J. Sci. Comput. 2012).
@@ -670,7 +670,7 @@ def _below(rows: list[Array], columns: int) -> Array:
 
 @cache
 def _upper(rows: int, columns: int) -> Array:
-    """1 on and above the diagonal, 0 below."""
+    """Mask that is 1 on and above the diagonal, 0 below."""
     return np.triu(np.ones((rows, columns)))
 
 

@@ -101,7 +101,7 @@ def require_known_variables(factors: Iterable[Factor], values: gtsam.Values, tim
 
 
 def require_finite(factors: Sequence[Factor], values: gtsam.Values, time: float) -> None:
-    """Check factors before they enter a smoother, which an exception or a NaN would spoil.
+    """Raise InputError for factors that are not finite, before these enter and spoil a smoother.
 
     Raises:
         InputError: a factor needs a variable that is not there, or its residual or Jacobian is not finite.
@@ -137,7 +137,7 @@ def _is_finite(factor: Factor, values: gtsam.Values) -> bool:
 
 @dataclass(eq=False)
 class RunState:
-    """State of an incremental run, beside the steps since its past was marginalised out.
+    """State of an incremental run, except the steps since its past was marginalised out.
 
     Attributes:
         window: how long states are kept, s or Keyframes; None keeps all.
@@ -170,7 +170,7 @@ class RunState:
 
 
 def save_checkpoint(path: Path, run: RunState, identity: Mapping[str, str]) -> None:
-    """Write a run; the file is replaced whole or not at all.
+    """Write a run to a file, atomically.
 
     Args:
         path: the file.

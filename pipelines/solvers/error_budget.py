@@ -135,7 +135,7 @@ _MOST_NAMED = 3
 
 
 def error_budget(influence: Influence, added: Mapping[str, Array], covariance: Array) -> dict[str, dict[str, float]]:
-    """Number -> source -> share of the number's variance, the largest first; shares sum to one.
+    """Share of each source in each number's variance, the largest first; shares sum to one.
 
     Sources are the families of the noise, each prior ("prior of NAME, ..."; "prior" of many numbers together), and what
     no measurement model has, together with what is of second order ("not modelled").
@@ -448,7 +448,7 @@ def variance_shares(posterior: Posterior) -> dict[str, Array]:
 
 
 def added_by_shares(directions: WeakDirections, shares: Mapping[str, Array], lengths: Mapping[str, float]) -> Array:
-    """Covariance (m, m) that correlation of a filter's innovations adds to the free numbers, in units of the priors.
+    """Covariance (m, m), in prior units, that correlated innovations add to the free numbers.
 
     Its measurements are gone: families have the shares of the covariance that they once had.
 
@@ -463,7 +463,7 @@ def added_by_shares(directions: WeakDirections, shares: Mapping[str, Array], len
 
 
 def _correlated(L: Array, correlation: Array) -> Array:
-    """Covariance L'TL (m, m) of numbers by noise of correlation T, (K,) at lags 1 ... K, and influences L (n, r, m)."""
+    """Covariance (m, m) by influences L (n, r, m) of noise with autocorrelation (K,) at lags 1 ... K."""
     size = 1 << (2 * len(L) - 1).bit_length()
     kernel = np.fft.rfft(
         np.concatenate([[0.0], correlation, np.zeros(size - 2 * len(correlation) - 1), correlation[::-1]])

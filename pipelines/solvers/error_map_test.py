@@ -144,7 +144,7 @@ def _rows(information: SqrtInformation, error_map: ErrorMap) -> tuple[Array, Arr
 
 
 def _with_history(estimate: Estimate, compiled: Compiled, posterior: Posterior, weak: Array) -> Estimate:
-    """Replace an estimate's history by that of the solution with the map: without it the map would show there.
+    """Replace an estimate's history by that of the solution with the map, which is free of the map's errors.
 
     The solution is off by `weak` (n,) along directions that are weak without the map.
     """

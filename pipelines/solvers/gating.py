@@ -32,7 +32,7 @@ MAX_OUTLIER_SHARE = 0.5
 
 
 class RowBuffer:
-    """Rows of numbers of one width, in an array that doubles when it is full.
+    """Growing array of rows of one width, whose capacity doubles when full.
 
     A list of small arrays would take ten times the memory over hours.
     """
@@ -133,7 +133,7 @@ class InnovationGate:
     rejected_in_a_row: int = 0
 
     def too_few_to_decide(self) -> bool:
-        """Whether a family has rejections among so few measurements that outliers may be its majority.
+        """Whether a family has rejections, but too few measurements to exclude a majority of outliers.
 
         The wrong ones cannot be identified then: they may agree by chance.
         """

@@ -76,7 +76,7 @@ class GtsamSystem:
         return cls(layout, graph, squares)
 
     def eliminate(self, damping: float = 0.0) -> GtsamFactorization:
-        """R of the rows, with so many times the information of each unknown added. Raises IndeterminateStateError."""
+        """Eliminate the rows, with each unknown's information times `damping` added. Raises IndeterminateStateError."""
         graph, layout = self._damped(damping) if damping > 0.0 else self.graph, self.layout
         *_, J, c, s = layout.sizes
         last = (layout.keyframe < 0) & ((layout.node <= 0) | (layout.node == J - 1))
@@ -157,7 +157,7 @@ def conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> 
 
 @dataclass(frozen=True, eq=False)
 class _Conditional:
-    """R x + S others = d of the variables of a clique, by their positions in the layout."""
+    """Conditional R x + S others = d of a clique's variables, by their positions in the layout."""
 
     own: list[int]
     others: list[int]

@@ -87,7 +87,7 @@ _HISTORY_RATE, _MOMENT_SPACING = 5.0, 0.02
 
 
 def solve_incremental(problem: Problem, window: Window = DEFAULT_WINDOW) -> Estimate:
-    """The filtered estimate after the last step, with its history.
+    """Run the incremental solver; return the filtered estimate after the last step, with its history.
 
     Measurements whose innovation lies outside the gate, measured against the innovation's own covariance, are left
     out. The chi-square is the sum of the squared innovations.
@@ -159,7 +159,7 @@ class IncrementalSolver:
 
     @property
     def started(self) -> bool:
-        """Whether there is an estimate yet."""
+        """Whether an estimate exists yet."""
         return self._smoother is not None or self._solved is not None
 
     @property
@@ -199,7 +199,7 @@ class IncrementalSolver:
         return self._constrained()[1]
 
     def posterior_history(self) -> PosteriorHistory | None:
-        """Joint estimates at moments; in the initialisation phase until its last batch solution."""
+        """Joint posteriors at moments; in the initialisation phase, those of the last batch solution."""
         if self.initialising:
             return self.estimate().posterior_history
         steady = np.repeat(
@@ -286,7 +286,7 @@ class IncrementalSolver:
         )
 
     def _batch(self) -> Solved:
-        """The last batch solution of the initialisation phase."""
+        """Return the last batch solution of the initialisation phase."""
         if self._solved is None:
             self._solve_batch()
         assert self._solved is not None
@@ -515,6 +515,6 @@ class IncrementalSolver:
 
 
 def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[int]:
-    """Keys of the variables that later steps may refer to: those of the last moment and those that never age."""
+    """Keys of variables that later steps may involve: those of the last moment and those that never age."""
     latest = max(stamps.values(), default=-np.inf)
     return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]

@@ -32,7 +32,7 @@ class NotAChainError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """Values of all variables.
+    """Values of all variables, in one array for each kind.
 
     Attributes:
         arrays: kind of variable -> (count, width), rows as `Layout` has them.
@@ -43,14 +43,14 @@ class Values:
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """Tangent vectors of all unknowns, or n of them side by side: states (N, d), nodes (J, c), shared (s,) [, n]."""
+    """Tangent of all unknowns, or n of these: states (N, d), nodes (J, c), shared (s,), each with [, n]."""
 
     states: Array
     nodes: Array
     shared: Array
 
     def times(self, length: float) -> Tangent:
-        """The tangent repeated `length` times."""
+        """Multiply the tangent by `length`."""
         return Tangent(length * self.states, length * self.nodes, length * self.shared)
 
 
@@ -88,7 +88,7 @@ class Layout:
     def of(
         cls, layout: ChainLayout | None, initial: gtsam.Values, shared: Collection[int] = ()
     ) -> tuple[Layout, Values]:
-        """Layout of the variables of some values, with these values in it.
+        """Lay out the variables of some gtsam values; return the layout with these values in arrays.
 
         Args:
             layout: how they are a chain; None: they are none, and every variable is a state by itself.

@@ -87,7 +87,7 @@ class Point:
 
     @cached_property
     def factorization(self) -> Factorization:
-        """R of the whitened rows. Raises IndeterminateStateError."""
+        """Square-root factorization R of the whitened rows. Raises IndeterminateStateError."""
         return self.system.eliminate()
 
 

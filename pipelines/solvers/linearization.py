@@ -131,7 +131,7 @@ class Group:
 
     @property
     def all_weights(self) -> Array:
-        """Weights (n, m) of the rows beside the loss, a copy."""
+        """Noise weights (n, m) of the rows, without the loss, as a copy."""
         shape = len(self.model.time), self.model.rows
         return np.ones(shape) if self.weights is None else self.weights.copy()
 
@@ -218,7 +218,7 @@ class Group:
         )
 
     def rows(self, values: Values, width: int) -> tuple[Array, float]:
-        """Whitened Jacobian rows (n, m, width) with the right-hand side in the last column, and the group's cost."""
+        """Whitened rows [Jacobian | right side] (n, m, width), and the group's cost."""
         right, jacobians, cost = self.whitened(values)
         out = np.zeros((*right.shape, width))
         out[..., -1] = right

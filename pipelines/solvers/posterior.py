@@ -169,7 +169,7 @@ class ReportedRoot:
         return np.asarray(self.basis @ np.vstack([y, du]))
 
     def covariance(self) -> Array:
-        """Covariance (m, m) of u by the linear system; works where R is singular."""
+        """Covariance (m, m) of u from the linear system, valid for singular R as well."""
         _, sizes, axes = np.linalg.svd(self.R)
         root = axes.T / np.maximum(sizes, 1.0 / WIDEST)
         return np.asarray(root @ root.T)
@@ -217,7 +217,7 @@ class Leverage:
 
 
 def leverages(engine: Linearization, system: System, factorization: Factorization, values: Values) -> list[Leverage]:
-    """Leverages of all measurements, processes and priors.
+    """Compute the leverages of all measurements, processes and priors.
 
     In a chain they are exact: what a row predicts has the variance that the shared unknowns leave, by the covariances
     of neighbours, and that of the shared ones, by the squares of what follows them. Of another engine they are the mean
@@ -308,7 +308,7 @@ class _Variances:
         )
 
     def of_walk(self, rows: Array, node: NDArray[np.intp]) -> Array:
-        """Variances (n, m) of rows (n, m, 2 c) about nodes and those before."""
+        """Variances (n, m) of the predictions of rows (n, m, 2 c) about consecutive nodes."""
         return _quadratic(rows, self.nodes[node]) + np.square(rows @ self.moves[node]).sum(axis=2)
 
 
@@ -345,7 +345,7 @@ def chi_square(found: Sequence[Leverage]) -> ChiSquare:
 def expected_squares(
     engine: Linearization, system: System, factorization: Factorization, values: Values
 ) -> dict[tuple[str, int], float]:
-    """Expected sums of squares under noise of unit variance, by (family, row of its measurements).
+    """Expected sum of squares under unit noise, by family and row of the measurements.
 
     Rows of a process or a prior count as one. Arguments and errors are those of `leverages`.
     """

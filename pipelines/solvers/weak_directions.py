@@ -305,7 +305,7 @@ class Posterior:
 
 
 def constrained_solution(compiled: Compiled, minimum: Point) -> Posterior:
-    """The posterior near a minimum, its weak directions at the prior.
+    """Compute the posterior near a minimum, with its weak directions at the prior.
 
     Args:
         compiled: the problem.

@@ -11,7 +11,7 @@ _KEYFRAMES = "kf"
 
 
 class Keyframes(int):
-    """A window's length as a number of keyframes; a plain number is seconds."""
+    """Window length as a number of keyframes; a plain number counts seconds."""
 
     def __str__(self) -> str:
         return f"{int(self)}{_KEYFRAMES}"
@@ -27,7 +27,7 @@ def check_window(window: object) -> None:
 
 
 def parse_window(text: str) -> Window:
-    """The window that `--window` names: seconds, keyframes ("50kf"), or None for "all". Raises InputError."""
+    """Parse `--window`: seconds, keyframes ("50kf"), or None for "all". Raises InputError."""
     if text == "all":
         return None
     number, read = (text.removesuffix(_KEYFRAMES), Keyframes) if text.endswith(_KEYFRAMES) else (text, float)

@@ -38,7 +38,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class BoardAttitudes:
-    """Attitudes of a tag board.
+    """Attitudes of a tag board over time.
 
     Attributes:
         t_ns: (K,) stamps, Unix ns.

@@ -124,7 +124,7 @@ class Camera:
         return np.asarray(self.K[:2, 2])
 
     def project(self, points: ArrayLike) -> Array:
-        """Pixels, shape (..., 2), of points in the optical frame, shape (..., 3), any unit; NaN behind the camera."""
+        """Project points (..., 3) in the optical frame, any unit, to pixels (..., 2); NaN behind the camera."""
         points = np.asarray(points, dtype=float)
         if self.distortion_model == "equidistant":
             rho = np.hypot(points[..., 0], points[..., 1])
@@ -202,7 +202,7 @@ class Camera:
         return np.stack(columns[: len(self.coefficients)], axis=-1)
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """Unit directions in the optical frame, shape (..., 3), of pixels, shape (..., 2).
+        """Unit directions (..., 3) in the optical frame of pixels (..., 2).
 
         Exact to 1e-9 px; NaN where the distortion model has no inverse.
         """

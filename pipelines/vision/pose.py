@@ -42,7 +42,7 @@ class PoseFit:
 
     @property
     def square(self) -> float:
-        """Sum of squares of `miss`, px^2."""
+        """Sum of squared reprojection errors `miss`, px^2."""
         return float((self.miss**2).sum())
 
 

@@ -264,5 +264,5 @@ def _los(ckRc0: Array, middle: Array, covariance: Array) -> tuple[Array, Array]:
 
 
 def _shortest(a: Array, b: Array) -> Array:
-    """The shortest rotation (4,) that turns the unit vector a into b."""
+    """Shortest rotation (4,) from unit vector a to b."""
     return so3.normalize(np.append(1.0 + a @ b, so3.cross(a, b)))
