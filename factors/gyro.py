@@ -58,7 +58,7 @@ def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tup
     _, N, off = _inverse(errors)
     bias_off = _apply(N, bias_error)
     phi = _apply(turns.bias_jacobian, bias_off) + _apply(needed(turns.scale_jacobian), off.reshape(-1, 9))
-    D = _driven(errors)
+    D = _driver_matrix(errors)
     d_off = None if D is None else N @ D
     if d_off is not None:
         phi = phi + _apply(needed(turns.driver_jacobian), d_off.reshape(len(d_off), -1))
@@ -275,7 +275,7 @@ def rate_error(
         return bias_error, lambda: (np.eye(3),)
     S, N, _ = _inverse(errors)
     excess = bias_error + _apply(S, rate)
-    D = _driven(errors)
+    D = _driver_matrix(errors)
     if D is not None:
         excess = excess + _apply(D, needed(drivers))
     excess = _apply(N, excess)
@@ -300,7 +300,7 @@ def _inverse(errors: Array) -> tuple[Array, Array, Array]:
     return S, N, N @ S
 
 
-def _driven(errors: Array) -> Array | None:
+def _driver_matrix(errors: Array) -> Array | None:
     """Driver matrix D (n or 1, 3, d) among a gyro's errors; None if absent."""
     numbers = _distinct(errors)[:, SCALE:]
     count = numbers.shape[1]

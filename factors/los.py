@@ -195,7 +195,7 @@ class LosDirectionFactor(Model):
         return _picture(self._camera(tRm, angles, self.gimbal)[:, :3])
 
     @cached_property
-    def _places(self) -> tuple[list[str], Array]:
+    def _angle_signs(self) -> tuple[list[str], Array]:
         """Names of the elementary rotations in use, and each mounting angle's sign in these (turns, angles)."""
         touched = {_PLACES[name][0] for name in self.names} | {"azimuth", "elevation"}
         turns = [turn for turn in _TURNS if turn in touched]
@@ -207,7 +207,7 @@ class LosDirectionFactor(Model):
 
     def _camera(self, tRm: Array, angles: Array, gimbal: Array) -> Array:
         """Camera matrix cRt with the elementary rotations' axes in c beside, (3, 3 + turns, n)."""
-        turns, places = self._places
+        turns, places = self._angle_signs
         angle = places @ angles.T
         angle[turns.index("azimuth")] += gimbal[:, 0]
         angle[turns.index("elevation")] += gimbal[:, 1]
@@ -238,7 +238,7 @@ class LosDirectionFactor(Model):
             error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
 
         def derivatives() -> tuple[Array, Array, Array]:
-            turns, places = self._places
+            turns, places = self._angle_signs
             # A passive turn by da moves the picture by Exp(-da axis), a right perturbation of tRm by Exp(-cRm delta).
             cRt = camera[:, :3].transpose(2, 0, 1)
             by_camera = scales[..., None] * _picture_jacobian(camera[:, :3])

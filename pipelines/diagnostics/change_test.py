@@ -216,7 +216,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     ranks = np.array([len(rows) for rows in whitening])
     sizes = _as_normal(np.array([((W @ d) ** 2).sum() for W, d in zip(whitening, difference, strict=True)]), ranks)
     worst = int(np.argmax(sizes))
-    beyond = _exceeded(P, whitening, ranks, float(sizes[worst]))
+    beyond = _p_value(P, whitening, ranks, float(sizes[worst]))
     sigmas = np.sqrt(np.maximum(np.diag(P[worst] - P[-1]), 1e-12 * np.diag(P[worst])))
     names = [quantities[k].name for k in kept.tolist()]
     differences = zip((-difference[worst]).tolist(), sigmas.tolist(), strict=True)
@@ -277,7 +277,7 @@ def _as_normal(square: Array, dof: Array) -> Array:
     return np.where(dof > 0, size, -np.inf)
 
 
-def _exceeded(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -> float:
+def _p_value(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -> float:
     """Share of simulated histories whose largest normalised difference is at least `size`."""
     rng = np.random.default_rng(0)
     n = P.shape[1]

@@ -138,7 +138,7 @@ def changes(
     steady = [(name, k) for name, k in steady if asked is None or name in asked]
     questions = [(name, k, after) for after in range(len(joined.parts) - 1) for name, k in steady]
     columns = _columns(joined, questions)
-    left, residual = _without(A * joined.scales, columns, b)
+    left, residual = _projected(A * joined.scales, columns, b)
     determined = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _DETERMINED
     questions = [question for question, yes in zip(questions, determined, strict=True) if yes]
     if not questions:
@@ -149,7 +149,7 @@ def changes(
     return Changes(
         level,
         limit,
-        tuple(_found(A * joined.scales, b, columns, questions, grown, limit)),
+        tuple(_significant_steps(A * joined.scales, b, columns, questions, grown, limit)),
         tuple(steps),
         tuple(_together(left, residual, questions, grown, level)),
         _rates(left, residual, questions, days, grown),
@@ -167,7 +167,7 @@ def _columns(joined: Joined, questions: Sequence[tuple[str, int, int]]) -> Array
     return out
 
 
-def _without(A: Array, columns: Array, b: Array) -> tuple[Array, Array]:
+def _projected(A: Array, columns: Array, b: Array) -> tuple[Array, Array]:
     """Project columns and right side b on the complement of A's range."""
     basis = np.linalg.qr(A).Q
     return columns - basis @ (basis.T @ columns), b - basis @ (basis.T @ b)
@@ -182,13 +182,13 @@ def _steps(questions: Sequence[tuple[str, int, int]], left: Array, residual: Arr
     ]
 
 
-def _found(
+def _significant_steps(
     A: Array, b: Array, columns: Array, questions: Sequence[tuple[str, int, int]], grown: Array, limit: float
 ) -> list[Change]:
     """Find significant steps one by one, each estimated with the earlier ones in the system."""
     taken: list[int] = []
     while len(taken) < _MOST_STEPS:
-        left, residual = _without(np.hstack([A, columns[:, taken]]), columns, b)
+        left, residual = _projected(np.hstack([A, columns[:, taken]]), columns, b)
         open_ = np.flatnonzero((left**2).sum(axis=0) > _ROUNDING * (columns**2).sum(axis=0)).tolist()
         if not open_:
             break
@@ -201,7 +201,7 @@ def _found(
     found = []
     for i in taken:
         others = [j for j in taken if j != i]
-        left, residual = _without(np.hstack([A, columns[:, others]]), columns[:, [i]], b)
+        left, residual = _projected(np.hstack([A, columns[:, others]]), columns[:, [i]], b)
         found += _steps([questions[i]], left, residual, grown[[i]])
     return found
 

@@ -255,7 +255,7 @@ def _coefficient(i: int, bins: _Bins, squares: Array, model: Mask, samples: int,
         root = float(np.sqrt(squares[i]))
         return Coefficient(NOISES[i], root, float(0.5 * sigma) / root, root * low**0.5, root * high**0.5)
     bound = _bound(i, bins, squares, model)
-    needed = _needed(i, bins, squares, model, bound / 4.0, samples, interval_s)
+    needed = _length_needed(i, bins, squares, model, bound / 4.0, samples, interval_s)
     return Coefficient(NOISES[i], None, None, 0.0, float(np.sqrt(bound)), needed)
 
 
@@ -281,7 +281,7 @@ def _bound(i: int, bins: _Bins, squares: Array, model: Mask) -> float:
     return high
 
 
-def _needed(
+def _length_needed(
     i: int, bins: _Bins, squares: Array, model: Mask, square: float, samples: int, interval_s: float
 ) -> float | None:
     """Length, s, of one record that would determine noise i with this squared coefficient."""

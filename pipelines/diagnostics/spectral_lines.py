@@ -81,12 +81,12 @@ def without_lines(pieces: Sequence[Array], interval_s: float, lines: Sequence[Li
     for piece in pieces:
         left = piece - piece.mean()
         for line in lines:
-            left = _less(left, 2.0 * np.pi * line.hz * interval_s, 2.0 * np.pi * line.resolution_hz * interval_s)
+            left = _notched(left, 2.0 * np.pi * line.hz * interval_s, 2.0 * np.pi * line.resolution_hz * interval_s)
         out.append(left)
     return out
 
 
-def _less(x: Array, rate: float, resolution: float) -> Array:
+def _notched(x: Array, rate: float, resolution: float) -> Array:
     """Subtract the best-fitting sinusoid near a rate from x; rate and resolution in rad per sample."""
     # Turned down to nearly zero and averaged in blocks, the line is the peak of a short spectrum.
     block = max(1, int(np.pi / (4.0 * resolution)))

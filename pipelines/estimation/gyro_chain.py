@@ -192,7 +192,7 @@ class GyroChain:
 
         What determines the attitude at the start of a chain, and the first bias, is the caller's to add.
         """
-        nodes, means = self._new(keyframes)
+        nodes, means = self._nodes_to_add(keyframes)
         for node in nodes:
             self.bias.begin(step, node, self.gyro.bias_hat)
         for node in means:
@@ -211,7 +211,7 @@ class GyroChain:
         if len(after):
             step.factors.extend(self._increments(after))
 
-    def _new(self, keyframes: range) -> tuple[range, range]:
+    def _nodes_to_add(self, keyframes: range) -> tuple[range, range]:
         """Bias nodes that begin at the keyframes, and bias nodes whose mean is complete with the keyframes."""
         first = 0 if keyframes.start == 0 else int(self.nodes[keyframes.start - 1]) + 1
         now = int(self.nodes[keyframes[-1]])
@@ -242,7 +242,7 @@ class GyroChain:
             current: the estimate.
         """
         out = gtsam.Values()
-        nodes, means = self._new(keyframes)
+        nodes, means = self._nodes_to_add(keyframes)
         bias = current.atVector(self.bias.key(nodes.start - 1))
         for key in [*map(self.bias.key, nodes), *map(self.bias.mean_key, means)]:
             out.insert(key, bias)

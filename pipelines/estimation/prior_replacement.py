@@ -194,14 +194,14 @@ class _PriorFactors:
         factors: list[Factor] = []
         for f in step.factors:
             if f.family == "prior" and all(begun.exists(key) for key in f.keys):
-                factors += self._rest(f, begun)
+                factors += self._kept_rows(f, begun)
             else:
                 factors.append(f)
         concerned = [p for p in new if p in self._concerned]
         factors += [self._factor(earlier, concerned)] if concerned else []
         return replace(step, factors=factors, initial=initial)
 
-    def _rest(self, prior: Factor, values: gtsam.Values) -> list[Factor]:
+    def _kept_rows(self, prior: Factor, values: gtsam.Values) -> list[Factor]:
         """Factors of the rows of a prior that the Gaussian prior does not replace."""
         kept = ~_about_alone(prior.factor.linearize(values), self.parameters, values, self.replaced)
         if kept.all():

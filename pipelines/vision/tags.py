@@ -214,7 +214,7 @@ def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array)
     weights = inside.all(axis=2).astype(float)
 
     # The step with its blur lies within `near`; beyond it are the levels.
-    near = np.minimum(_needed(blur), reach)
+    near = np.minimum(_half_length(blur), reach)
     beyond = np.abs(unit) >= (near / reach)[:, None] * (1 - 1e-9)
     beside = np.stack([beyond & (unit < 0), beyond & (unit > 0)])
     (black, white), noise = _levels(grey, beside, s)
@@ -233,11 +233,11 @@ def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array)
     level = np.median(np.maximum(contrast, _CONTRAST), axis=1)
     level_variance = (near / level) ** 2 * (noise**2).sum(axis=0)
     return _Cuts(
-        points, weights, normal, (length - 2 * inset) / (_CUTS - 1), _needed(sigma) / reach, sigma, level_variance
+        points, weights, normal, (length - 2 * inset) / (_CUTS - 1), _half_length(sigma) / reach, sigma, level_variance
     )
 
 
-def _needed(blur: Array) -> Array:
+def _half_length(blur: Array) -> Array:
     """Half length, px, of the profile that a step with Gaussian blur of sigma `blur` px needs."""
     return 3.0 * blur + 0.7
 

@@ -101,14 +101,14 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
         InputError: no picture shows the first tag with another, or the pictures do not distinguish the layout from its
             mirror image.
     """
-    unplaced = _apart(gathered(shots, given), given)
+    unplaced = _unconnected(gathered(shots, given), given)
     body: TagBody | None = None
     while True:
         placed = part(given, ~np.isin(given.ids, list(unplaced)))
         views = gathered(shots, placed)
         with progress.doing("placing tags"):
             fit = adjusted_whole(views, None if body is None else part(body, np.isin(body.ids, placed.ids)))
-        wrong = _wrong(views, fit)
+        wrong = _unusable(views, fit)
         if not wrong:
             break
         if int(given.ids[0]) in wrong:
@@ -120,7 +120,7 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
     return _layout(views, fit, unplaced)
 
 
-def _apart(views: Gathered, given: TagBody) -> dict[int, str]:
+def _unconnected(views: Gathered, given: TagBody) -> dict[int, str]:
     """Ids of tags without a chain of common pictures to the first tag, with the reason in words."""
     n, sights = len(given.ids), views.sights
     times = np.bincount(sights.tag, minlength=n)
@@ -147,7 +147,7 @@ def _reached(sights: Sights, tags: int) -> NDArray[np.bool_]:
     return reached
 
 
-def _wrong(views: Gathered, fit: Fit) -> dict[int, str]:
+def _unusable(views: Gathered, fit: Fit) -> dict[int, str]:
     """Ids of tags with an ambiguous or inconsistent pose, with the reason in words."""
     body, sights = fit.bundle.body, views.sights
     n = len(body.ids)

@@ -164,7 +164,7 @@ def _sandwich(fit: Fit, own: Array, view: Index, white: Array) -> Array:
     """Sandwich covariance (q, q) of the shared unknowns, from the influence of every corner error."""
     bundle, sights = fit.bundle, fit.sights
     of, views = view[sights.picture], int(view.max()) + 1
-    power, common = _spectrum(_correlations(fit, of, views), views), _common(fit, of)
+    power, common = _spectrum(_correlations(fit, of, views), views), _common_share(fit, of)
     free = fit.additional.sigma[fit.additional.free]
     of_priors = white[:, len(white) - len(free) :]
     parts, taken = [], []
@@ -204,7 +204,7 @@ def _correlations(fit: Fit, of: Index, views: int) -> Array:
     return np.array(found)
 
 
-def _common(fit: Fit, of: Index) -> float:
+def _common_share(fit: Fit, of: Index) -> float:
     """Share of the error variance common to pictures without motion between them; 1 if there are too few."""
     order = np.lexsort((fit.sights.picture, fit.sights.tag))
     tag, view, miss = fit.sights.tag[order], of[order], fit.rows.miss[order]

@@ -90,7 +90,7 @@ def _decisive(sights: Sights, view: Index) -> Index:
         ties = joint(sights, int(sights.tag.max()) + 1)
         a, b = pairs(sights.picture)
         rare = np.unique(sights.picture[a[ties[sights.tag[a], sights.tag[b]] <= _RARE]])
-        first = np.union1d(_some(first, _MOST), np.intersect1d(rare, first))
+        first = np.union1d(_thinned(first, _MOST), np.intersect1d(rare, first))
     return np.flatnonzero(np.isin(sights.picture, first))
 
 
@@ -132,7 +132,7 @@ def flip_told(fit: Fit, view: Index, tag: int) -> bool:
     """
     mine = np.flatnonzero(fit.sights.tag == tag)
     mine = mine[np.unique(view[fit.sights.picture[mine]], return_index=True)[1]]
-    seen = fit.sights[_some(mine, _HEARD)]
+    seen = fit.sights[_thinned(mine, _HEARD)]
     others = fit.sights[np.isin(fit.sights.picture, seen.picture) & (fit.sights.tag != tag)]
     bRt, _, cost = vote(fit.bundle, seen, sides(fit.bundle, others))
     now = angles(bRt, fit.bundle.body.bRt[tag]) < _SAME
@@ -195,13 +195,13 @@ def _next(sights: Sights, placed: NDArray[np.bool_]) -> int | None:
 def _placed(bundle: Bundle, sights: Sights, poses: Sides, tag: int) -> Bundle:
     """Place one more tag at the pose that most pictures agree on."""
     rows = np.flatnonzero((sights.tag == tag) & np.isfinite(poses.cost[sights.picture, 0]))
-    bRt, position, _ = vote(bundle, sights[_some(rows, _PICTURES)], poses)
+    bRt, position, _ = vote(bundle, sights[_thinned(rows, _PICTURES)], poses)
     turned, places = bundle.body.bRt.copy(), bundle.body.position.copy()
     turned[tag], places[tag] = bRt[0], position[0]
     return replace(bundle, body=replace(bundle.body, bRt=turned, position=places))
 
 
-def _some(rows: Index, most: int) -> Index:
+def _thinned(rows: Index, most: int) -> Index:
     """Thin row indices evenly to at most `most`."""
     if len(rows) <= most:
         return rows
@@ -223,14 +223,14 @@ def vote(bundle: Bundle, sights: Sights, poses: Sides) -> tuple[Array, Array, Ar
     bRc = so3.inverse(cRb)[:, :, None]
     proposals = so3.multiply(bRc, sights.cRt[:, None]).reshape(-1, 4)
     places = so3.rotate(bRc, sights.place[:, None] - position[:, :, None]).reshape(-1, 3)
-    keep = _some(np.flatnonzero(np.repeat(there.ravel(), 2)), _PROPOSALS)
+    keep = _thinned(np.flatnonzero(np.repeat(there.ravel(), 2)), _PROPOSALS)
     bRt, place = proposals[keep], places[keep]
     known = poses.information[sights.picture] + 1e-12 * np.eye(6)
     odds = np.where(there, poses.cost[sights.picture] - poses.cost[sights.picture, :1], np.inf)
     cost, going = np.zeros(len(keep)), np.arange(len(keep))
     for round_ in range(_ROUNDS + 1):
         far = FAR * 4.0 ** max(0, 4 - round_)
-        squares, gradient, information = _against(bundle, sights, cRb, position, known, bRt[going], place[going])
+        squares, gradient, information = _proposal_costs(bundle, sights, cRb, position, known, bRt[going], place[going])
         squares = np.where(there, squares + odds, np.inf)
         side = squares.argmin(axis=2)[..., None]
         squares = np.take_along_axis(squares, side, 2)[..., 0]
@@ -256,7 +256,7 @@ def vote(bundle: Bundle, sights: Sights, poses: Sides) -> tuple[Array, Array, Ar
     return bRt[order], place[order], cost[order]
 
 
-def _against(
+def _proposal_costs(
     bundle: Bundle, sights: Sights, cRb: Array, position: Array, known: Array, bRt: Array, place: Array
 ) -> tuple[Array, Array, Array]:
     """Squares, gradient (6,), information (6, 6) of a tag's pose, by proposal (h), sight (s), picture side (2).
