@@ -49,7 +49,7 @@ _Number = tuple[Quantity, float, float]
 def split_halves(
     build: Build, faults: FaultModel, data: Any, config: Config
 ) -> tuple[dict[str, SplitHalf], tuple[str, ...]]:
-    """Solve both halves of a recording separately, see `solve_segments`; also "first", "second" if unsolved."""
+    """Solve both halves of a recording, see `solve_segments`; also return unsolved ones ("first", "second")."""
     start, stop = faults.span(data)
     parts = _solved_parts(build, faults, data, config, 0.5 * (start + stop))
     return _in_both(*parts), tuple(name for name, part in zip(("first", "second"), parts, strict=True) if not part)

@@ -112,7 +112,7 @@ def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
 
 
 def has_no_solution(findings: Sequence[Finding]) -> bool:
-    """Whether the findings say that the solver found no solution."""
+    """Whether the findings include an unconverged solver, whose values are unusable."""
     return any(each.kind == "not_converged" and each.severity > Severity.NOTE for each in findings)
 
 

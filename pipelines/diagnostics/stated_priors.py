@@ -23,7 +23,7 @@ from alidade.pipelines.settings import Config
 
 
 def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | None:
-    """Return the config with all fixed and tightly stated parameters free; None if it fixes nothing.
+    """Return the config with all fixed and tightly stated parameters free; None if none is fixed.
 
     Args:
         config: in force.

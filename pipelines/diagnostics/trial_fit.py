@@ -121,7 +121,7 @@ def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> Tri
 
 
 def score_trial(build: Build, data: Any, config: Config, label: str = "") -> tuple[float, float]:
-    """Median whitened residual of measurements plus that of processes after few steps, and the prior cost.
+    """Median whitened residual of measurements plus that of processes, after a few steps; and the prior cost.
 
     Infinite when there is no solution; exceptions as of `solve_trial`.
     """

@@ -58,7 +58,7 @@ class MarginalState:
         keys: Sequence[int],
         stamps: Mapping[int, float],
     ) -> MarginalState:
-        """Marginalise a linear system about the values down to a MarginalState.
+        """Marginalise all variables except `keys` out of a system linear about the values.
 
         Raises:
             IndeterminateStateError: a variable that is marginalised out is not determined.

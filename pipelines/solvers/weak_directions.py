@@ -158,7 +158,7 @@ class WeakDirections:
 
     @property
     def followers(self) -> NDArray[np.bool_]:
-        """Mask (k, m): the strong direction has a sigma so small that it depends on its slope along the axis."""
+        """Mask (k, m): the strong direction is so well determined that a move along the axis shifts its estimate."""
         return np.asarray(self.sigmas[:, None] < FOLLOWS * self.all_sigmas)
 
     def covariance(self) -> Array:

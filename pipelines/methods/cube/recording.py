@@ -237,7 +237,7 @@ _NUMBERS = (IMU, MAG, REFERENCE_IMU, REFERENCE_FIX)
 
 
 def read_cube(recording: Recording, config: Config) -> CubeData:
-    """Read and check a cube session; without tag detections they are taken from the pictures of the static poses.
+    """Read and check a cube session; without tag detections, detect tags in pictures of the static poses.
 
     What the recording holds decides what there is: magnetometer, reference and camera may each be missing.
 

@@ -37,7 +37,7 @@ class Errors(ScenarioPart):
 
 
 class FieldErrors(ScenarioPart):
-    """Sigmas of the earth's field against its model, T; a data sheet of the field goes before them."""
+    """Sigmas of the earth's field about its model, T; a data sheet of the field takes precedence."""
 
     direction: NotNegative = 5e-7  # each way across the model's field
     strength: NotNegative = 5e-7  # along it
@@ -79,7 +79,7 @@ class CubeCamera(ScenarioPart):
 
 
 class Magnetometer(ScenarioPart):
-    """The device's magnetometer, and iron about it."""
+    """Settings of the device's magnetometer, and of iron near some poses."""
 
     rate_hz: Positive = 50.0
     disturbed: Share = 0.0  # of the poses stand near iron

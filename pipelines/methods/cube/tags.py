@@ -43,7 +43,7 @@ def read_camera(recording: Recording, config: Config) -> Camera:
 
 
 def _refined(camera: Camera, refined: RefinedCamera) -> Camera:
-    """The recording's camera with the intrinsics of the config. Raises InputError when these are of another one."""
+    """Apply the config's intrinsics to the recording's camera. Raises InputError if these are of another camera."""
     if np.abs(np.array(refined.focal) / camera.focal - 1.0).max() > _OTHER_CAMERA:
         raise InputError(
             f"cube.camera is of another camera: its focal length is {refined.focal[0]:.6g} px, that of the recording's "

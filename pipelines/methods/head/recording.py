@@ -132,7 +132,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
 
 
 def head_topics(data: HeadData, pictures: series.Pictures | None = None) -> dict[str, series.Topic]:
-    """Topics of a recording under their default names; pictures take the place of vision's attitudes."""
+    """Topics of a recording under their default names, with pictures or vision attitudes."""
     epoch = data.epoch_ns
     topics: dict[str, series.Topic] = {
         HEAD_IMU.name: imu_series(epoch, data.head_t, data.head_gyro, data.head_force, data.gyro_density),

@@ -145,7 +145,7 @@ def check(data: LosData, gyro: str, gimbal: str) -> None:
 
 
 def los_topics(data: LosData, pictures: series.Pictures | None = None) -> dict[str, series.Topic]:
-    """Topics of a recording under their default names; pictures take the place of the LOS errors."""
+    """Topics of a recording under their default names, with pictures or LOS errors."""
     epoch = data.epoch_ns
     topics: dict[str, series.Topic] = {
         IMU.name: imu_series(epoch, data.gyro_t, data.gyro, data.force, data.gyro_density),
