@@ -256,7 +256,7 @@ def _square(information: Array, x: Array) -> Array:
 def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
     """Find the steps of one of `Problem.step_candidates` that explain a recording best, most significant first.
 
-    None where the recording determines too little for the tests.
+    Empty where the recording determines too little for the tests.
     """
     try:
         return _largest_steps(compiled, levels, solution)
