@@ -194,10 +194,15 @@ def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[
 
 
 def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
-    """Return the config's keys that would allow for conflicts with data sheets or priors; empty without conflicts."""
+    """Return the config's keys that would allow for conflicts with data sheets or priors; empty without conflicts.
+
+    1 + scale is negative for a reversed axis, which no data sheet allows for.
+    """
     stated: dict[str, dict[str, float]] = {}  # sensor, or none for `priors` -> figure or parameter -> size
     for e in (finding.evidence for finding in findings if finding.kind == "prior_conflict"):
         q = quantities[e["parameter"]]
+        if e["value"] < -1.0 and q.sheet.endswith(".scale"):
+            return f"{q.name} is that of a reversed axis: correct its sign."
         if q.group == "assumption":
             sensor, _, figure = q.sheet.partition(".")
             known = stated.setdefault(sensor, {})
