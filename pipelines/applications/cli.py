@@ -255,6 +255,7 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html; compares both halves too.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
+    auto_columns: _AutoColumns = False,
     jobs: _OwnJobs = None,
     time_limit: _TimeLimit = None,
     as_json: _Json = False,
@@ -274,7 +275,8 @@ def compare(
     require_room(out)
     kept = parse_window(window)
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
-        opened = open_session(session, method, config, strict, auto_topics=auto_topics, prior=prior)
+        how = {"auto_topics": auto_topics, "auto_columns": auto_columns, "prior": prior}
+        opened = open_session(session, method, config, strict, **how)
         comparison = compared(opened, kept, halves=out is not None)
         written = None if out is None else comparison.write(out)
     lines = [] if written is None else [f"Comparison in {written}"]
@@ -352,6 +354,8 @@ def validate(
     config: _ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page [default: RECORDING-validation].")] = None,
     strict: _Strict = False,
+    auto_topics: _AutoTopics = False,
+    auto_columns: _AutoColumns = False,
     jobs: _OwnJobs = None,
     time_limit: _TimeLimit = None,
     as_json: _Json = False,
@@ -369,9 +373,10 @@ def validate(
 
     folder = out or _default_folder(session, "validation")
     require_room(folder)
+    how: dict[str, Any] = {"auto_topics": auto_topics, "auto_columns": auto_columns, "strict": strict}
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
         with progress.doing("validating"):
-            validated = run(session, calibration, method=method, config=config, strict=strict)
+            validated = run(session, calibration, method=method, config=config, **how)
         report = validation_report(validated)
         (written,) = write_whole(folder, {"validation.html": render_html(report)})
     _show(as_json, partial(validation_json, validated), lambda: report, f"Plots in {written}")

@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines import deadline, methods, progress
-from alidade.pipelines.applications.session import Session, resolve_method
+from alidade.pipelines import deadline, progress
+from alidade.pipelines.applications.session import Session, open_session
 from alidade.pipelines.applications.sharing import device_prior, walks
-from alidade.pipelines.config import Settings, configured
+from alidade.pipelines.config import Settings
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.estimation.problem import Estimate
-from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration, load_known, saved, with_covariance
 from alidade.pipelines.reports.result import Calibration
 
@@ -108,6 +107,8 @@ def validate(
     method: str | None = None,
     config: Settings = None,
     strict: bool = False,
+    auto_topics: bool = False,
+    auto_columns: bool = False,
 ) -> Validated:
     """Test a calibration on another recording: `.verdict`, `.sentence`, `.held.steps`.
 
@@ -117,6 +118,8 @@ def validate(
         method: overrides the config's.
         config: overrides the recording's own config key by key.
         strict: refuse a recording of which anything is lost.
+        auto_topics: use the topics that `alidade info` proposes where those of the method are absent.
+        auto_columns: use the columns of tables that `alidade info` proposes where the config describes none.
 
     Raises:
         InputError: recording, config or calibration cannot be used, or the calibration is another method's.
@@ -126,16 +129,16 @@ def validate(
         known = saved(calibration)
     else:
         known = with_covariance(load_known(Path(calibration)), Path(calibration))
-    opened, settings = configured(open_recording(path, strict), config)
-    name = resolve_method(method or known.method, opened, settings)
-    known.of_method(name)
-    chosen = methods.method(name)
-    data = chosen.read(opened, settings)
+    session = open_session(
+        path, method or known.method, config, strict, auto_topics=auto_topics, auto_columns=auto_columns
+    )
+    chosen, data, settings, opened = session.method, session.data, session.config, session.recording
+    assert opened is not None
+    known.of_method(chosen.name)
     values = known.values
     validations = chosen.report.validate(data, settings, values)
     if known.recording.sha256 == opened.sha256():
         return Validated(known, path.name, validations, True, opened.notes)
-    session = Session(chosen, data, settings, opened)
     with session.usual_time():
         found = _check(session, known)
         lost = (*opened.notes, *filter(None, [deadline.stopped()]))

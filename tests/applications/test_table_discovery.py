@@ -270,3 +270,21 @@ def test_several_tables_of_one_device_have_their_columns_proposed(tmp_path: Path
     done = alidade("calibrate", *map(str, paths), "--auto-columns", "--json", "--out", str(tmp_path / "out"))
     assert done.code == 0, done.err
     assert [part["recording"] for part in json.loads(done.out)["recordings"]] == ["march.csv", "june.csv"]
+
+
+def test_compare_and_validate_use_the_proposed_columns(tmp_path: Path, alidade: Command) -> None:
+    """Their error proposes `--auto-columns`."""
+    header = ",".join(["Time (s)", *(f"Magnetic Field {axis} (µT)" for axis in "xyz")])
+    for name in ("march", "june"):
+        field = 45.0 * DIRECTIONS @ np.diag([1.05, 0.97, 1.0]) + [12.0, -30.0, 7.0] + 0.1 * RNG.normal(size=(N, 3))
+        write(tmp_path / f"{name}.csv", header, SECONDS, field)
+    march, june = str(tmp_path / "march.csv"), str(tmp_path / "june.csv")
+    assert alidade("calibrate", march, "--auto-columns", "--out", str(tmp_path / "out")).code == 0
+    found = str(tmp_path / "out" / "result.json")
+    refused = alidade("validate", june, "--calibration", found)
+    assert refused.code == 2
+    assert "--auto-columns" in refused.err
+    validated = alidade("validate", june, "--calibration", found, "--auto-columns", "--out", str(tmp_path / "page"))
+    assert validated.code == 0, validated.err
+    compared = alidade("compare", june, "--auto-columns")
+    assert compared.code == 0, compared.err
