@@ -185,13 +185,15 @@ class StreamReader:
     def attitude(self, topic: str, least_variance: float, least: int = 2) -> tuple[Array, Array, Array]:
         """Times (N,) s, unit quaternions (N, 4) and covariances (N, 3, 3), rad^2, of a topic of poses or attitudes.
 
-        Rotations that a tracker lost are left out. An implausible covariance is zero, also where it is below
-        `least_variance`, rad^2.
+        Rotations that a tracker lost are left out, and one that is published again counts once. An implausible
+        covariance is zero, also where it is below `least_variance`, rad^2.
         """
         poses = self.recording.poses(topic)
         self.count(topic, "stamped by log time (kept)", poses.stamped_by_log)
         given = checks.tracked(topic, poses.wxyz, self.dropped)
         t, rows = self.clean(topic, poses.t_ns, given, least)
+        own = plausibility.measured_once(topic, given[rows], self.dropped)
+        t, rows = t[own], rows[own]
         wxyz = checks.unit_quaternions(topic, t, given[rows])
         cov = poses.cov[rows][:, 3:, 3:]
         return t, wxyz, plausibility.plausible_covariance(topic, "attitude", cov, least_variance, self.dropped)
