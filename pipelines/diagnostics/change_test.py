@@ -243,7 +243,7 @@ def _with_priors_as_found(
     Widening priors changes the information by numbers on the diagonal (Woodbury 1950), of all of them at once.
     Variances above the priors', as terms of second order may make them, count as the priors'.
     """
-    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.inflations, strict=True)
+    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.widenings, strict=True)
     size = np.array(
         [prior_z_score(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated]
     )

@@ -116,14 +116,15 @@ def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
 
 
 def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
-    """Findings on nuisance and tightly stated parameters far from their priors, worst first.
+    """Findings on nuisance and tightly stated parameters far from their priors, material ones first, worst first.
 
     Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
     """
     P, sigma, x, sensitivities = estimate.covariance, estimate.sigmas, estimate.values, estimate.sensitivities
     nuisance = [j for j, q in enumerate(quantities) if (q.assumed or q.tight) and sigma[j] > 0.0]
-    z = {j: prior_z_score(quantities[j], x[j], sigma[j], estimate.inflations[j]) or 0.0 for j in nuisance}
+    z = {j: prior_z_score(quantities[j], x[j], sigma[j], estimate.widenings[j]) or 0.0 for j in nuisance}
     left = sorted((j for j in nuisance if abs(z[j]) > LIMITS.prior_z), key=lambda j: -abs(z[j]))
+    immaterial = []
     while left:
         j, worst = left[0], quantities[left[0]]
         same = [k for k in nuisance if k != j and abs(P[j, k]) > LIMITS.inseparable * sigma[j] * sigma[k]]
@@ -132,8 +133,13 @@ def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iter
         material = any(abs(effect.get(q.name, 0.0)) >= LIMITS.material * q.require for q in quantities if q.required)
         severe = material and sigma[j] < LIMITS.determined * worst.scale
         others = tuple(sorted(quantities[k].name for k in same))
-        yield _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)
+        conflict = _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)
+        if material:
+            yield conflict
+        else:
+            immaterial.append(conflict)
         left = [k for k in left[1:] if k not in same]
+    yield from immaterial
 
 
 def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:

@@ -279,7 +279,7 @@ def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: flo
     Args:
         quantity: the assumption.
         value, sigma: its estimate.
-        inflation: by what sigma is larger because noise is coloured.
+        inflation: by what sigma is larger because noise is coloured, or errors are slow.
     """
     prior, white = quantity.prior_sigma or 0.0, sigma / inflation
     if white > _UNINFORMED * prior or prior == 0.0:

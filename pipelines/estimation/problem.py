@@ -674,6 +674,11 @@ class Estimate:
         """Inflation factors (n,) of the sigmas; ones where `inflation` is None."""
         return np.ones(len(self.values)) if self.inflation is None else self.inflation
 
+    @property
+    def widenings(self) -> Array:
+        """Ratio (n,) of the sigmas to those by white noise alone: correlated residuals, and slow errors."""
+        return self.inflations * slow_widening(self.sandwich, len(self.values))
+
     def widest(self, quantities: Sequence[Quantity]) -> float:
         """Largest inflation, at least 1, of a judged quantity's sigma by correlated residuals and slow errors."""
         ratios = self.inflations if self.sandwich is None else self.inflations * self.sandwich

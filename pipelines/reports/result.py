@@ -108,6 +108,7 @@ class Calibration(SensorValues):
             self.estimate.values,
             self.estimate.sigmas,
             self.estimate.inflations,
+            self.estimate.widenings,
             strict=True,
         )
         return {
@@ -121,10 +122,10 @@ class Calibration(SensorValues):
                 require=q.require if q.judged else None,
                 observability=given.get(q.name),
                 group=q.group,
-                pull=None if q.group is None else prior_z_score(q, float(value), float(sigma), float(inflation)),
+                pull=None if q.group is None else prior_z_score(q, float(value), float(sigma), float(widening)),
                 inflation=float(inflation),
             )
-            for q, value, sigma, inflation in rows
+            for q, value, sigma, inflation, widening in rows
         }
 
     @property

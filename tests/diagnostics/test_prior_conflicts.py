@@ -99,3 +99,15 @@ def test_a_gyro_scale_far_beyond_its_data_sheet_is_inconsistent_and_named_first(
     assert told.status != "inconsistent"
     scale = told.parameters["gyro_scale_x"]
     assert abs(scale.value - 0.06) < 4.0 * scale.sigma
+
+
+def test_slow_errors_neither_hide_a_departure_nor_make_one() -> None:
+    """Of white noise 5e-3 of a prior of 1e-2 is determined, though its sandwich is 1.6e-2, beyond the prior."""
+    slow = replace(estimate([0.16], [1.6e-2]), sandwich=np.array([3.2]))
+    (found,) = conflicts(slow, [assumption("a")])
+    by_itself = (1e-2 - 5e-3**2 / 1e-2) ** 2  # p, s0 and V of `prior_z_score`
+    elsewhere = 1.6e-2**2 - (5e-3**2 / 1e-2) ** 2
+    assert found.evidence["z"] == pytest.approx(0.16 / np.sqrt(by_itself + elsewhere))
+    # Of a sigma near the prior's the shift has that of the slow errors, not next to none.
+    near = replace(estimate([0.03], [9e-3]), sandwich=np.array([1.8]))
+    assert conflicts(near, [assumption("a")]) == []
