@@ -32,11 +32,11 @@ from alidade.pipelines.diagnostics.change_test import (
     with_change,
 )
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
-from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
+from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, prior_conflicts
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
 from alidade.pipelines.diagnostics.observability import finite_covariance
-from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config
+from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config, with_conflicts
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
@@ -316,6 +316,9 @@ class Session:
             elif report and estimate.solver == "incremental" and published is None:
                 published = self._published()
             stable, change = self._change(estimate, quantities)
+            conflicts = tuple(prior_conflicts(estimate, quantities))
+            if estimate.converged and estimate.solver != "published":
+                estimate = with_conflicts(estimate, quantities, conflicts)
             if change is not None and change.kind == "change" and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
             tables = self.method.report.findings(self.data, self.config, estimate) if report else {}
@@ -327,7 +330,7 @@ class Session:
                     estimate=estimate,
                     findings=by_severity(
                         [
-                            *self._findings(problem, estimate, quantities, change),
+                            *self._findings(problem, estimate, quantities, change, conflicts),
                             *_remarks(problem, estimate, difference),
                             *carried,
                             *_stopped(),
@@ -367,11 +370,16 @@ class Session:
             return halves, predicted, deadline.stopped(), unsolved
 
     def _findings(
-        self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None
+        self,
+        problem: Problem,
+        estimate: Estimate,
+        quantities: Sequence[Quantity],
+        change: Finding | None,
+        conflicts: Sequence[Finding],
     ) -> tuple[Finding, ...]:
         """Return the findings on an estimate; hypotheses are tested if the estimate is suspect."""
         contradicted = self._contradictions(estimate, quantities)
-        findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted)
+        findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted, conflicts)
         if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
             return findings
         hypotheses = misstatements(self.method.graph, self.method.faults, self.data, self.config)
@@ -385,7 +393,8 @@ class Session:
             )
         deadline.passed(_HYPOTHESES)
         # A fault that explains more than freeing what is fixed is what these contradictions come from.
-        return diagnose(estimate, quantities, problem.advice, change, hypotheses, () if hypotheses else contradicted)
+        contradicted = () if hypotheses else contradicted
+        return diagnose(estimate, quantities, problem.advice, change, hypotheses, contradicted, conflicts)
 
     def _contradictions(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Finding, ...]:
         """Return findings on inputs that the config fixes and the recording contradicts."""

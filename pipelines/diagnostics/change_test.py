@@ -206,9 +206,12 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
     time = posterior_history.time[late]
-    values, covariance = _with_priors_as_found(
-        estimate, quantities, posterior_history.values[late], posterior_history.covariance[late]
-    )
+    values, covariance = posterior_history.values[late], posterior_history.covariance[late]
+    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.inflations, strict=True)
+    z = np.abs([prior_z_score(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated])
+    # Under priors so wide that no parameter lies far beyond its own.
+    if (wider := by_wider_priors(quantities, np.where(z >= _BEYOND, z, 1.0), values, covariance)) is not None:
+        values, covariance = values + wider[0], covariance + wider[1] @ np.swapaxes(wider[1], 1, 2)
     # By one factor: each by its own would turn the directions that are known well, where many are correlated.
     P = float(estimate.inflations[kept].max()) ** 2 * covariance[:, kept[:, None], kept]
     difference = values[:-1, kept] - values[-1, kept]
@@ -235,29 +238,30 @@ def _long_enough(estimate: Estimate, numbers: int) -> float:
     return latest
 
 
-def _with_priors_as_found(
-    estimate: Estimate, quantities: Sequence[Quantity], values: Array, P: Array
-) -> tuple[Array, Array]:
-    """Posterior values (k, n) and covariances (k, n, n) over time, under priors widened to fit the estimate.
+def by_wider_priors(
+    quantities: Sequence[Quantity], times: Array, values: Array, P: Array
+) -> tuple[Array, Array] | None:
+    """Shift (k, n) and S (k, n, m) of k posteriors under wider priors, P + S S'; None where none is wider.
 
     Widening priors changes the information by numbers on the diagonal (Woodbury 1950), of all of them at once.
     Variances above the priors', as terms of second order may make them, count as the priors'.
+
+    Args:
+        quantities: n of them.
+        times: (n,) that priors are wider; up to 1 leaves one.
+        values, P: (k, n), (k, n, n) the posteriors.
     """
-    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.widenings, strict=True)
-    size = np.array(
-        [prior_z_score(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated]
-    )
-    wide = np.flatnonzero(np.abs(size) >= _BEYOND)
+    wide = np.flatnonzero(times > 1.0)
     if not len(wide):
-        return values, P
+        return None
     priors = np.array([(q.prior_mean, q.prior_sigma or 0.0) for q in quantities])[wide]
-    taken = np.sqrt(1.0 - size[wide] ** -2) / priors[:, 1]
+    taken = np.sqrt(1.0 - times[wide] ** -2) / priors[:, 1]
     columns = P[:, :, wide] * taken
     left, axes = np.linalg.eigh(np.eye(len(wide)) - columns[:, wide] * taken[:, None])
-    axes = axes / np.sqrt(np.maximum(left, (size[wide] ** -2).min()))[:, None]
+    axes = axes / np.sqrt(np.maximum(left, (times[wide] ** -2).min()))[:, None]
     gains = columns @ axes
     off = ((values[:, wide] - priors[:, 0]) * taken)[:, None] @ axes
-    return values + (gains @ np.swapaxes(off, 1, 2))[..., 0], P + gains @ np.swapaxes(gains, 1, 2)
+    return (gains @ np.swapaxes(off, 1, 2))[..., 0], gains
 
 
 def _whitening(P: Array, last: Array) -> Array:

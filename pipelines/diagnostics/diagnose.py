@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
-from alidade.pipelines.diagnostics.observability import Advise, verdict, weak_directions
+from alidade.pipelines.diagnostics.observability import UNCHANGED, Advise, verdict, weak_directions
 from alidade.pipelines.estimation.disturbances import intervals
 from alidade.pipelines.estimation.error_map import UNIT
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
@@ -60,6 +60,7 @@ def diagnose(
     change: Finding | None = None,
     hypotheses: Sequence[Finding] = (),
     contradictions: Sequence[Finding] = (),
+    conflicts: Sequence[Finding] | None = None,
 ) -> tuple[Finding, ...]:
     """Derive all findings from an estimate, the most severe first; equally severe ones cause before symptom.
 
@@ -70,6 +71,7 @@ def diagnose(
         change: finding of `diagnostics.change_test`.
         hypotheses: findings of `diagnostics.hypothesis_tests`, which run where `is_suspect` is true.
         contradictions: findings of `diagnostics.stated_priors`.
+        conflicts: `prior_conflicts` of the estimate before they widened it; None: of the estimate.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone
     failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": _failure(estimate, quantities)})
@@ -79,12 +81,16 @@ def diagnose(
     directions = () if hypotheses else weak_directions(quantities, estimate.covariance, advise, estimate.values)
     found = [*directions, *contradictions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
-        found += [*_prior_conflicts(estimate, quantities), *([change] if change else [])]
+        conflicts = tuple(prior_conflicts(estimate, quantities)) if conflicts is None else conflicts
+        found += [*conflicts, *([change] if change else [])]
         found += [*rejections(estimate), *_noise(estimate), *_correlations(estimate)]
         found += [*_error_map(estimate, quantities), *_slow_errors(estimate, quantities), *disturbances(estimate)]
     found += misfits(estimate.chi_square, estimate.levels)
-    if any(finding.severity == WEAK for finding in directions):
-        found += _dominant_priors(quantities, estimate.covariance)
+    is_weak = any(finding.severity == WEAK for finding in directions)
+    if is_weak or all(finding.severity == NOTE for finding in found):
+        named = {each.evidence["parameter"] for each in conflicts or ()}
+        contradicted = {q.sheet for q in quantities if q.name in named}
+        found += _dominant_priors(quantities, estimate.covariance, is_weak, contradicted)
     if not published:
         found += [*_far_from_prior(estimate, quantities), *_ambiguity(estimate, quantities)]
     return by_severity(found)
@@ -115,7 +121,7 @@ def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
     )
 
 
-def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
+def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
     """Findings on nuisance and tightly stated parameters far from their priors, material ones first, worst first.
 
     Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
@@ -276,27 +282,32 @@ def disturbances(estimate: Estimate) -> Iterator[Finding]:
             yield Finding("disturbance", Severity.NOTE, evidence)
 
 
-def _dominant_priors(quantities: Sequence[Quantity], covariance: Array) -> Iterator[Finding]:
-    """Findings of data-sheet figures that cause most of a weak parameter's variance, largest share first.
+def _dominant_priors(
+    quantities: Sequence[Quantity], covariance: Array, is_weak: bool, contradicted: Collection[str]
+) -> Iterator[Finding]:
+    """Findings of data-sheet figures that cause most of a required parameter's variance, largest share first.
 
     The share of a figure is the part of a variance that conditioning on its nuisance parameters removes:
-    P_wn P_nn^-1 P_nw over P_ww; the covariance (n, n) is in the order of the quantities.
+    P_wn P_nn^-1 P_nw over P_ww; the covariance (n, n) is in the order of the quantities. A figure counts where
+    parameters are weak, and as a NOTE where they are as accurate as required and the recording adds next to nothing to
+    what the figure states: an error of it is theirs, and no residual shows it. A contradicted one has its own finding.
     """
     variances = np.diag(covariance)
-    weak = [i for i, q in enumerate(quantities) if q.judged and variances[i] > q.require**2]
+    rows = [i for i, q in enumerate(quantities) if q.judged and variances[i] > (q.require**2 if is_weak else 0.0)]
     figures: dict[str, list[int]] = {}
     for i, q in enumerate(quantities):
-        if q.sheet and variances[i] > 0.0:
+        least = 0.0 if is_weak else UNCHANGED * q.scale
+        if q.sheet and q.sheet not in contradicted and variances[i] > least**2:
             figures.setdefault(q.sheet, []).append(i)
     shares = {}
-    for figure, rows in figures.items():
-        across = covariance[np.ix_(weak, rows)]
-        removed = across @ np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True) @ across.T
-        shares[figure] = float(max(np.diag(removed) / variances[weak], default=0.0))
+    for figure, of in figures.items():
+        across = covariance[np.ix_(rows, of)]
+        removed = across @ np.linalg.pinv(covariance[np.ix_(of, of)], hermitian=True) @ across.T
+        shares[figure] = float(max(np.diag(removed) / variances[rows], default=0.0))
     dominant = [figure for figure in sorted(shares, key=lambda figure: -shares[figure]) if shares[figure] > _MIN_SHARE]
     for figure in dominant[:_MAX_REPORTED]:
         evidence = {"figure": figure, "stated": quantities[figures[figure][0]].scale, "share": shares[figure]}
-        yield Finding("dominant_prior", Severity.WEAK, evidence)
+        yield Finding("dominant_prior", WEAK if is_weak else NOTE, evidence)
 
 
 def _ambiguity(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:

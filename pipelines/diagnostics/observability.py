@@ -22,7 +22,7 @@ _RANKS: tuple[Verdict, ...] = get_args(Verdict)
 Advise = Callable[[Mapping[str, float]], Motion]
 
 # A posterior sigma of this fraction of its prior's says that the recording added next to nothing.
-_UNCHANGED = 0.9
+UNCHANGED = 0.9
 # Weights of a direction below this are left out.
 _MIN_WEIGHT = 0.1
 # Eigenvectors whose sigmas have a ratio above this are arbitrary mixtures of each other.
@@ -72,7 +72,7 @@ def verdict(quantity: Quantity, sigma: float) -> Verdict:
     """Return the contract's verdict on a parameter with a given posterior sigma, SI."""
     if quantity.prior_sigma == 0.0:
         return "fixed"
-    unchanged = sigma >= _UNCHANGED * quantity.scale
+    unchanged = sigma >= UNCHANGED * quantity.scale
     if sigma <= quantity.require:
         return "prior" if unchanged else "observable"
     return "unobservable" if unchanged else "weak"
@@ -233,7 +233,7 @@ def weak_directions(
     bad = np.flatnonzero(beyond[:, :count].any(axis=0))[::-1]
     found = []
     for group in _degenerate(ratios[bad]):
-        severity = Severity.UNOBSERVABLE if ratios[bad[group]][0] >= _UNCHANGED else Severity.WEAK
+        severity = Severity.UNOBSERVABLE if ratios[bad[group]][0] >= UNCHANGED else Severity.WEAK
         for vector in _simplest_basis(vectors[:, bad[group]]).T:
             ratio = float(np.sqrt(max(vector @ scaled @ vector, 0.0)))
             found.append(_direction(severity, _weights(names, vector), ratio, advise))
@@ -252,7 +252,7 @@ def _direction(severity: Severity, weights: Mapping[str, float], ratio: float, a
 def _degenerate(ratios: Array) -> list[Index]:
     """Runs of nearly equal decreasing ratios with one verdict, as indices: their eigenvectors are arbitrary."""
     falls = ratios[1:] < _DEGENERATE * ratios[:-1]
-    changes = (ratios[1:] >= _UNCHANGED) != (ratios[:-1] >= _UNCHANGED)
+    changes = (ratios[1:] >= UNCHANGED) != (ratios[:-1] >= UNCHANGED)
     return [run for run in np.split(np.arange(len(ratios)), np.flatnonzero(falls | changes) + 1) if len(run)]
 
 

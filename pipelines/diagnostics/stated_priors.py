@@ -1,4 +1,4 @@
-"""Numbers that the config fixes, against what the recording says of them: a score test of each.
+"""Numbers that the config fixes or data sheets state, against what the recording says of them: score tests.
 
 With H, g the information of a graph in which they are free, linear about the solution with them fixed, A the numbers
 that are free there and j a fixed one, the estimate of j alone freed is
@@ -16,10 +16,42 @@ from collections.abc import Sequence
 import numpy as np
 
 from alidade.factors.array import Mask
+from alidade.pipelines.diagnostics.change_test import by_wider_priors
 from alidade.pipelines.diagnostics.diagnose import LIMITS
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.problem import Array, Quantity, SqrtInformation
+from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, SqrtInformation
+from alidade.pipelines.estimation.widening import widened
 from alidade.pipelines.settings import Config
+
+# In an error budget.
+CONFLICT = "data sheets that the recording contradicts"
+
+
+def with_conflicts(estimate: Estimate, quantities: Sequence[Quantity], conflicts: Sequence[Finding]) -> Estimate:
+    """The estimate with what immaterial prior conflicts cost in its covariance.
+
+    A prior that is contradicted draws all that is correlated with it to where the truth is not. What a data sheet says
+    of one number it says of all of that figure: the priors of all of them are widened by the largest z-score, and both
+    the variance that this adds and the shift are added.
+
+    Args:
+        estimate: of n numbers.
+        quantities: in its order.
+        conflicts: findings of `diagnose.prior_conflicts`; where one is material, the values are not to be used.
+    """
+    z: dict[str, float] = {}
+    immaterial = all(each.severity == Severity.NOTE for each in conflicts)
+    for e in (each.evidence for each in conflicts if immaterial):
+        for q in quantities:
+            if q.name in (e["parameter"], *e["inseparable"]):
+                z[q.sheet or q.name] = max(z.get(q.sheet or q.name, 1.0), abs(e["z"]))
+    times = np.array([z.get(q.sheet or q.name, 1.0) if q.prior_sigma else 1.0 for q in quantities])
+    white = estimate.covariance / np.outer(estimate.inflations, estimate.inflations)
+    wider = by_wider_priors(quantities, times, estimate.values[None], white[None])
+    if wider is None:
+        return estimate
+    columns = np.column_stack([estimate.inflations[:, None] * wider[1][0], wider[0][0]])
+    return widened(estimate, CONFLICT, columns)
 
 
 def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | None:

@@ -16,6 +16,7 @@ from typing import Any
 
 from alidade.pipelines.diagnostics.change_test import CHANGE
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
+from alidade.pipelines.diagnostics.stated_priors import CONFLICT
 from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.error_map import SOURCE
 from alidade.pipelines.estimation.finding import Finding, Severity, status
@@ -342,9 +343,14 @@ def _misfit(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     return f"Residuals{of} {relation} the noise used: {sums}{largest}."
 
 
-def _dominant_prior(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+def _dominant_prior(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     share, figure = f"{100.0 * e['share']:.0f} %", e["figure"]
     what = figure.replace(".", " ").replace("_", " ")
+    if severity == Severity.NOTE:
+        return (
+            f"Up to {share} of the variance of a required parameter comes from {what}, which the recording does not "
+            f"determine: check sensors.{figure} (now {e['stated']:.2g}), see the error budget."
+        )
     return (
         f"{share} of that variance comes from {what}: state sensors.{figure} (now {e['stated']:.2g}) if it is better."
     )
@@ -461,6 +467,8 @@ def _described(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
         return source, "record longer, or more often"
     if source == WALK:
         return source, "calibrate more often"
+    if source == CONFLICT:
+        return source, "state the figures of your sensors"
     if source in (CHANGE, SOURCE):
         return source, "find what changed" if source == CHANGE else "calibrate the camera, or move the other ways too"
     if not source.startswith(_PRIOR):

@@ -9,8 +9,10 @@ import pytest
 
 import alidade
 from alidade.pipelines.diagnostics.diagnose import diagnose
+from alidade.pipelines.diagnostics.stated_priors import with_conflicts
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.problem import Estimate, Quantity
+from alidade.pipelines.estimation.problem import Array, Estimate, Quantity
+from alidade.pipelines.reports.sentences import sentence
 
 HEAD = {"duration_s": 40.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
 
@@ -111,3 +113,45 @@ def test_slow_errors_neither_hide_a_departure_nor_make_one() -> None:
     # Of a sigma near the prior's the shift has that of the slow errors, not next to none.
     near = replace(estimate([0.03], [9e-3]), sandwich=np.array([1.8]))
     assert conflicts(near, [assumption("a")]) == []
+
+
+def linear(truth: list[float], rows: Array, priors: list[float]) -> tuple[Estimate, list[Quantity]]:
+    """Posterior of an angle, required, and of nuisance parameters by rows of unit noise, here without any."""
+    prior = np.diag(np.array(priors) ** -2.0)
+    P: Array = np.asarray(np.linalg.inv(rows.T @ rows + prior), dtype=float)
+    values = P @ rows.T @ rows @ truth
+    own = [
+        REQUIRED,
+        *(replace(assumption(name, p), sheet="accel.cube") for name, p in zip("ab", priors[1:], strict=True)),
+    ]
+    return Estimate("batch", ("angle", "a", "b"), values, P, True, ""), own
+
+
+def test_what_an_immaterial_conflict_costs_is_in_the_sigmas() -> None:
+    """The angle is drawn by 8 of its sigmas; what the data sheet says of a it says of b, which no row determines."""
+    rows = np.array([[1e4, 60.0, 90.0], [0.0, 90.0, 0.0]])
+    found, quantities = linear([1e-3, 0.1, 0.1], rows, [1.0, 1e-2, 1e-2])
+    own = conflicts(found, quantities)
+    assert [(each.evidence["parameter"], each.severity) for each in own] == [("a", Severity.NOTE)]
+    assert abs(found.values[0] - 1e-3) > 6.0 * found.sigmas[0]
+    wide = with_conflicts(found, quantities, own)
+    assert np.abs((wide.values - [1e-3, 0.1, 0.1]) / wide.sigmas).max() < 2.0
+    np.testing.assert_array_equal(wide.values, found.values)
+    kept = [finding for finding in diagnose(wide, quantities, conflicts=own) if finding.kind == "prior_conflict"]
+    assert kept == own
+    assert with_conflicts(found, quantities, []) is found
+
+
+def test_a_figure_that_no_row_determines_is_named() -> None:
+    """An error of it is the angle's, and nothing contradicts it."""
+    found, quantities = linear([1e-3, 0.0, 0.1], np.array([[1e4, 0.0, 90.0], [0.0, 1e4, 0.0]]), [1.0, 1e-2, 1e-2])
+    assert abs(found.values[0] - 1e-3) > 6.0 * found.sigmas[0]
+    (note,) = (finding for finding in diagnose(found, quantities) if finding.kind == "dominant_prior")
+    assert note.severity == Severity.NOTE
+    assert note.evidence["figure"] == "accel.cube"
+    assert note.evidence["share"] > 0.4
+    assert "check sensors.accel.cube (now 0.01)" in sentence(note, {})
+    found, quantities = linear(
+        [1e-3, 0.0, 0.0], np.array([[1e4, 0.0, 90.0], [0.0, 1e4, 0.0], [0.0, 0.0, 1e3]]), [1.0, 1e-2, 1e-2]
+    )
+    assert not [finding for finding in diagnose(found, quantities) if finding.kind == "dominant_prior"]

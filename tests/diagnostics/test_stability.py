@@ -10,8 +10,14 @@ import pytest
 import alidade
 from alidade.factors import so3
 from alidade.pipelines.applications.follow.guidance import View, Watch
-from alidade.pipelines.diagnostics import change_test
-from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_finding, stability, with_change
+from alidade.pipelines.diagnostics.change_test import (
+    CHANGE,
+    Stability,
+    by_wider_priors,
+    change_finding,
+    stability,
+    with_change,
+)
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.parameters import prior_z_score
@@ -138,17 +144,18 @@ def test_numbers_far_beyond_their_priors_have_wider_ones(departure: float, exces
     values, steady = departure + rng.standard_normal((3, n)), np.ones(n, dtype=bool)
     posterior_history = PosteriorHistory(np.arange(3.0), values, np.tile((1.0 + excess) * P, (3, 1, 1)), steady)
     quantities = tuple(Quantity(f"q{i}", "rad", 1.0, 1.0, 1.0) for i in range(n))
-    names = tuple(q.name for q in quantities)
-    estimate = Estimate("batch", names, posterior_history.values[-1], P, True, "", posterior_history=posterior_history)
-    values, covariance = change_test._with_priors_as_found(
-        estimate, quantities, posterior_history.values, posterior_history.covariance
+    sizes = np.array(
+        [prior_z_score(q, v, s) for q, v, s in zip(quantities, values[-1], np.sqrt(np.diag(P)), strict=True)]
     )
+    covariance = posterior_history.covariance
+    wider = by_wider_priors(quantities, np.abs(sizes.astype(float)), values, covariance)
+    assert wider is not None
+    values, covariance = values + wider[0], covariance + wider[1] @ np.swapaxes(wider[1], 1, 2)
     assert np.isfinite(values).all()
     assert (np.linalg.eigvalsh(covariance) > 0.0).all()
     assert (np.diagonal(covariance, axis1=1, axis2=2) <= 4.0 * departure**2 * (1.0 + excess)).all()
     if not excess:
-        sizes = [prior_z_score(q, v, s) for q, v, s in zip(quantities, estimate.values, estimate.sigmas, strict=True)]
-        information = np.linalg.inv(P) - np.diag(1.0 - np.array(sizes, dtype=float) ** -2)
+        information = np.linalg.inv(P) - np.diag(1.0 - sizes.astype(float) ** -2)
         np.testing.assert_allclose(covariance[-1], np.linalg.inv(information), rtol=1e-6)
         gradient = np.linalg.inv(P) @ posterior_history.values[-1]
         np.testing.assert_allclose(values[-1], np.linalg.solve(information, gradient), rtol=1e-6)

@@ -124,6 +124,24 @@ def test_a_gyro_that_feels_force_far_beyond_its_data_sheet_is_named_first() -> N
     assert gyro_g.group == "assumption"
 
 
+def test_what_contradicts_a_data_sheet_by_little_is_in_the_sigmas() -> None:
+    """Cubic terms ten times their prior, of which the recording shows some: K was 7 of its sigmas off."""
+    cubic = {f"accel_cube_{axis}": 1e-5 for axis in "123"}
+    simulated = alidade.simulate("cube", _scenario(static_s=4.0, poses=20, effects=cubic), seed=0)
+    found = alidade.open(simulated).calibrate()
+    assert found.status == "calibrated"
+    assert any("contradicts its data sheet" in note for note in found.notes)
+    judged = [p for p in found.parameters.values() if p.group is None and p.sigma > 0.0]
+    assert max(abs(p.value - simulated.truth[p.name]) / p.sigma for p in judged) < 4.0
+
+
+def test_a_tilt_of_the_reference_that_no_residual_shows_is_named() -> None:
+    """Of a reference that stands still it is as the camera's mount: both go wrong together, within 5e-3 rad unseen."""
+    tilted = _scenario(effects={"reference_tilt_e": 6e-3, "reference_tilt_n": -6e-3})
+    found = alidade.open(alidade.simulate("cube", tilted, seed=0)).calibrate()
+    assert any("check sensors.reference.tilt" in note for note in found.notes)
+
+
 def test_a_field_far_from_its_model_is_named_and_has_room_where_stated() -> None:
     """What a building does to the field's direction it does to its strength, which no motion tells from a scale."""
     far = {"direction": 5e-6, "strength": 5e-6, "measured": None}
