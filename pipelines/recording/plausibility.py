@@ -211,6 +211,21 @@ def dead_band(t: Array, values: Array) -> tuple[float, Array]:
     return half_width, side
 
 
+def hidden(t: Array, half_width: float, side: Array) -> Array | None:
+    """Density (N,) of what a gyro does not show within its dead band, rad/s/sqrt(Hz); None without one.
+
+    The rate there, with the bias that rests hide, is uniform in the band and may be the same all the time. Over all the
+    time in it, T, white noise of the density half_width sqrt(T / 3) leaves its mean as uncertain as that.
+
+    Args:
+        t: (N,) s.
+        half_width, side: as `dead_band` has them.
+    """
+    within = (side == 0.0).any(axis=1)
+    lasting = float(within.mean() * (t[-1] - t[0]))
+    return np.where(within, half_width * np.sqrt(lasting / 3.0), 0.0) if half_width else None
+
+
 def _one_value(values: Array) -> float | None:
     """Return the one value that readings (N,) have within a dead band; None without a dead band."""
     found, counts = np.unique(values, return_counts=True)

@@ -25,8 +25,8 @@ from tests.install.walk import steps
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "data-sheets.md"
 ASSUMED: dict[str, Sequence[ParameterSpec]] = {
-    "los": LOS,
-    "head": HEAD,
+    "los": (*LOS, DEAD_BAND),
+    "head": (*HEAD, DEAD_BAND),
     "indexer": INDEXER,
     "cube": (*CUBE, FIELD, DEAD_BAND),
     "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD, ACCEL_SQUARE, DEAD_BAND),

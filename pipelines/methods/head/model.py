@@ -26,7 +26,7 @@ from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
 from alidade.pipelines.estimation.error_map import ErrorMap
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameters import acting
+from alidade.pipelines.estimation.parameters import DEAD_BAND, acting
 from alidade.pipelines.estimation.parameters import stated as stated_figure
 from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Factor, Problem, Step
@@ -38,6 +38,8 @@ from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import at_gyro_rate
 from alidade.pipelines.methods.noise import at_least_at_rest, estimated, mean_at_rest, sampled, stated, typical
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.recording.plausibility import DEAD_BAND as HAS_DEAD_BAND
+from alidade.pipelines.recording.plausibility import dead_band, hidden
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Pictures share a keyframe within this time, s, and keyframes are never farther apart than this, s: increments are
@@ -79,6 +81,7 @@ class _Model:
     helmet_guess: Array  # vRh
     reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
     noises: dict[str, Level]  # by name
+    dead_band: bool  # of the helmet's gyro
 
 
 def problem(data: HeadData, config: Config) -> Problem:
@@ -101,8 +104,11 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         at_gyro_rate=partial(at_gyro_rate, data),
         advice=_advice,
         dropped=data.dropped,
-        premises=() if data.platform_t is not None else (_AT_REST,),
-        continuation=partial(_continuation, config, model),
+        premises=(
+            *(() if data.platform_t is not None else (_AT_REST,)),
+            *((HAS_DEAD_BAND,) if model.dead_band else ()),
+        ),
+        continuation=None if model.dead_band else partial(_continuation, config, model),
         revision_horizon=temperature.longest_gap(data.temperature),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.picture, model.clock.begun),
@@ -190,7 +196,8 @@ def _continuation(config: Config, model: _Model, data: HeadData, time: float) ->
     if (data.temperature is None) != (model.reference is None):
         return None
     grown = _prepare(data, config, model, trunk, time)
-    return _problem(config, data, grown) if trunk is ROOT or grown.chain.time[0] == time else None
+    begins = trunk is ROOT or grown.chain.time[0] == time
+    return _problem(config, data, grown) if begins and not grown.dead_band else None
 
 
 def _prepare(
@@ -218,7 +225,9 @@ def _prepare(
         platform_density = noises["platform_gyro_density"].used
     reference = temperature.reference(data.temperature) if before is None else before.reference
     temperature_rise = temperature.above(data.temperature, reference, data.head_t)
-    drivers = {SENSITIVITY: data.head_force, GYRO_SLOPE: temperature_rise}
+    half_width, side = dead_band(data.head_t, data.head_gyro)
+    hidden_rate = hidden(data.head_t, half_width, side)
+    drivers = {SENSITIVITY: data.head_force, GYRO_SLOPE: temperature_rise, DEAD_BAND: side if half_width else None}
     caused = [each for each, driver in drivers.items() if driver is not None]
     if before is None:
         around = _all_around(data.vision_wxyz)
@@ -246,7 +255,8 @@ def _prepare(
     time, pictures = time[late:], pictures[late:] - pictures[late]
     frames = slice(len(taken) - pictures[-1], None)
     stamps, taken, measured = stamps[frames], taken[frames], measured[frames]
-    gyro = GyroPath(data.head_t, data.head_gyro, bias_hat, acting(parameters.gyro, drivers))
+    driving = acting(parameters.gyro, drivers)
+    gyro = GyroPath(data.head_t, data.head_gyro, bias_hat, driving, hidden=hidden_rate)
     chain = GyroChain.over(
         time,
         np.arange(len(time)) == 0,
@@ -277,6 +287,7 @@ def _prepare(
         helmet_guess=vRh,
         reference=reference,
         noises=noises,
+        dead_band=half_width > 0.0,
     )
 
 

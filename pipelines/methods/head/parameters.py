@@ -12,6 +12,7 @@ from alidade.factors.earth import EARTH_RATE
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
     CLOCK_SKEW,
+    DEAD_BAND,
     ParameterSpec,
     check_parameters,
     error_map,
@@ -70,7 +71,7 @@ NUISANCE = (
     *(*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE),
     *(CLOCK_SKEW, VISION_SCALE, GYRO_SLOPE, VISION_FILTER),
 )
-PARAMETERS = (BIAS, HELMET, CAMERA, OFFSET, *NUISANCE, VISION_MAP)
+PARAMETERS = (BIAS, HELMET, CAMERA, OFFSET, *NUISANCE, DEAD_BAND, VISION_MAP)
 # Those of the pictures, behind the time offset, in the order of the factor's columns.
 PICTURE_SPECS = tuple(next(spec for spec in NUISANCE if spec.name == name) for name in PICTURE_ERRORS[1:])
 
@@ -110,7 +111,7 @@ class HeadParameters:
         Args:
             config: priors, data sheets, accuracies wanted.
             platform: whether there is a platform gyro.
-            drivers: SENSITIVITY and GYRO_SLOPE, in this order, where the helmet's IMU measures their causes.
+            drivers: SENSITIVITY, GYRO_SLOPE and DEAD_BAND, in this order, where the helmet's IMU has their causes.
             stamp_sigma: s, how well the stamps are known.
             all_around: whether vision shows the helmet turned by half a turn: no scale of its angles but 1 is
                 continuous there, so that it is fixed unless the config says something of it.

@@ -16,7 +16,7 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import AXES, COLORS, PALE, Figure, Plot
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.parameters import fixed_without_force
+from alidade.pipelines.estimation.parameters import DEAD_BAND, fixed_without_force
 from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import Correction, Report, temperature
@@ -33,6 +33,7 @@ from alidade.pipelines.methods.head.parameters import (
 from alidade.pipelines.methods.head.recording import HEAD_IMU, PLATFORM_IMU, HeadData
 from alidade.pipelines.methods.head.uses import uses
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.recording.plausibility import dead_band
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -354,6 +355,8 @@ def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:
     if data.temperature is not None:
         values = {temperature.FIRST: data.temperature.first, **values}
         measured["temperature"] = data.temperature.above(0.0, data.head_t)
+    if DEAD_BAND.name in values:
+        measured["gyro"] = data.head_gyro + values[DEAD_BAND.name] * dead_band(data.head_t, data.head_gyro)[1]
     causes = {SENSITIVITY: measured["accel"], GYRO_SLOPE: measured["temperature"]}
     unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
     known = {name: value for name, value in values.items() if name not in unknown}

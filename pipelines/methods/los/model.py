@@ -30,7 +30,7 @@ from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
 from alidade.pipelines.estimation.error_map import ErrorMap
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, as_slice
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameters import acting
+from alidade.pipelines.estimation.parameters import DEAD_BAND, acting
 from alidade.pipelines.estimation.parameters import stated as stated_figure
 from alidade.pipelines.estimation.priors import rotation_about, vector_prior
 from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Problem, Step
@@ -56,6 +56,8 @@ from alidade.pipelines.methods.los.parameters import (
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.noise import sampled, stated, typical, walking
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.recording.plausibility import DEAD_BAND as HAS_DEAD_BAND
+from alidade.pipelines.recording.plausibility import dead_band, hidden
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures determine it. Rotation about the line of
@@ -89,6 +91,7 @@ class _Model:
     reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
     noises: dict[str, Level]  # by name
     clock: Clock  # by which stamps of the recording were moved to the keyframes' times
+    dead_band: bool  # of the gyro
 
     @property
     def gimbal_errors(self) -> GimbalErrors:
@@ -116,7 +119,8 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         advice=_advice,
         dropped=dropped,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
-        continuation=partial(_continuation, config, model) if data.error_cov is None else None,
+        continuation=partial(_continuation, config, model) if data.error_cov is None and not model.dead_band else None,
+        premises=(HAS_DEAD_BAND,) if model.dead_band else (),
         revision_horizon=max(
             _SETTLED if model.around is None else WINDOWS[0], temperature.longest_gap(data.temperature)
         ),
@@ -165,7 +169,8 @@ def _continuation(config: Config, model: _Model, data: LosData, time: float) -> 
     if (data.temperature is None) != (model.reference is None):
         return None
     grown, dropped = _prepare(data, config, model, trunk, time)
-    return _problem(config, data, grown, dropped) if trunk is ROOT or grown.chain.time[0] == time else None
+    begins = trunk is ROOT or grown.chain.time[0] == time
+    return _problem(config, data, grown, dropped) if begins and not grown.dead_band else None
 
 
 def _prepare(
@@ -183,7 +188,9 @@ def _prepare(
     grows stay where they are, and so do its keyframes.
     """
     reference = temperature.reference(data.temperature) if before is None else before.reference
-    drivers = {SENSITIVITY: data.force, GYRO_SLOPE: temperature.above(data.temperature, reference, data.gyro_t)}
+    half_width, side = dead_band(data.gyro_t, data.gyro)
+    temperature_rise = temperature.above(data.temperature, reference, data.gyro_t)
+    drivers = {SENSITIVITY: data.force, GYRO_SLOPE: temperature_rise, DEAD_BAND: side if half_width else None}
     caused = [each for each, driver in drivers.items() if driver is not None]
     parameters = LosParameters.of(config, caused, data.stamp_sigma)
     driving = acting(parameters.gyro, drivers)
@@ -215,7 +222,7 @@ def _prepare(
         time,
         used.starts,
         carried,
-        GyroPath(data.gyro_t, data.gyro, bias_hat, driving),
+        GyroPath(data.gyro_t, data.gyro, bias_hat, driving, hidden=hidden(data.gyro_t, half_width, side)),
         density=noises["gyro_density"].used,
         walk=noises["gyro_bias_walk"].used,
         errors=parameters.gyro,
@@ -241,6 +248,7 @@ def _prepare(
         reference=reference,
         noises=noises,
         clock=clock,
+        dead_band=half_width > 0.0,
     )
     return model, {**data.dropped, **dropped}
 

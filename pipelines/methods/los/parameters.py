@@ -10,6 +10,7 @@ import gtsam
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
     CLOCK_SKEW,
+    DEAD_BAND,
     ParameterSpec,
     check_parameters,
     encoder_errors,
@@ -87,7 +88,7 @@ NUISANCE = (*SCALE, SENSITIVITY, *GIMBAL_ERRORS, *TRACKER_ERRORS, GYRO_SLOPE)
 # The angles by which gyro, gimbal axes and camera are mounted.
 ANGLE_SPECS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, *GIMBAL_ERRORS)
 ANGLES = tuple(name for each in ANGLE_SPECS for name in each.names)
-PARAMETERS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, BIAS, *NUISANCE, LOS_MAP)
+PARAMETERS = (*MOUNT, AZIMUTH, *AZIMUTH_ZEROS, BIAS, *NUISANCE, DEAD_BAND, LOS_MAP)
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class LosParameters:
 
         Args:
             config: priors, data sheets, accuracies wanted.
-            drivers: SENSITIVITY and GYRO_SLOPE, in this order, where the gyro's IMU measures their causes.
+            drivers: SENSITIVITY, GYRO_SLOPE and DEAD_BAND, in this order, where the gyro's IMU has their causes.
             stamp_sigma: s, how well the stamps are known.
         """
         if config.noise.gyro_scale:

@@ -17,7 +17,7 @@ from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.estimation.camera_clock import Clock
-from alidade.pipelines.estimation.parameters import fixed_without_force
+from alidade.pipelines.estimation.parameters import DEAD_BAND, fixed_without_force
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import Correction, Report
@@ -33,6 +33,7 @@ from alidade.pipelines.methods.los.parameters import ANGLES, DELAY, ONCE_PER_TUR
 from alidade.pipelines.methods.los.recording import JOINTS, LosData
 from alidade.pipelines.methods.los.uses import uses
 from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
+from alidade.pipelines.recording.plausibility import dead_band
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -265,7 +266,8 @@ def rates(data: LosData, values: Mapping[str, float]) -> Array:
     unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
     known = {name: value for name, value in values.items() if name not in unknown}
     formula, out = Formula("rate, rad/s in m", "w_m", *gyro_rate(known, S, *DRIVERS)), np.empty_like(data.gyro)
-    inputs = {"gyro": data.gyro, "accel": data.force, "temperature": warm}
+    left = values[DEAD_BAND.name] * dead_band(data.gyro_t, data.gyro)[1] if DEAD_BAND.name in values else 0.0
+    inputs = {"gyro": data.gyro + left, "accel": data.force, "temperature": warm}
     for begin in range(0, len(out), _BLOCK):
         some = slice(begin, begin + _BLOCK)
         measured = {name: given[some] for name in formula.inputs if (given := inputs[name]) is not None}

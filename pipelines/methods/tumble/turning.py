@@ -34,7 +34,7 @@ from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.estimation.walking_bias import FIRST
 from alidade.pipelines.methods.noise import sampled, stated, walking
 from alidade.pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
-from alidade.pipelines.recording.plausibility import dead_band
+from alidade.pipelines.recording.plausibility import dead_band, hidden
 from alidade.pipelines.settings import Config
 
 Index = NDArray[np.intp]
@@ -303,7 +303,12 @@ def turning(
         drivers[DEAD_BAND] = beyond
     errors = gyro_errors(_ERRORS_KEY, SCALE, list(drivers), config)
     path = GyroPath(
-        data.gyro_t, data.gyro, guess.bias, acting(errors, drivers), density.used, _hidden(data, half_width, beyond)
+        data.gyro_t,
+        data.gyro,
+        guess.bias,
+        acting(errors, drivers),
+        density.used,
+        hidden(data.gyro_t, half_width, beyond),
     )
     inside = _inside(mag.time, data.gyro_t)
     time, begins = shared_keyframes(mag.time[inside], mag.time[inside[0]], _SHARED, _APART)
@@ -338,20 +343,6 @@ def turning(
         earth_rate=_earth_rate(config) if earth is None else None,
         levels=(density, walk),
     )
-
-
-def _hidden(data: TumbleData, half_width: float, beyond: Array) -> Array | None:
-    """Noise density (N,), rad/s/sqrt(Hz), for the rate hidden in a gyro's dead band; None without a dead band.
-
-    The rate there, with the bias that rests hide, is uniform in the band and may be the same all the time. Over all the
-    time in it, T, white noise of the density half_width sqrt(T / 3) leaves its mean as uncertain as that.
-    """
-    if not half_width:
-        return None
-    assert data.gyro_t is not None
-    within = (beyond == 0.0).any(axis=1)
-    lasting = float(within.mean() * (data.gyro_t[-1] - data.gyro_t[0]))
-    return np.where(within, half_width * np.sqrt(lasting / 3.0), 0.0)
 
 
 def _earth(latitude: float, declination: float) -> Array:
