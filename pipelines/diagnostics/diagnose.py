@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -82,8 +82,11 @@ def diagnose(
     found = [*directions, *contradictions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
         conflicts = tuple(prior_conflicts(estimate, quantities)) if conflicts is None else conflicts
-        found += [*conflicts, *([change] if change else [])]
-        found += [*rejections(estimate), *_noise(estimate), *_correlations(estimate)]
+        noise = tuple(_noise(estimate))
+        # In noise that is none conflicts look immaterial, and may be what it comes from.
+        symptom = any(each.severity == INCONSISTENT for each in noise)
+        found += [replace(each, severity=INCONSISTENT) if symptom else each for each in conflicts]
+        found += [*([change] if change else []), *rejections(estimate), *noise, *_correlations(estimate)]
         found += [*_error_map(estimate, quantities), *_slow_errors(estimate, quantities), *disturbances(estimate)]
     found += misfits(estimate.chi_square, estimate.levels)
     is_weak = any(finding.severity == WEAK for finding in directions)

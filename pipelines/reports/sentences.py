@@ -20,6 +20,7 @@ from alidade.pipelines.diagnostics.stated_priors import CONFLICT
 from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.error_map import SOURCE
 from alidade.pipelines.estimation.finding import Finding, Severity, status
+from alidade.pipelines.estimation.parameters import UNINFORMED
 from alidade.pipelines.estimation.parameters import kind as kind_of
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.solvers.joint import RECORDING, WALK
@@ -207,7 +208,10 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
         if q.group == "assumption":
             sensor, _, figure = q.sheet.partition(".")
             known = stated.setdefault(sensor, {})
-            known[figure or q.name] = max(known.get(figure or q.name, 0.0), abs(e["value"] - q.prior_mean))
+            # Without the prior, which draws it to its mean: 1 / sigma^2 = 1 / free^2 + 1 / prior^2.
+            drawn = min(e["sigma"] / q.scale, UNINFORMED) ** 2
+            size = abs(e["value"] - q.prior_mean) / (1.0 - drawn)
+            known[figure or q.name] = max(known.get(figure or q.name, 0.0), size)
     written = {
         sensor: f"{{{', '.join(f'{name}: {size:.1g}' for name, size in known.items())}}}"
         for sensor, known in stated.items()

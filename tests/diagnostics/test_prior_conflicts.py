@@ -11,8 +11,9 @@ import alidade
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.stated_priors import with_conflicts
 from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import Array, Estimate, Quantity
-from alidade.pipelines.reports.sentences import sentence
+from alidade.pipelines.reports.sentences import headline, sentence
 
 HEAD = {"duration_s": 40.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
 
@@ -155,3 +156,16 @@ def test_a_figure_that_no_row_determines_is_named() -> None:
         [1e-3, 0.0, 0.0], np.array([[1e4, 0.0, 90.0], [0.0, 1e4, 0.0], [0.0, 0.0, 1e3]]), [1.0, 1e-2, 1e-2]
     )
     assert not [finding for finding in diagnose(found, quantities) if finding.kind == "dominant_prior"]
+
+
+def test_conflict_comes_before_the_noise_that_hides_it() -> None:
+    """Of a gyro that feels force the noise took most: the conflict was a note, and only the noise was named."""
+    quantities = [REQUIRED, replace(assumption("a"), sheet="gyro.g_sensitivity")]
+    level = Level(Noise("gyro_density", 1e-4, "config", 0.1, ("gyro",)), 20.0, 20.0, 2.0)
+    noisy = replace(estimate([0.0, 0.02], [1e-3, 9e-3]), names=("angle", "a"), levels=(level,))
+    findings = diagnose(noisy, quantities)
+    assert [f.kind for f in findings if f.severity == Severity.INCONSISTENT] == ["prior_conflict", "noise"]
+    named = {q.name: q for q in quantities}
+    assert "gyro: {g_sensitivity: 0.1}" in headline(findings, named, {})  # .02 over 1 - .9^2, not .02
+    calm = diagnose(replace(noisy, levels=()), quantities)
+    assert all(f.severity == Severity.NOTE for f in calm)
