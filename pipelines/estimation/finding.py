@@ -40,7 +40,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "slow_error": ("parameter", "ratio"),  # sandwich over nominal sigma, the largest of a required parameter
     # Family None: all measurements, of which `largest` departs most; noise_factor times its noise would fit it.
     "misfit": ("family", "chi_square", "dof", "largest", "noise_factor"),
-    "dominant_prior": ("figure", "stated", "share"),  # data-sheet figure: its share of a weak parameter's variance
+    "dominant_prior": ("figure", "stated", "share"),  # data-sheet figure: its share of a variance
     "ambiguous_solution": ("chi_square", "values"),  # excess over the reported one; parameter -> (there, reported)
     "solver_difference": ("parameter", "z", "sigma_ratio"),  # incremental less batch
     "recording": ("recording", "findings"),  # those of one recording of a joint calibration by itself
