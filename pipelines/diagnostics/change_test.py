@@ -207,7 +207,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
         return None
     time = posterior_history.time[late]
     values, covariance = posterior_history.values[late], posterior_history.covariance[late]
-    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.inflations, strict=True)
+    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.widenings, strict=True)
     z = np.abs([prior_z_score(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated])
     # Under priors so wide that no parameter lies far beyond its own.
     if (wider := by_wider_priors(quantities, np.where(z >= _BEYOND, z, 1.0), values, covariance)) is not None:

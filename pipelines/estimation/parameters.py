@@ -25,7 +25,7 @@ from alidade.pipelines.settings import Config, check_names
 # The prior of a nuisance parameter that the config sets to null is so many times the usual one.
 _FREE = 10.0
 # A sigma of more than this part of its prior's says nothing, one of less than that determines it.
-UNINFORMED = 0.98
+_UNINFORMED = 0.98
 
 # What the names of numbers of one kind differ by.
 _NUMBERS = re.compile(r"(_p?[xyzenu]{1,2})?(_sin|_cos)?$")
@@ -282,7 +282,7 @@ def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: flo
         inflation: by what sigma is larger because noise is coloured, or errors are slow.
     """
     prior, white = quantity.prior_sigma or 0.0, sigma / inflation
-    if white > UNINFORMED * prior or prior == 0.0:
+    if white > _UNINFORMED * prior or prior == 0.0:
         return None
     elsewhere = sigma**2 - (white**2 / prior) ** 2
     return (value - quantity.prior_mean) / math.sqrt((prior - white**2 / prior) ** 2 + elsewhere)

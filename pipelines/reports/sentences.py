@@ -20,7 +20,6 @@ from alidade.pipelines.diagnostics.stated_priors import CONFLICT
 from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.error_map import SOURCE
 from alidade.pipelines.estimation.finding import Finding, Severity, status
-from alidade.pipelines.estimation.parameters import UNINFORMED
 from alidade.pipelines.estimation.parameters import kind as kind_of
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.solvers.joint import RECORDING, WALK
@@ -208,9 +207,8 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
         if q.group == "assumption":
             sensor, _, figure = q.sheet.partition(".")
             known = stated.setdefault(sensor, {})
-            # Without the prior, which draws it to its mean: 1 / sigma^2 = 1 / free^2 + 1 / prior^2.
-            drawn = min(e["sigma"] / q.scale, UNINFORMED) ** 2
-            size = abs(e["value"] - q.prior_mean) / (1.0 - drawn)
+            # The prior draws the value to its mean; one that is wider by the z-score is contradicted no more.
+            size = max(abs(e["value"] - q.prior_mean), abs(e["z"]) * q.scale)
             known[figure or q.name] = max(known.get(figure or q.name, 0.0), size)
     written = {
         sensor: f"{{{', '.join(f'{name}: {size:.1g}' for name, size in known.items())}}}"

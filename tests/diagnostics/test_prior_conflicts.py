@@ -166,6 +166,7 @@ def test_conflict_comes_before_the_noise_that_hides_it() -> None:
     findings = diagnose(noisy, quantities)
     assert [f.kind for f in findings if f.severity == Severity.INCONSISTENT] == ["prior_conflict", "noise"]
     named = {q.name: q for q in quantities}
-    assert "gyro: {g_sensitivity: 0.1}" in headline(findings, named, {})  # .02 over 1 - .9^2, not .02
+    # 4.6 times the prior, which drew it to .02.
+    assert "gyro: {g_sensitivity: 0.05}" in headline(findings, named, {})
     calm = diagnose(replace(noisy, levels=()), quantities)
     assert all(f.severity == Severity.NOTE for f in calm)

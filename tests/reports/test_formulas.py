@@ -249,7 +249,7 @@ def test_a_departure_that_is_significant_is_applied_though_its_sigma_is_nearly_t
     known = replace(problem, parameters=(Parameter(9, tuple(replace(q, prior_mean=0.002) for q in scales)),))
     assert replace(calibration, problem=known).applied == list(names)
     (note,) = (note for note in sentences.notes(diagnose(estimate, scales), calibration.quantities) if "state" in note)
-    assert note == "If the device is so, state it: `sensors: {gyro: {scale: 0.08}}`"
+    assert note == "If the device is so, state it: `sensors: {gyro: {scale: 0.1}}`"
     # No data sheet has a reversed axis.
     reversed_axis = replace(estimate, values=np.array([0.0786, 0.0399, -1.945]))
     said = sentences.notes(diagnose(reversed_axis, scales), calibration.quantities)
@@ -261,7 +261,7 @@ def test_a_departure_that_is_significant_is_applied_though_its_sigma_is_nearly_t
     (note,) = (
         note for note in sentences.notes(diagnose(estimate, own.quantities), priors.quantities) if "state" in note
     )
-    assert note.endswith("state it: `sensors: {gyro: {scale: 0.04}}` and `priors: {gyro_scale_x: 0.08}`")
+    assert note.endswith("state it: `sensors: {gyro: {scale: 0.04}}` and `priors: {gyro_scale_x: 0.1}`")
 
 
 # Parameters that no formula uses, and why.
