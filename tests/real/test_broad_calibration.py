@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import alidade
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
+from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.write import write_results
 from datasets.broad import Score, read_trial, score_results, to_session
@@ -92,3 +94,20 @@ def test_noise_of_a_gyro_that_never_rests_is_judged_by_its_rate(
     (density,) = (noise for noise in found.noises if noise.name == "gyro_density")
     assert density.used > 3e-3
     assert any(f.kind == "hypothesis" and "gyro's x" in f.evidence["label"] for f in found.findings) == (signs[0] < 0)
+
+
+@pytest.mark.parametrize("name", ["07_undisturbed_fast_rotation_B", "12_undisturbed_slow_translation_C"])
+def test_a_swung_accelerometer_begins_as_nominal(name: str, shared_data: Path) -> None:
+    """The ellipsoid nearest to its readings has axes of 37 and 348 m/s^2: thousands of sigmas, minutes of solving."""
+    from scipy.io import loadmat
+
+    trial = loadmat(str(shared_data / "broad" / f"{name}.mat"))
+    time = np.arange(len(trial["imu_gyr"])) / trial["sampling_rate"].item()
+    at, force, field = (each[::6] for each in (time, trial["imu_acc"], 1e-6 * trial["imu_mag"]))
+    gyro = {"gyro_t": time, "gyro": trial["imu_gyr"]}
+    session = alidade.open({"accel_t": at, "accel": force, "mag_t": at, "mag": field, **gyro}, method="tumble")
+    accel, _ = prepare(session.data, session.config).sensors
+    assert not accel.rested
+    assert accel.radius == pytest.approx(accel.strength)
+    # The noise to begin with, which the graph lowers, has most readings inside the gate.
+    assert 20.0 < accel.level < 60.0

@@ -75,8 +75,10 @@ def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variab
 
 
 def _level(sensor: Sensor, guess: FieldGuess) -> Level:
-    """Initial noise level: that of the first guess for a magnetometer without a stated noise."""
-    if sensor.name != "mag" or sensor.noise.source != "default" or sensor.noise.known == 0.0:
+    """Initial noise level: that of the first guess where no noise is stated, that of rests where there are some."""
+    if sensor.name != "mag":
+        return Level(sensor.noise, 1.0 if sensor.rested else max(1.0, sensor.level))
+    if sensor.noise.source != "default" or sensor.noise.known == 0.0:
         return Level(sensor.noise)
     return Level(sensor.noise, max(1.0, guess.sigma / float(np.median(sensor.sigma))))
 

@@ -453,7 +453,8 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sen
     known = data.latitude is not None
     strength = float(gravity(data.latitude, data.height)) if data.latitude is not None else _GRAVITY
     of = strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"
-    found = _sensor("accel", (data.accel_t, data.accel, data.accel_density), rests, config, of)
+    swung = rests is None and data.gyro is not None
+    found = _sensor("accel", (data.accel_t, data.accel, data.accel_density), rests, config, of, swung)
     causes = {ACCEL_SQUARE: found.nominal(found.raw) ** 2}
     if data.temperature is not None:
         temperature = data.temperature.above(data.temperature.first, data.accel_t)
@@ -479,6 +480,7 @@ def _sensor(
     rests: Array | None,
     config: Config,
     known: tuple[float, float, str],
+    swung: bool = False,
 ) -> Sensor:
     """Build a triad with symmetric K.
 
@@ -488,13 +490,18 @@ def _sensor(
         rests: over which means are used; None: all samples are.
         config: in force.
         known: strength, its sigma, and its unit.
+        swung: whether it moves beside a gyro. In SI its K and b begin as nominal then: the ellipsoid nearest to
+            readings with several m/s^2 of motion may have its centre thousands of m/s^2 away.
     """
     time, raw, number = _means(*stream[:2], rests)
     if rests is None and len(raw) < FEWEST:
         raise InputError(f"{name}: {len(raw)} readings, at least {FEWEST} in different attitudes are needed")
     is_si = _is_si(name, raw)
     usual = (_EARTH_FIELD if known[2] == "1" else known[0]) if is_si else None
-    S, centre = first_guess(raw, usual, ACCEL_OFFSET if is_si and name == "accel" else OFFSET)
+    if swung and usual is not None:
+        S, centre = np.eye(3) / usual, np.zeros(3)
+    else:
+        S, centre = first_guess(raw, usual, ACCEL_OFFSET if is_si and name == "accel" else OFFSET)
     radius = float(np.linalg.det(S)) ** (-1.0 / 3.0)
     start = np.concatenate([(radius * S)[np.triu_indices(3)], -S @ centre])
     numbers, root_number = start @ entries(True).T, np.sqrt(number)
