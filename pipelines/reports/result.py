@@ -111,6 +111,8 @@ class Calibration(SensorValues):
             self.estimate.widenings,
             strict=True,
         )
+        # Conflicts widened the sigmas of what they are about.
+        conflicts = {f.evidence["parameter"]: f.evidence["z"] for f in self.findings if f.kind == "prior_conflict"}
         return {
             q.name: ParameterResult(
                 name=q.name,
@@ -122,7 +124,9 @@ class Calibration(SensorValues):
                 require=q.require if q.judged else None,
                 observability=given.get(q.name),
                 group=q.group,
-                pull=None if q.group is None else prior_z_score(q, float(value), float(sigma), float(widening)),
+                pull=None
+                if q.group is None
+                else conflicts.get(q.name, prior_z_score(q, float(value), float(sigma), float(widening))),
                 inflation=float(inflation),
             )
             for q, value, sigma, inflation, widening in rows
