@@ -4,7 +4,8 @@ from alidade.plugin import Method, ParameterSpec, parameter_problem
 """
 
 from alidade.factors import so3
-from alidade.factors.model import ROT3, Array, Model, Residuals
+from alidade.factors.array import Array
+from alidade.factors.model import ROT3, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
 from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
 from alidade.pipelines.diagnostics.cross_validation import Validation, rms

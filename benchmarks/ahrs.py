@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.model import Array
+from alidade.factors.array import Array
 from alidade.factors.preintegration import Increments
 
 

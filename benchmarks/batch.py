@@ -9,9 +9,10 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.problem import Array, Problem
+from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.methods.head import model as head
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head

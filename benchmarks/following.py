@@ -18,10 +18,10 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from alidade.factors.array import Array
 from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.sources import Source
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing

@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.problem import Array, Problem
+from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.methods.head import model as head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los import model as los

@@ -24,10 +24,11 @@ import numpy as np
 from scipy.stats import chi2
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.indexer import mounting_angles
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem, Step, rotation_vector_coordinates
+from alidade.pipelines.estimation.problem import Estimate, Problem, Step, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position

@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.model import Array, Model, Residuals
+from alidade.factors.array import Array
+from alidade.factors.model import Model, Residuals
 from alidade.factors.triad import AccelFactor
 from alidade.pipelines.estimation.priors import LinearModel
 from alidade.pipelines.estimation.problem import Factor

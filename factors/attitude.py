@@ -14,8 +14,9 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gyro import Derivatives, by_platform_errors, carried, error_blocks, needed, parted, platform_errors
-from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.model import ROT3, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 
 # The pictures' errors, in the order of their block, and their columns there: s, s/s, share of an angle, s^2.

@@ -15,12 +15,11 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import (
     POSE3,
     ROT3,
-    Array,
     Block,
     Keys,
     Model,

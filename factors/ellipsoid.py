@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from alidade.factors.model import Array, Block, Model, Residuals
+from alidade.factors.array import Array
+from alidade.factors.model import Block, Model, Residuals
 
 # Of a symmetric K: which of the nine entries by rows each of the six numbers is.
 _UPPER = np.zeros((9, 6))

@@ -7,7 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from alidade.factors.model import Array, Block, Residuals, WrappedModel
+from alidade.factors.array import Array
+from alidade.factors.model import Block, Residuals, WrappedModel
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
-from alidade.factors.array import Index
-from alidade.factors.model import Array, Stacked
+from alidade.factors.array import Array, Index
+from alidade.factors.model import Stacked
 
 # Motion around a picture is smoothed over one of these times to either side, s: the longest that follows it. The first
 # is long against noise, the last follows swings of 10 Hz.

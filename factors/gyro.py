@@ -25,7 +25,8 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.array import Array
+from alidade.factors.model import ROT3, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
 
 # Derivatives by bias (n, 3, 3) and, where they are variables, by errors (n, 3, 6 to 19).

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from alidade.factors import so3
-from alidade.factors.array import Index
+from alidade.factors.array import Array, Index
 from alidade.factors.gyro import by_symmetric, needed, symmetric
-from alidade.factors.model import Array, Block, Model, Residuals
+from alidade.factors.model import Block, Model, Residuals
 
 Option = Literal["errors", "temperature", "encoder", "epsilon", "tilt"]
 # What the encoders' errors are, in the order of their block.

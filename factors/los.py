@@ -22,9 +22,10 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gimbal import LocalMotion
 from alidade.factors.gyro import rate_error
-from alidade.factors.model import ROT3, Array, Block, Model, Residuals, Stacked
+from alidade.factors.model import ROT3, Block, Model, Residuals, Stacked
 
 # What else than the mounting spoils LOS errors, in the order of their block: s and rad/s, s and c of encoders rad.
 SIGHT_ERRORS = (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alidade.factors.model import Array
+from alidade.factors.array import Array
 
 
 @dataclass(frozen=True)

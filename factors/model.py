@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array as Array
-from alidade.factors.array import Index
+from alidade.factors.array import Array, Index
 
 if TYPE_CHECKING:
     import gtsam

@@ -22,8 +22,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
 from alidade.factors import so3
-from alidade.factors.array import Index
-from alidade.factors.model import Array, Stacked
+from alidade.factors.array import Array, Index
+from alidade.factors.model import Stacked
 
 # Neighbouring intervals that differ by more than this share are not taken as even.
 _UNEVEN = 0.05

@@ -12,7 +12,8 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.array import Array
+from alidade.factors.model import ROT3, Block, Model, Residuals
 
 
 @dataclass(frozen=True)

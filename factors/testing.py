@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.factors.model import Array, Model, check, dimension, retract
+from alidade.factors.array import Array
+from alidade.factors.model import Model, check, dimension, retract
 
 
 def assert_jacobians(

@@ -25,8 +25,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.los import SIGHT_ERRORS
-from alidade.factors.model import Array, Block, Residuals, Stacked, WrappedModel, dimension
+from alidade.factors.model import Block, Residuals, Stacked, WrappedModel, dimension
 
 # The turns of gimbal and camera, from the gyro on.
 _AZIMUTH, _ELEVATION, _NONPERPENDICULARITY, _COLLIMATION, _ROLL = range(5)

@@ -18,9 +18,10 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.ellipsoid import by_slope, drifted
 from alidade.factors.gyro import SCALE, Derivatives, carried, needed, rate_error
-from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.model import ROT3, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
 
 # Half width of the cubic fit for the angular acceleration, s. Differences over 10 ms have noise at 400 Hz that makes a

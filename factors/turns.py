@@ -13,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Index
-from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.array import Array, Index
+from alidade.factors.model import ROT3, Block, Model, Residuals
 from alidade.factors.preintegration import running_product, trapezoid_excess
 from alidade.factors.triad import parts
 

@@ -34,7 +34,7 @@ from alidade.pipelines.recording.topics import TEMPERATURE
 from alidade.pipelines.reports.calibration import SavedCalibration, as_saved
 
 if TYPE_CHECKING:
-    from alidade.pipelines.estimation.problem import Array
+    from alidade.factors.array import Array
     from alidade.pipelines.methods import Correction
     from alidade.pipelines.recording.container import MessageBlock
     from alidade.pipelines.recording.opening import Where

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.sharing import DAY_S, stated_walks, walks
@@ -34,15 +35,7 @@ from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import kind
 from alidade.pipelines.estimation.prior_replacement import with_priors
-from alidade.pipelines.estimation.problem import (
-    Array,
-    ChiSquare,
-    Estimate,
-    Parameter,
-    Problem,
-    Quantity,
-    SqrtInformation,
-)
+from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Parameter, Problem, Quantity, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.applications.api import calibrate
 from alidade.pipelines.config import Settings, load_config
-from alidade.pipelines.estimation.problem import Array
 
 if TYPE_CHECKING:
     from alidade.pipelines.reports.result import Calibration

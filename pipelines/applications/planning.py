@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines import methods, progress
 from alidade.pipelines.config import Settings
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Status, status
-from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.methods import Method, Scenario
 

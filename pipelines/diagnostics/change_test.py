@@ -17,10 +17,11 @@ from itertools import islice
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.parameters import prior_z_score
-from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, StepEstimate
+from alidade.pipelines.estimation.problem import Estimate, Quantity, StepEstimate
 from alidade.pipelines.estimation.widening import widened
 
 # Probability of calling a recording changed in which nothing changed.

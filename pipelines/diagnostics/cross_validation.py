@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines import parallel
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.trial_fit import Build, max_concurrent, solve_trial
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, Problem, Quantity
+from alidade.pipelines.estimation.problem import Problem, Quantity
 from alidade.pipelines.settings import Config
 
 

@@ -20,9 +20,10 @@ from typing import Literal
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.estimation.parameters import kind
-from alidade.pipelines.estimation.problem import Array, Quantity, SqrtInformation
+from alidade.pipelines.estimation.problem import Quantity, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.solvers.joint import Joined, join
 from alidade.pipelines.solvers.posterior import sqrt_information_of

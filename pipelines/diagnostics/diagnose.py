@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import UNCHANGED, Advise, verdict, weak_directions
@@ -16,7 +17,7 @@ from alidade.pipelines.estimation.error_map import UNIT
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import prior_z_score
-from alidade.pipelines.estimation.problem import SLOW_ERROR, Array, ChiSquare, Estimate, Quantity
+from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 from alidade.pipelines.settings import Config
 
 

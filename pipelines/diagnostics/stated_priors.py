@@ -15,11 +15,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.pipelines.diagnostics.change_test import by_wider_priors
 from alidade.pipelines.diagnostics.diagnose import LIMITS
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, SqrtInformation
+from alidade.pipelines.estimation.problem import Estimate, Quantity, SqrtInformation
 from alidade.pipelines.estimation.widening import widened
 from alidade.pipelines.settings import Config
 

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import CHUNK, Array, ChiSquare, Estimate, Problem, Quantity
+from alidade.pipelines.estimation.problem import CHUNK, ChiSquare, Estimate, Problem, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.parallel import LostError
 from alidade.pipelines.settings import Config

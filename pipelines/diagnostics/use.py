@@ -23,7 +23,7 @@ from typing import Protocol
 import numpy as np
 from scipy.special import gammaincinv
 
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 
 Z95 = 1.959963984540054
 # Draws that test whether the error is linear, the coverage that they may show, and draws that give bounds where not.

@@ -13,7 +13,7 @@ from html import escape
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 
 # Where the eye is: of the world behind, to the right and above; of a body's axes where all three come towards it.
 BEHIND, _BEFORE = (0.42, -0.78, 0.46), (0.72, 0.5, 0.48)

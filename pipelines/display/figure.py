@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 from alidade.pipelines.files import as_date
 
 # The first three are Paul Tol's high-contrast scheme: distinguishable for the colour-blind, and in grey. On dark ground

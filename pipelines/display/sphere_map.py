@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.display.figure import COLORS, GRID, Figure
-from alidade.pipelines.estimation.problem import Array
 
 # Directions farther than this from all there are, rad, are gaps; the second ones wide.
 _GAPS = np.deg2rad([30.0, 45.0])

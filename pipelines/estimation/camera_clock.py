@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.preintegration import GyroPath, Increments
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import fitted
 
 # A clock is guessed first from as much of a recording as takes it to go wrong by so much, s (sigma), far less than a

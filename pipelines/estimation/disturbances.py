@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.factors.array import Mask
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array, Mask
 
 # Chance that outliers which are independent of each other make an interval in one family of a recording.
 _CHANCE = 1e-3

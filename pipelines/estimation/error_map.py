@@ -16,12 +16,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.error_map import ErrorMapFactor
 from alidade.factors.model import Model
 from alidade.factors.through_gimbal import GimbalMap, ThroughGimbalFactor
 from alidade.pipelines.estimation.priors import vector_prior
 from alidade.pipelines.estimation.problem import (
-    Array,
     Estimate,
     Factor,
     Parameter,

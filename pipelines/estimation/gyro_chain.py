@@ -11,10 +11,10 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Index, Mask
+from alidade.factors.array import Array, Index, Mask
 from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, platform_errors
 from alidade.factors.preintegration import GyroPath, Increments
-from alidade.pipelines.estimation.problem import Array, ChainLayout, Factor, Parameter, Step
+from alidade.pipelines.estimation.problem import ChainLayout, Factor, Parameter, Step
 from alidade.pipelines.estimation.walking_bias import NODES, WalkingBias
 
 # Of a problem whose states are a gyro chain's attitudes.

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.parameters import ParameterSpec, check_parameters, quantities
 from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import (
-    Array,
     ChainLayout,
     Factor,
     Parameter,

@@ -19,7 +19,8 @@ from functools import partial
 
 import numpy as np
 
-from alidade.pipelines.estimation.problem import Array, Findings, Parameter, Quantity
+from alidade.factors.array import Array
+from alidade.pipelines.estimation.problem import Findings, Parameter, Quantity
 from alidade.pipelines.settings import Config, check_names
 
 # The prior of a nuisance parameter that the config sets to null is so many times the usual one.

@@ -15,11 +15,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from alidade.factors.array import Index, Mask
+from alidade.factors.array import Array, Index, Mask
 from alidade.factors.bridge import value_at
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.priors import pinned
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step, changed
+from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Quantity, Step, changed
 from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
 
 # Gives the steps before some.

@@ -9,9 +9,10 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.bridge import BoundModel
 from alidade.factors.model import ROT3, Block, Model, Residuals
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
+from alidade.pipelines.estimation.problem import Factor, Parameter, Quantity
 
 # A fixed quantity is held by a prior this much tighter than the accuracy wanted of it.
 _PINNED = 1e-6

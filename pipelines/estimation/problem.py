@@ -16,8 +16,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Array as Array
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.advice import Motion

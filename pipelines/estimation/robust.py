@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 
 # Of numeric differentiation, in units of each number.
 _STEP = 1e-6

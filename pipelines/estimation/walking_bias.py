@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from alidade.factors.array import Index
+from alidade.factors.array import Array, Index
 from alidade.pipelines.estimation.priors import linear_factor
-from alidade.pipelines.estimation.problem import Array, Factor, Step
+from alidade.pipelines.estimation.problem import Factor, Step
 
 # The bias walk over a segment moves the angle by this fraction of what gyro noise does ...
 _FRACTION = 0.2

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from alidade.pipelines.estimation.problem import Array, Estimate, SqrtInformation
+from alidade.factors.array import Array
+from alidade.pipelines.estimation.problem import Estimate, SqrtInformation
 
 
 def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.inf) -> Estimate:

@@ -24,6 +24,7 @@ from alidade.pipelines.errors import InputError
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
+    from alidade.factors.array import Array
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
     from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.display.figure import Plot
     from alidade.pipelines.display.table import Table
     from alidade.pipelines.estimation.parameters import ParameterSpec
-    from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
+    from alidade.pipelines.estimation.problem import Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.noises import NoiseSpec
     from alidade.pipelines.recording import series

@@ -21,8 +21,9 @@ from typing import Any, Literal
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Parameter
+from alidade.pipelines.estimation.problem import Parameter
 
 # A vector has shape (..., 3), a rotation is a quaternion w, x, y, z (..., 4), a matrix is constant, (3, 3).
 Kind = Literal["scalar", "vector", "matrix", "rotation"]

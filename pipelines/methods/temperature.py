@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.parameters import ParameterSpec, parameter, temperature_slope
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.streams import StreamReader, Temperature

@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gyro import symmetric
 from alidade.pipelines.estimation.parameters import SENSOR_NAMES, ParameterSpec
-from alidade.pipelines.estimation.problem import Array, CommonFactor, Quantity
+from alidade.pipelines.estimation.problem import CommonFactor, Quantity
 from alidade.pipelines.methods import Correction
 from alidade.pipelines.methods.formula import Formula
 from alidade.pipelines.recording.topics import IMU, MAG

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Applied, Coefficients, Line, Truth, Use
 from alidade.pipelines.display.figure import AXES
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.triads import gain_names
 
 G = 9.80665

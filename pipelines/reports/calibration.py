@@ -16,10 +16,10 @@ import numpy as np
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, as_date, load_yaml, read_bytes, yaml_float
 from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods.formula import Value, results

@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.display.figure import COLORS, PALETTE
-from alidade.pipelines.estimation.problem import Array, History
+from alidade.pipelines.estimation.problem import History
 from alidade.pipelines.recording.array_container import encode_series
 from alidade.pipelines.recording.messages import JOINT_STATE, definition_text
 from alidade.pipelines.recording.series import JointSeries

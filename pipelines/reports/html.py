@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.display.figure import PALETTE, Figure, Mark, Plot
 from alidade.pipelines.display.svg import interval_bar, svg
 from alidade.pipelines.display.table import Cell, Column, Table
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.reports.report import Report, plots_of
 
 if TYPE_CHECKING:

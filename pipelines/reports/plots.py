@@ -9,11 +9,12 @@ from itertools import cycle
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import interval
 from alidade.pipelines.display.figure import AXES, COLORS, PALE, REJECTED, Figure, Plot
 from alidade.pipelines.display.units import human_unit, noise_unit
 from alidade.pipelines.estimation.error_map import UNIT, FoundMap
-from alidade.pipelines.estimation.problem import Array, History, Quantity, Residuals
+from alidade.pipelines.estimation.problem import History, Quantity, Residuals
 from alidade.pipelines.reports.result import Calibration, quantities_of
 
 # Suffix of a number of one variable: an axis, an element, a harmonic.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.device_changes import Changes
 from alidade.pipelines.diagnostics.diagnose import LIMITS
@@ -35,7 +36,7 @@ from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import prior_z_score
-from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
+from alidade.pipelines.estimation.problem import Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.faults import CLIPPED

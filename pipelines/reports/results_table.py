@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.observability import DerivedNumber, Verdict, doubted, verdict
 from alidade.pipelines.display.table import Cell, Column, Interval, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.parameters import SENSOR_NAMES
-from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.triads import TRIADS, numeric_jacobian, parts_of, sensor_model
 from alidade.pipelines.reports.plots import variables
 from alidade.pipelines.reports.result import Calibration, quantities_of

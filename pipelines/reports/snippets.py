@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 from alidade.pipelines.methods.formula import (
     AXES,
     OPERATORS,

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Posterior, Truth, UseBands, use_bands
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula, results
 from alidade.pipelines.reports.result import Calibration, quantities_of
 

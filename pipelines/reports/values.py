@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple, overload
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, nearest
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula, Value, apply, results
 
 # Of a sigma, for derivatives.

@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
-    Array,
     EngineName,
     Estimate,
     Minimum,

@@ -19,10 +19,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.bridge import value_at
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level, Noise
-from alidade.pipelines.estimation.problem import Array, Factor, Step
+from alidade.pipelines.estimation.problem import Factor, Step
 from alidade.pipelines.solvers.gating import InnovationGate, RowBuffer
 from alidade.pipelines.solvers.gtsam_engine import undetermined
 from alidade.pipelines.solvers.smoother import ordering_of

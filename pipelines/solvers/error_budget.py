@@ -36,9 +36,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.estimation.problem import InfluentialMeasurement
-from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import Group, Linearization

@@ -19,10 +19,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.error_map import ErrorMap, FoundMap
-from alidade.pipelines.estimation.problem import Array, Estimate, History, PosteriorHistory, Problem, SqrtInformation
+from alidade.pipelines.estimation.problem import Estimate, History, PosteriorHistory, Problem, SqrtInformation
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio

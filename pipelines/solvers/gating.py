@@ -18,8 +18,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import gate
-from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Residuals
+from alidade.pipelines.estimation.problem import ChiSquare, Factor, Residuals
 from alidade.pipelines.solvers.error_budget import autocorrelation
 from alidade.pipelines.solvers.smoother import Smoother, linear_graph_of, ordering_of, slices
 

@@ -19,8 +19,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.bridge import jacobian_factor
-from alidade.pipelines.solvers.chain import UNDETERMINED, Array, Factorization, IndeterminateStateError, Index
+from alidade.pipelines.solvers.chain import UNDETERMINED, Factorization, IndeterminateStateError, Index
 from alidade.pipelines.solvers.layout import Layout
 
 

@@ -23,8 +23,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.problem import (
-    Array,
     Attitudes,
     ChiSquare,
     Estimate,

@@ -16,8 +16,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, Problem, SqrtInformation
+from alidade.pipelines.estimation.problem import Problem, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.solvers.batch import minimum
 from alidade.pipelines.solvers.engines import Compiled

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.model import POSE3, ROT3, Block, dimension, retract, width
 from alidade.pipelines.estimation.problem import ChainLayout
-from alidade.pipelines.solvers.chain import Array, Index
+from alidade.pipelines.solvers.chain import Index
 
 if TYPE_CHECKING:
     import gtsam

@@ -25,12 +25,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Block, Model, Residuals, dimension, select_rows, stack_models, stacking_key
 from alidade.pipelines.estimation.problem import Factor
-from alidade.pipelines.solvers.chain import PART_STATES, Array, Chain, ChainSystem, Index
+from alidade.pipelines.solvers.chain import PART_STATES, Chain, ChainSystem, Index
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem
 from alidade.pipelines.solvers.layout import Layout, NotAChainError, Values, insert_value
 

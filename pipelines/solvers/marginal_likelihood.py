@@ -27,12 +27,12 @@ from typing import Any
 
 import numpy as np
 
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.factors.chi_square import gate
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise
 from alidade.pipelines.estimation.problem import Residuals
-from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
+from alidade.pipelines.solvers.chain import UNDETERMINED, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import certain_ratio, sigma_ratio
 from alidade.pipelines.solvers.layout import Tangent, Values

@@ -18,10 +18,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization

@@ -21,9 +21,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.problem import ChiSquare, Problem, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
-from alidade.pipelines.solvers.chain import Array, Chain, ChainFactorization, Factorization
+from alidade.pipelines.solvers.chain import Chain, ChainFactorization, Factorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization, System

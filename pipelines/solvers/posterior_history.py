@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.problem import History, PosteriorHistory, Problem
-from alidade.pipelines.solvers.chain import Array, ChainFactorization
+from alidade.pipelines.solvers.chain import ChainFactorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.posterior import Reported

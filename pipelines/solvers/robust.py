@@ -21,11 +21,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.disturbances import onsets
-from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
+from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import DEFAULT, LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization, System

@@ -9,10 +9,11 @@ from typing import cast
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.bridge import value_at
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, Factor
+from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.noise_estimation import acting, level_weights
 
 # Move of a variable, in its own unit (rad, rad/s, s), above which iSAM2 linearises its factors again.

@@ -23,11 +23,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.factors.model import ROT3
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
 from alidade.pipelines.estimation.problem import APART, Factor, Parameter, StepEstimate
-from alidade.pipelines.solvers.chain import Array, IndeterminateStateError, Index
+from alidade.pipelines.solvers.chain import IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Solution

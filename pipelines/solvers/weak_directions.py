@@ -37,7 +37,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
+from alidade.factors.array import Array
+from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Point

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 import alidade
 from alidade import Config
+from alidade.factors.array import Array
 from alidade.pipelines.applications import joint as together
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.fleet.statistics import mean_nees
@@ -27,7 +28,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
-from alidade.pipelines.estimation.problem import Array, SqrtInformation
+from alidade.pipelines.estimation.problem import SqrtInformation
 from alidade.pipelines.recording.opening import group_recordings
 from alidade.pipelines.reports.joint_report import forecasts, recording_blocks
 from alidade.pipelines.reports.result import Calibration

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import alidade
+from alidade.factors.array import Array
 from alidade.pipelines.applications.joint import calibrate_together
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.device_changes import LEVEL, Changes, changes
-from alidade.pipelines.estimation.problem import Array, SqrtInformation
+from alidade.pipelines.estimation.problem import SqrtInformation
 from alidade.pipelines.reports.joint_report import forecasts
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.joint import join

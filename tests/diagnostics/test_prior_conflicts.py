@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import alidade
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.stated_priors import with_conflicts
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level, Noise
-from alidade.pipelines.estimation.problem import Array, Estimate, Quantity
+from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.reports.sentences import headline, sentence
 
 HEAD = {"duration_s": 40.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.fault_models import ExactInput
-from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Step
+from alidade.pipelines.estimation.problem import Estimate, Factor, Step
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.indexer.guidance import FAULTS

@@ -12,8 +12,8 @@ import pytest
 
 import alidade
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Applied, Line, Posterior, Truth, Use, coverage, use_bands
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import input_kind, results
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.uses import deviation_coefficients

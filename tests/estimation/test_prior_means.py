@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 import alidade
 from alidade import Config
+from alidade.factors.array import Array
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.sharing import walks
@@ -22,7 +23,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.prior_replacement import with_priors
 from alidade.pipelines.estimation.priors import vector_prior
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Quantity, Step
 from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.result import Calibration

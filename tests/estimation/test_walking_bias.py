@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.estimation.walking_bias import WalkingBias
 from alidade.pipelines.methods.head.model import problem as head_problem
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.attitude import VisionAttitudeFactor
 from alidade.factors.gyro import GyroIncrementFactor, symmetric
-from alidade.factors.model import Array
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
 from benchmarks.ahrs import ahrs_factors

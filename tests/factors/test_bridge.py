@@ -13,9 +13,10 @@ import pytest
 
 from alidade import factors
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.model import POSE3, Array, Keys, Model, Residuals
+from alidade.factors.model import POSE3, Keys, Model, Residuals
 from alidade.factors.testing import assert_jacobians
 
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, symmetric
-from alidade.factors.model import Array
 from alidade.factors.preintegration import GyroPath, Increments
 from alidade.factors.testing import assert_jacobians
 from benchmarks.ahrs import ahrs_factors

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate
 from alidade.factors.indexer import (
     AxisPath,
@@ -21,7 +22,6 @@ from alidade.factors.indexer import (
     mounting,
     mounting_angles,
 )
-from alidade.factors.model import Array
 from alidade.factors.testing import assert_jacobians
 from tests.support.numerics import assert_rows_are_independent
 

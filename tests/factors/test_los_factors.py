@@ -7,9 +7,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gimbal import GimbalPath, LocalMotion, command
 from alidade.factors.los import SIGHT_ERRORS, LosContext, LosDirectionFactor
-from alidade.factors.model import Array
 from alidade.factors.testing import assert_jacobians
 from tests.support.los_rates import LosRateFactor, rate_matrix, roll_rate
 from tests.support.numerics import assert_rows_are_independent

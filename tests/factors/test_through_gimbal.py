@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gimbal import command
 from alidade.factors.gyro import GyroIncrementFactor
 from alidade.factors.los import SIGHT_ERRORS, LosDirectionFactor
-from alidade.factors.model import Array, Block, Model, Residuals
+from alidade.factors.model import Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
 from alidade.factors.through_gimbal import GimbalErrors, GimbalMap, ThroughGimbalFactor

@@ -13,7 +13,8 @@ from gtsam.symbol_shorthand import A, X
 
 import alidade.factors
 from alidade.factors import AccelFactor, MagFactor, TriadPriorFactor, TruncatedLoss, so3
-from alidade.factors.model import Array, Model, Residuals
+from alidade.factors.array import Array
+from alidade.factors.model import Model, Residuals
 
 N = 20
 RNG = np.random.default_rng(0)

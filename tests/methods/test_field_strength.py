@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import chi2
 
 import alidade
+from alidade.factors.array import Array
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import Method, method
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.results_table import result_cards

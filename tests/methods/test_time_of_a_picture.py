@@ -13,9 +13,9 @@ import gtsam
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.factors.attitude import VisionAttitudeFactor
 from alidade.factors.los import LosDirectionFactor
-from alidade.factors.model import Array
 from alidade.pipelines.estimation.problem import Problem, Step
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply

@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.model import ROT3, Array, Model, Residuals
+from alidade.factors.array import Array
+from alidade.factors.model import ROT3, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
 from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates

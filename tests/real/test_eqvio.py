@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
-from alidade.factors.model import Array
+from alidade.factors.array import Array
 from alidade.factors.testing import assert_jacobians
 from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.solvers.batch import solve_batch

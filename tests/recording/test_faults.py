@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head import model as head
 from alidade.pipelines.methods.head.recording import read_head

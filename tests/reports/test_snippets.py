@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.snippets import c_code, python_code

@@ -9,10 +9,11 @@ import gtsam
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.factors.bridge import BoundModel
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Factor, Problem, Step
 from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.support.chain import PARAMETER, Walk, state
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.factors.array import Array
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.solvers import weak_directions
 from alidade.pipelines.solvers.batch import solve, solve_batch

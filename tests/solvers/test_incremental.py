@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.factors.array import Array
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.sensors import EulerMotion

@@ -13,9 +13,10 @@ from scipy.signal import lfilter
 
 from alidade import simulate
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.methods.noise import at_least_at_rest, estimated, white_density
 from alidade.pipelines.settings import DEFAULT_NOISE, Config

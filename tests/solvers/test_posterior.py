@@ -12,10 +12,10 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from alidade.factors.array import Mask
+from alidade.factors.array import Array, Mask
 from alidade.factors.chi_square import quantile
 from alidade.factors.model import Model, Residuals
-from alidade.pipelines.estimation.problem import Array, Factor, Problem
+from alidade.pipelines.estimation.problem import Factor, Problem
 from alidade.pipelines.solvers.chain import ChainFactorization, Factorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (

@@ -9,10 +9,11 @@ import gtsam
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.estimation.problem import Estimate, Factor, Parameter, Problem, Quantity, Step
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers import levenberg

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.prior_replacement import with_priors
-from alidade.pipelines.estimation.problem import Array, Problem
+from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers.batch import solve_batch

@@ -9,10 +9,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Block, Model, Residuals
 from alidade.pipelines.estimation.priors import vector_prior
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Quantity, Step
 
 PARAMETER = int(gtsam.symbol("p", 0))
 WALK, START, NOISE, PRIOR = 0.3, 0.5, 0.2, 2.0

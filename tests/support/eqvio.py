@@ -19,10 +19,10 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Index
+from alidade.factors.array import Array, Index
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.model import ROT3, Array, Model, Residuals
+from alidade.factors.model import ROT3, Model, Residuals
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.problem import (
     Estimate,

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, ChiSquare, Estimate, Quantity
+from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Quantity
 from alidade.pipelines.reports import sentences
 
 

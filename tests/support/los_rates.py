@@ -7,8 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.gimbal import GimbalPath
-from alidade.factors.model import Array, Model, Residuals
+from alidade.factors.model import Model, Residuals
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.factors.model import Array
+from alidade.factors.array import Array
 
 
 def assert_rows_are_independent(model_of: object, blocks: list[Array]) -> None:

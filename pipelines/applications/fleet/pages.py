@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.analysis import Population, iso
 from alidade.pipelines.applications.fleet.attention import Unit, sentence, units_of_interest
@@ -18,7 +19,6 @@ from alidade.pipelines.applications.fleet.statistics import Component
 from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot, Shape, milliseconds, thin
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import rounded, shown_unit, to_digits_of
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.report import Block, Bullets, Plots, Report, Section, Summary, Text
 

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.diagnose import misfits
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.finding import Finding, by_severity, status
-from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.solvers.incremental import IncrementalSolver
 

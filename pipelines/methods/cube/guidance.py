@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import magnetic_field
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.fault_models import ExactInput, FaultModel, ScaleFactor
 from alidade.pipelines.display.drawing import covered, resting, swaying
 from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.cube.faces import SIDES, Resting, Side
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData

@@ -21,6 +21,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.chi_square import gate
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.loss import TruncatedLoss
@@ -32,7 +33,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.prior_replacement import with_priors
 from alidade.pipelines.estimation.priors import linear_factor, rotation_about, vector_about
-from alidade.pipelines.estimation.problem import Array, Attitudes, ChainLayout, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.cube.guidance import advice
 from alidade.pipelines.methods.cube.parameters import (

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.triad import FieldPriorFactor, TriadPriorFactor, calibration, triad
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
@@ -25,7 +26,7 @@ from alidade.pipelines.estimation.parameters import (
     stated,
 )
 from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
+from alidade.pipelines.estimation.problem import Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
 from alidade.pipelines.methods.place import FIELD, known_field
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE, GYRO_SLOPE

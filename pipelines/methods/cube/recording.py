@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.noise import Noise
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.methods.place import field_at, known_field, place_topics, read_place

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.recording import REFERENCE_IMU, CubeConfig, CubeData
 from alidade.pipelines.methods.cube.static_poses import StaticPoses
 from alidade.pipelines.settings import Config

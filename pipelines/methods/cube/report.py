@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
@@ -21,7 +22,7 @@ from alidade.pipelines.display.sphere_map import described, sphere_map, widest_g
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Estimate, Findings
+from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods import Report, temperature
 from alidade.pipelines.methods.cube.model import noises
 from alidade.pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE, TILT

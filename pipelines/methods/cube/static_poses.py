@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.cube.recording import (
     CubeConfig,

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import stated
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.cube.parameters import PLACE, TAG
 from alidade.pipelines.methods.cube.recording import TAG_DETECTIONS, CubeConfig, CubeData, RefinedCamera, Sightings

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.recording import RawConversion, nominal
 from alidade.pipelines.recording.checks import too_fast
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, SI, implausible

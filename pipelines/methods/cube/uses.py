@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Truth, Use
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.parameters import CUBE, SQUARE
 from alidade.pipelines.methods.cube.recording import CubeConfig, nominal, recorded
 from alidade.pipelines.methods.uses import along, raw_of, triad_uses

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.attitude import SKEW_COLUMN
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.camera_clock import Clock, Miss, first_span, guess_clock, turns_near
 from alidade.pipelines.estimation.priors import prior_sigmas
-from alidade.pipelines.estimation.problem import Array, Parameter
+from alidade.pipelines.estimation.problem import Parameter
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.pairing import BELONGS, pair
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.attitude import FADE, OFFSET_COLUMN, SKEW_COLUMN, VisionAttitudeFactor
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
@@ -29,7 +30,7 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import DEAD_BAND, acting
 from alidade.pipelines.estimation.parameters import stated as stated_figure
 from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
-from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Attitudes, Estimate, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.formula import clock_constants
 from alidade.pipelines.methods.head.initial_values import guess, guess_picture_clock

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.noise import typical

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import AXES, COLORS, PALE, Figure, Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import DEAD_BAND, fixed_without_force
-from alidade.pipelines.estimation.problem import Array, Attitudes, Estimate, Findings
+from alidade.pipelines.estimation.problem import Attitudes, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import Correction, Report, temperature
 from alidade.pipelines.methods.formula import Formula, apply, gyro_rate, picture_time, symmetric_text, vector_text

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.uses import G, gyro_reading
 from alidade.pipelines.settings import Config
 

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Index
+from alidade.factors.array import Array, Index
 from alidade.factors.earth import EARTH_RATE
 from alidade.factors.indexer import (
     ENCODER_ERRORS,
@@ -33,7 +33,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about, vector_prior
-from alidade.pipelines.estimation.problem import Array, Attitudes, ChainLayout, Factor, Parameter, Problem, Step
+from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Parameter, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.estimation.walking_bias import NODES, WalkingBias
 from alidade.pipelines.methods import temperature

@@ -8,6 +8,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.estimation.parameters import (
     ParameterSpec,
     check_parameters,
@@ -19,7 +20,7 @@ from alidade.pipelines.estimation.parameters import (
     scalar,
     stamped,
 )
-from alidade.pipelines.estimation.problem import Array, Parameter
+from alidade.pipelines.estimation.problem import Parameter
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods.indexer.recording import JOINTS
 from alidade.pipelines.methods.temperature import GYRO_SLOPE

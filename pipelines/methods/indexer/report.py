@@ -11,13 +11,12 @@ from itertools import cycle
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Index
+from alidade.factors.array import Array, Index
 from alidade.factors.gyro import symmetric
 from alidade.factors.indexer import IndexerAverageFactor, mounting
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import AXES, COLORS, Figure, Plot
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import Correction, Report
 from alidade.pipelines.methods.formula import Formula, axis_angles, gyro_rate
 from alidade.pipelines.methods.indexer.model import carrier

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import EARTH_RATE
 from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import passive
 from alidade.pipelines.methods.uses import gyro_reading
 from alidade.pipelines.settings import Config

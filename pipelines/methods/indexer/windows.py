@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate
 from alidade.factors.indexer import AxisPath, PlatformRates, gyro_edges, gyro_means
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.indexer.recording import IndexerConfig, IndexerData
 from alidade.pipelines.settings import Config

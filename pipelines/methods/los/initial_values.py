@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gimbal import GimbalPath
 from alidade.factors.los import LosDirectionFactor
 from alidade.factors.preintegration import GyroPath, Increments
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.camera_clock import Clock, Miss, guess_clock, turns_near
 from alidade.pipelines.estimation.priors import prior_sigmas
-from alidade.pipelines.estimation.problem import Array, Parameter
+from alidade.pipelines.estimation.problem import Parameter
 from alidade.pipelines.estimation.robust import fitted
 from alidade.pipelines.methods.los.recording import LosData
 

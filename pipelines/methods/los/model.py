@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.chi_square import gate
 from alidade.factors.gimbal import WINDOWS, GimbalPath, LocalMotion
 from alidade.factors.los import LosContext, LosDirectionFactor
@@ -33,7 +34,7 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import DEAD_BAND, acting
 from alidade.pipelines.estimation.parameters import stated as stated_figure
 from alidade.pipelines.estimation.priors import rotation_about, vector_prior
-from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Estimate, Factor, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.formula import clock_constants

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.gimbal import WINDOWS, GimbalPath, command
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
@@ -18,7 +19,7 @@ from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.estimation.camera_clock import Clock
 from alidade.pipelines.estimation.parameters import DEAD_BAND, fixed_without_force
-from alidade.pipelines.estimation.problem import Array, Estimate, Findings
+from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import Correction, Report
 from alidade.pipelines.methods.formula import Formula, apply, axis_angles, gyro_rate, passive, picture_time

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
 from alidade.pipelines.display.figure import AXES
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import passive
 from alidade.pipelines.methods.los.parameters import ONCE_PER_TURN
 from alidade.pipelines.methods.uses import G, gyro_reading

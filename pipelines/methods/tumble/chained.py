@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.turned import FieldFactor, UpFactor
@@ -18,7 +19,7 @@ from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.gyro_chain import LAYOUT
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.priors import rotation_about, vector_prior
-from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Attitudes, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import STRENGTH_ADVICE
 from alidade.pipelines.methods.tumble.model import Model, Sensor

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.ellipsoid import StrengthFactor, entries
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.tumble.published import FEWEST, Ellipsoid, ellipsoid
 

@@ -17,11 +17,12 @@ from itertools import pairwise, product
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import gate
 from alidade.factors.ellipsoid import DipFactor, StrengthFactor, entries
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, ChainLayout, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.tumble.chained import FAMILIES, advice, chained
 from alidade.pipelines.methods.tumble.model import Model, Moments, Sensor, prepare

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.display.drawing import along, covered, resting
 from alidade.pipelines.display.sphere_map import described, share_near, widest_gap
 from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import TumbleData

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
 from alidade.pipelines.display.sphere_map import described
@@ -19,7 +20,6 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import ROUGHLY, Noise
 from alidade.pipelines.estimation.parameters import SENSOR_NAMES, ParameterSpec, parameter
 from alidade.pipelines.estimation.parameters import stated as sheet
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import sampled, stated
 from alidade.pipelines.methods.place import FIELD, field_at, known_strength

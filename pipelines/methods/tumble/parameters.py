@@ -10,10 +10,11 @@ from itertools import chain
 import gtsam
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.factors.ellipsoid import entries
 from alidade.pipelines.estimation.parameters import DEAD_BAND, quantities
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
+from alidade.pipelines.estimation.problem import Factor, Parameter, Quantity
 from alidade.pipelines.methods.triads import MAG_SHAPE, triad_names, with_factor
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, GAIN, OFFSET
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes

@@ -11,12 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, share_near, sphere_map, widest_gap
 from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Estimate, Findings
+from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods import Report
 from alidade.pipelines.methods.formula import Formula, gyro_rate, temperature_text, vector_text
 from alidade.pipelines.methods.temperature import FIRST

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alidade.pipelines.estimation.problem import Array
+from alidade.factors.array import Array
 
 # Readings leave the ring's plane by less than this share of their scatter along it: 6 deg.
 _FLAT = 0.1

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import EARTH_RATE, earth_rate
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.gyro_chain import GyroChain, shared_keyframes
@@ -29,7 +30,7 @@ from alidade.pipelines.estimation.parameters import (
     quantities,
     scalar,
 )
-from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
+from alidade.pipelines.estimation.problem import Parameter, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.estimation.walking_bias import FIRST
 from alidade.pipelines.methods.noise import sampled, stated, walking

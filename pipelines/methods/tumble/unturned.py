@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.factors.ellipsoid import entries, excess, sagitta
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.tumble.model import TURNED, Sensor, relative_scatter
 from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.recording.topics import IMU, MAG

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Truth, Use
-from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE
 from alidade.pipelines.methods.uses import G, gyro_reading, raw_of, triad_uses
 from alidade.pipelines.settings import Config

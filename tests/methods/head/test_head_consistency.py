@@ -13,9 +13,10 @@ from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head

@@ -10,9 +10,10 @@ from typer.testing import CliRunner
 
 import alidade
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.applications.cli import app
-from alidade.pipelines.estimation.problem import Array, Attitudes
+from alidade.pipelines.estimation.problem import Attitudes
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import _between
 from alidade.pipelines.methods.head.recording import HeadData

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.los.model import problem
 from alidade.pipelines.methods.los.parameters import NUISANCE
 from alidade.pipelines.methods.los.published import recursive_least_squares

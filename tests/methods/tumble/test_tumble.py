@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 
 import alidade
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.factors.ellipsoid import DipFactor, StrengthFactor, sagitta
 from alidade.factors.preintegration import GyroPath
@@ -25,7 +26,7 @@ from alidade.pipelines.applications.session import Session, resolve_method
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, Estimate
+from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.methods.triads import triad_names, triad_of
