@@ -40,7 +40,7 @@ _CONVERSIONS = {
     "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
     "the messages as JSON, which `flatc --json --raw-binary` makes of each with its .fbs, into another MCAP file",
 }
-# Largest share of messages without a stamp that are left out; where there are more, log times replace all stamps.
+# Largest share of messages without a stamp that are left out; where there are more, log times stand for theirs.
 MAX_UNSTAMPED_SHARE = 0.1
 # Layouts of a topic's messages (they differ in frame names, say) that are decoded at once; others one by one.
 _MAX_LAYOUTS = 8

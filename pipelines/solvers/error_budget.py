@@ -218,7 +218,7 @@ def most_influential(
 def autocorrelation(whitened: Array, shown: float = CORRELATED) -> Array:
     """Autocorrelation (K,) of residuals (n, r) at lags 1 ... K, up to where it vanishes; empty if white.
 
-    Its means over the lags 1, 2 to 3, 4 to 7 and so on: what is faint and long shows in no lag alone, and widens most.
+    Its means over the lags 1, 2 to 3, 4 to 7 and so on: what is small and long shows in no lag alone, and widens most.
     One of them is `shown` sigmas above zero.
     """
     n, r = whitened.shape

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # A direction without any information gets this many times its prior scale as sigma.
 WIDEST = 1e4
 # Combinations whose sigma would be more than this many times their prior's are left out of square-root information.
-MAX_TOLD = 1e6
+MAX_CONDITION = 1e6
 # Sigma of a prior where the config frees a number, in units of its default prior's sigma; see estimation.priors.
 FREE_PRIOR = 10.0
 # Draws whose mean squares give leverages where the system is no chain: 13 % of each, 1 % of a hundred's sum.
@@ -450,5 +450,5 @@ def fewest(R: Array, d: Array, scales: Array) -> tuple[Array, Array]:
     if not len(R):
         return R, d
     u, s, vt = np.linalg.svd(R * scales, full_matrices=False)
-    kept = s > 1.0 / MAX_TOLD
+    kept = s > 1.0 / MAX_CONDITION
     return (s[kept, None] * vt[kept]) / scales, u.T[kept] @ d

@@ -71,7 +71,7 @@ _GRAVITY_DOWN = (
     "The accelerometer shows gravity down where it has to show the force that holds it, up: all its three signs are "
     "inverted, which its K mends (about -1); the magnetometer keeps its signs."
 )
-_STRAIGHT = "The gyro counts as mounted straight to the magnetometer: turning about one axis does not tell."
+_STRAIGHT = "The gyro counts as mounted straight to the magnetometer: turning about one axis does not show it."
 _UPRIGHT = (
     "The accelerometer is left out: it felt gravity along much the same axis all the time, which leaves its numbers at "
     "their priors."

@@ -27,7 +27,7 @@ from alidade.pipelines.vision.layout.bundle import (
     with_intrinsics,
 )
 from alidade.pipelines.vision.layout.covariance import Covariance, covariance
-from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_told, joint
+from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_resolved, joint
 from alidade.pipelines.vision.layout.sights import Gathered, Shots, Sights, gathered, linearized
 from alidade.pipelines.vision.pose import TagBody, part
 
@@ -165,7 +165,7 @@ def _unusable(views: Gathered, fit: Fit) -> dict[int, str]:
                 f"in {shown[k]} pictures, but in none with placed tags that resolves the flip of all it shows; take "
                 "pictures from nearer, or that show more tags"
             )
-        elif not flip_told(fit, views.view, k):
+        elif not flip_resolved(fit, views.view, k):
             out[tag] = (
                 f"in {used[k]} pictures that fit its planar flip as well; take pictures of it with its neighbours from "
                 "nearer and from other sides"

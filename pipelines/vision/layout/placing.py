@@ -125,7 +125,7 @@ def _right_side_out(start: Bundle, sights: Sights) -> TagBody:
     return bodies[best]
 
 
-def flip_told(fit: Fit, view: Index, tag: int) -> bool:
+def flip_resolved(fit: Fit, view: Index, tag: int) -> bool:
     """Whether the pictures distinguish a tag's pose (by tag index) from every alternative that `vote` finds.
 
     Pictures in which nothing moved count once.
