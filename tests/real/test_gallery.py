@@ -20,8 +20,13 @@ def test_the_page_says_where_it_is_and_how_it_is_calibrated(recording: Recording
     assert f"| {recording.method} | {recording.source} | {recording.commands} | {recording.what} |" in README
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("recording", RECORDINGS, ids=lambda each: each.method)
+@pytest.mark.parametrize(
+    "recording",
+    [
+        pytest.param(each, id=each.method, marks=() if each.method == "tumble" else pytest.mark.slow)
+        for each in RECORDINGS
+    ],
+)
 def test_numbers_agree_with_published_ones(recording: Recording, shared_data: Path) -> None:
     path = shared_data / recording.file
     assert hashlib.sha256(path.read_bytes()).hexdigest() == recording.sha256
