@@ -31,7 +31,7 @@ NOTHING, SEVERAL = "nothing", "several"
 SIZES = (0.3, 1.0, 3.0, 6.0, 10.0)
 # Errors beyond the first are wrong, up to the second and half of what is required right.
 WRONG, RIGHT = 4.0, 3.0
-# Of a calibration, s: longer than the usual one, so that figures do not depend on the load of the machine.
+# Of a calibration, s: so long that the load of the machine seldom matters.
 LIMIT_S = 300.0
 # Ranges, even in the logarithm, of the settings that `several` draws where a simulator has them.
 RANGES = {

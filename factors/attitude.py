@@ -142,7 +142,7 @@ class VisionAttitudeFactor(Model):
         return at, np.stack([np.ones_like(elapsed), -elapsed], axis=1)
 
     def _seen(self, cRh: Array, picture: Array) -> tuple[Array, Callable[[], Array], Array]:
-        """Attitudes corrected by the angle scale, their derivatives by cRh, and (n, 3, .) by the scale."""
+        """Predicted attitudes, scaled as vision errs, their derivatives by cRh, and (n, 3, .) by the scale."""
         n = len(cRh)
         if picture.shape[1] == 1:
             return cRh, lambda: np.eye(3), np.empty((n, 3, 0))

@@ -131,8 +131,8 @@ class StrengthFactor(Model):
         """
         K, length, direction = _polar(self.raw, drifted(triads, self.drivers, drift), self.symmetric)
         gradient = np.einsum("nij,ni->nj", K, direction)
-        excess = (length - strength[:, 0]) / np.maximum((gradient**2).sum(axis=1), _LEAST)
-        return replace(self, raw=self.raw - excess[:, None] * gradient)
+        steps = (length - strength[:, 0]) / np.maximum((gradient**2).sum(axis=1), _LEAST)
+        return replace(self, raw=self.raw - steps[:, None] * gradient)
 
 
 @dataclass(frozen=True)

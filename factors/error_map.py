@@ -13,7 +13,7 @@ from alidade.factors.model import Block, Residuals, WrappedModel
 
 @dataclass(frozen=True)
 class ErrorMapFactor(WrappedModel):
-    """Measurement model plus an error linear in given functions of the place of measurement.
+    """Measurement model plus an error linear in given functions of attitude or gimbal angles.
 
     The first `axes` numbers of measurement i are larger by e_i = sum_j f_ij c_j, so that its residual is that of the
     model less sqrt_information e_i; of a rotation to first order in e_i times the noise. Blocks: those of the model,

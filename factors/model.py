@@ -105,7 +105,7 @@ class Model:
             """Return whitened residuals (n, m), and a function that gives their Jacobians (n, m, d) by each block."""
 
     def without_noise(self, *_: Any) -> Model:
-        """Return the model of the nearest measurements whose residuals are zero, if noise enters the Jacobians."""
+        """Return the model at the nearest measurements without noise, where its effect on the Jacobians matters."""
         return self
 
     def on(

@@ -178,8 +178,7 @@ class GyroPath:
         return np.asarray(rate + slope * s)
 
     def acceleration(self, at: ArrayLike) -> tuple[Array, Array]:
-        """Angular acceleration (n, 3), rad/s^2, at the times, and its derivative by time, from differences over 14 ms
-        or a longer sample interval."""
+        """Angular acceleration (n, 3), rad/s^2, and its derivative by time, from differences of rates around times."""
         at, half = np.asarray(at, dtype=float), max(_HALF, 0.5 * self.interval)
         i, s = self._place(np.concatenate([at - half, at + half]))
         rate, slope = self._line(i, _rates)

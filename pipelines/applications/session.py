@@ -223,7 +223,7 @@ class Session:
 
     @cached_property
     def facts(self) -> SessionFacts:
-        """Facts about the recording: topics, rates, gaps, losses (then its stamps are freed); of arrays the length."""
+        """Facts about the recording: topics, rates, gaps, losses; frees the stamps. Of arrays the length alone."""
         if self.recording is None:
             start, stop = self.method.faults.span(self.data)
             return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})

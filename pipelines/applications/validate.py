@@ -173,7 +173,7 @@ def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck,
     device = walks(session.method, session.config, [q.name for q in problem.quantities])
     gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:
-        with progress.doing("solving"):
+        with progress.doing("solving"), deadline.of_processor():
             estimate = solve_batch(problem, device=device)
     except IndeterminateError:
         return None

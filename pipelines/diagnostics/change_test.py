@@ -300,7 +300,7 @@ def _p_value(P: Array, whitening: Sequence[Array], ranks: Array, size: float) ->
 
 
 def _root(covariance: Array, larger: Array) -> Array:
-    """Square root R R' of a covariance without negative eigenvalues; `larger` covariance gives the scale."""
+    """R with R R' the covariance, negative eigenvalues set to zero; `larger` covariance gives the scale."""
     scale = np.sqrt(np.maximum(np.diag(larger), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))

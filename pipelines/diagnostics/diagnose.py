@@ -92,7 +92,7 @@ def diagnose(
     found += misfits(estimate.chi_square, estimate.levels)
     is_weak = any(finding.severity == WEAK for finding in directions)
     if is_weak or all(finding.severity == NOTE for finding in found):
-        named = {each.evidence["parameter"] for each in conflicts or ()}
+        named = {name for c in conflicts or () for name in (c.evidence["parameter"], *c.evidence["inseparable"])}
         contradicted = {q.sheet for q in quantities if q.name in named}
         found += _dominant_priors(quantities, estimate.covariance, is_weak, contradicted)
     if not published:
@@ -218,7 +218,7 @@ def _correlations(estimate: Estimate) -> Iterator[Finding]:
 
 
 def _error_map(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
-    """Finding of systematic errors by position; INCONSISTENT far beyond the data sheet."""
+    """Finding of errors that depend on attitude or gimbal angles; INCONSISTENT far beyond the data sheet."""
     found = estimate.error_map
     if found is None:
         return
@@ -289,7 +289,7 @@ def disturbances(estimate: Estimate) -> Iterator[Finding]:
 def _dominant_priors(
     quantities: Sequence[Quantity], covariance: Array, is_weak: bool, contradicted: Collection[str]
 ) -> Iterator[Finding]:
-    """Findings of data-sheet figures that cause most of a required parameter's variance, largest share first.
+    """Findings of data-sheet figures that cause a large share of a required parameter's variance, largest first.
 
     The share of a figure is the part of a variance that conditioning on its nuisance parameters removes:
     P_wn P_nn^-1 P_nw over P_ww; the covariance (n, n) is in the order of the quantities. A figure counts where

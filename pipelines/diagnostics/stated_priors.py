@@ -12,12 +12,14 @@ again, so that what explains a misfit is named once.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from alidade.factors.array import Array, Mask
 from alidade.pipelines.diagnostics.change_test import by_wider_priors
 from alidade.pipelines.diagnostics.diagnose import LIMITS
+from alidade.pipelines.diagnostics.observability import UNCHANGED
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Estimate, Quantity, SqrtInformation
 from alidade.pipelines.estimation.widening import widened
@@ -28,30 +30,34 @@ CONFLICT = "data sheets that the recording contradicts"
 
 
 def with_conflicts(estimate: Estimate, quantities: Sequence[Quantity], conflicts: Sequence[Finding]) -> Estimate:
-    """The estimate with what immaterial prior conflicts cost in its covariance.
+    """Widen an estimate's covariance by what prior conflicts cost that are notes.
 
-    A prior that is contradicted draws all that is correlated with it to where the truth is not. What a data sheet says
-    of one number it says of all of that figure: the priors of all of them are widened by the largest z-score, and both
-    the variance that this adds and the shift are added.
+    A prior that is contradicted draws all that is correlated with it to where the truth is not. What a data sheet
+    states of one number it states of all of that figure: the priors of all of them are widened by the largest z-score,
+    and both the variance that this adds and the shift are added. Of numbers of which the recording shows next to
+    nothing a conflict costs nothing: its z-score is one of small differences of sigmas. The square-root information for
+    joint calibrations is left: priors are no part of it.
 
     Args:
         estimate: of n numbers.
         quantities: in its order.
-        conflicts: findings of `diagnose.prior_conflicts`; where one is material, the values are not to be used.
+        conflicts: findings of `diagnose.prior_conflicts`; where one is no note, the values are not to be used.
     """
+    if any(each.severity != Severity.NOTE for each in conflicts):
+        return estimate
     z: dict[str, float] = {}
-    immaterial = all(each.severity == Severity.NOTE for each in conflicts)
-    for e in (each.evidence for each in conflicts if immaterial):
+    for e in (each.evidence for each in conflicts):
         for q in quantities:
-            if q.name in (e["parameter"], *e["inseparable"]):
+            if q.name in (e["parameter"], *e["inseparable"]) and e["sigma"] < UNCHANGED * q.scale:
                 z[q.sheet or q.name] = max(z.get(q.sheet or q.name, 1.0), abs(e["z"]))
     times = np.array([z.get(q.sheet or q.name, 1.0) if q.prior_sigma else 1.0 for q in quantities])
-    white = estimate.covariance / np.outer(estimate.inflations, estimate.inflations)
+    by = estimate.widenings
+    white = estimate.covariance / np.outer(by, by)
     wider = by_wider_priors(quantities, times, estimate.values[None], white[None])
     if wider is None:
         return estimate
-    columns = np.column_stack([estimate.inflations[:, None] * wider[1][0], wider[0][0]])
-    return widened(estimate, CONFLICT, columns)
+    columns = np.column_stack([by[:, None] * wider[1][0], wider[0][0]])
+    return replace(widened(estimate, CONFLICT, columns), sqrt_info=estimate.sqrt_info)
 
 
 def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | None:

@@ -242,7 +242,7 @@ def gyro_errors(
 
 
 def acting(errors: Parameter | None, drivers: Mapping[ParameterSpec, Array | None]) -> Array | None:
-    """Columns (N, d) of the nuisance inputs that a gyro's errors depend on; None if there are none."""
+    """Columns (N, d) of the drivers that a gyro's errors depend on; None if there are none."""
     names = {q.name for q in errors.quantities} if errors else set()
     found = [driver for each, driver in drivers.items() if driver is not None and each.names[0] in names]
     alone = len(found) == 1 and found[0].ndim == 2

@@ -113,7 +113,12 @@ class Calibration(SensorValues):
             strict=True,
         )
         # Conflicts widened the sigmas of what they are about.
-        conflicts = {f.evidence["parameter"]: f.evidence["z"] for f in self.findings if f.kind == "prior_conflict"}
+        conflicts = {
+            name: finding.evidence["z"]
+            for finding in self.findings
+            if finding.kind == "prior_conflict"
+            for name in (*finding.evidence["inseparable"], finding.evidence["parameter"])
+        }
         return {
             q.name: ParameterResult(
                 name=q.name,

@@ -200,11 +200,12 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
     1 + scale is negative for a reversed axis, which no data sheet allows for.
     """
     stated: dict[str, dict[str, float]] = {}  # sensor, or none for `priors` -> figure or parameter -> size
+    reversed_axes = []
     for e in (finding.evidence for finding in findings if finding.kind == "prior_conflict"):
         q = quantities[e["parameter"]]
-        if e["value"] < -1.0 and q.sheet.endswith(".scale"):
-            return f"{q.name} is that of a reversed axis: correct its sign."
-        if q.group == "assumption":
+        if e["value"] < -1.0 and "_scale_" in q.name:
+            reversed_axes.append(f"{q.name} is that of a reversed axis: correct its sign.")
+        elif q.group == "assumption":
             sensor, _, figure = q.sheet.partition(".")
             known = stated.setdefault(sensor, {})
             # The prior draws the value to its mean; one that is wider by the z-score is contradicted no more.
@@ -216,7 +217,8 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
     }
     priors = [f"`priors: {written.pop('')}`"] if "" in written else []
     sensors = [f"`sensors: {{{', '.join(map(': '.join, written.items()))}}}`"] if written else []
-    return f"If the device is so, state it: {' and '.join([*sensors, *priors])}." if stated else ""
+    state = [f"If the device is so, state it: {' and '.join([*sensors, *priors])}."] if stated else []
+    return " ".join([*reversed_axes, *state])
 
 
 def _weak(severity: Severity, labels: str, sigma_ratio: float, advice: str) -> str:

@@ -158,7 +158,7 @@ class ChainSystem(Chain):
 
     @property
     def squares(self) -> float:
-        """Sum of squares of the right side: twice the cost at a zero step."""
+        """Sum of squares of the right side, the cost at a zero step."""
         parts = [self.measured, self.between, self.beside, self.shared, *([] if self.walk is None else [self.walk])]
         return sum(float(np.square(rows[..., -1]).sum()) for rows in parts)
 
@@ -398,8 +398,7 @@ class ChainFactorization(Factorization):
 
     @property
     def shared_roots(self) -> Array:
-        """Columns (c + s, s) whose squares sum to the shared unknowns' part of the covariance of the last node and the
-        shared unknowns."""
+        """Factor F (c + s, s): F F' is what the shared unknowns add to the covariance of last node and shared."""
         return np.asarray(np.linalg.inv(self.root[:-1, :-1])[:, self.c :])
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
@@ -521,8 +520,10 @@ class _TimeOrder:
 
 
 def _before(R: Array, following: Array, same: Array) -> tuple[Array, Array]:
-    """Return the covariance of (x, parts of y) for rows R [x | y | .], and its cross term to y; `following` is that of
-    y and `same` selects the parts."""
+    """Return the covariance of (x, parts of y) and its cross term to y, from rows R [x | y | .].
+
+    `following` is the covariance of y, and `same` selects the parts.
+    """
     own = len(R)
     T = np.vstack([-np.linalg.solve(R[:, :own], R[:, own : own + len(following)]), same])
     cross = T @ following

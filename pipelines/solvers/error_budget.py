@@ -463,7 +463,7 @@ def added_by_shares(directions: WeakDirections, shares: Mapping[str, Array], len
 
 
 def _correlated(L: Array, correlation: Array) -> Array:
-    """Covariance (m, m) by influences L (n, r, m) of noise with autocorrelation (K,) at lags 1 ... K."""
+    """Covariance L'TL (m, m) that correlation adds, for L (n, r, m) and autocorrelation (K,) at lags 1 ... K."""
     size = 1 << (2 * len(L) - 1).bit_length()
     kernel = np.fft.rfft(
         np.concatenate([[0.0], correlation, np.zeros(size - 2 * len(correlation) - 1), correlation[::-1]])

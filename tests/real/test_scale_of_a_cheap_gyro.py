@@ -36,7 +36,7 @@ def test_the_scale_is_named_first(recording: Path, tmp_path: Path) -> None:
     found = calibrated(recording, "{}", tmp_path)
     conflicts = [finding.evidence for finding in found.findings if finding.kind == "prior_conflict"]
     assert conflicts[0]["parameter"] == "gyro_scale_x"
-    assert abs(conflicts[0]["z"]) > 6.0  # its slow errors double the sigma
+    assert abs(conflicts[0]["z"]) > 6.0  # 6.3: its slow errors double the sigma
     scale, mount = (found.parameters[name].value for name in ("gyro_scale_x", "helmet_mount_y"))
     less = calibrated(recording, f"priors: {{gyro_scale_x: {{mean: {scale - 0.01}, sigma: 1e-6}}}}", tmp_path)
     slope = (less.parameters["helmet_mount_y"].value - mount) / -0.01

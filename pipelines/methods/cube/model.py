@@ -257,14 +257,14 @@ class Model:
 
     @property
     def rest_error(self) -> float:
-        """Repeatability of a mean rate at rest, beyond white noise, rad/s per axis.
+        """Sigma of a mean rate at rest beyond white noise, rad/s per axis.
 
         That of the earth rate left out, and of an offset within the dead band, uniform and the same in all poses.
         """
         return float(np.hypot(self.unknown_rate, self.dead_band * np.sqrt(len(self.poses) / 3.0)))
 
     def turn_error(self, samples: Turning) -> float:
-        """Repeatability of a mean rate over a turn, beyond white noise, rad/s per axis.
+        """Sigma of a mean rate over a turn beyond white noise, rad/s per axis.
 
         That of the earth rate left out, and of rates within the gyro's dead band, uniform in it.
         """

@@ -205,10 +205,10 @@ def recorded(values: Array, conversion: RawConversion | None) -> Array:
 
 
 def local_field(data: CubeData, config: Config) -> Array:
-    """Magnetic field (3,), T in n, at the reference: by the model on the config's date or that of the stamps, with the
-    measured strength if given.
+    """Magnetic field (3,), T in n, at the reference, by the world magnetic model.
 
-    Raises InputError when the model does not hold there and then. `data` has latitude and longitude.
+    The date is the config's or that of the stamps, the strength `field.strength` where it is given. Raises InputError
+    when the model does not hold there and then. `data` has latitude and longitude.
     """
     assert data.latitude is not None
     assert data.longitude is not None

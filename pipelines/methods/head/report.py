@@ -351,7 +351,7 @@ def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], a
 
 
 def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:
-    """Helmet gyro corrected by its formula in calibration.yaml; errors with unmeasured causes remain."""
+    """Helmet gyro without dead band, corrected by its formula; errors with unmeasured causes remain."""
     measured: dict[str, Array | None] = {"gyro": data.head_gyro, "accel": data.head_force, "temperature": None}
     if data.temperature is not None:
         values = {temperature.FIRST: data.temperature.first, **values}

@@ -267,8 +267,10 @@ def rates(data: LosData, values: Mapping[str, float]) -> Array:
     unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
     known = {name: value for name, value in values.items() if name not in unknown}
     formula, out = Formula("rate, rad/s in m", "w_m", *gyro_rate(known, S, *DRIVERS)), np.empty_like(data.gyro)
-    left = values[DEAD_BAND.name] * dead_band(data.gyro_t, data.gyro)[1] if DEAD_BAND.name in values else 0.0
-    inputs = {"gyro": data.gyro + left, "accel": data.force, "temperature": warm}
+    gyro = data.gyro
+    if DEAD_BAND.name in values:
+        gyro = gyro + values[DEAD_BAND.name] * dead_band(data.gyro_t, gyro)[1]
+    inputs = {"gyro": gyro, "accel": data.force, "temperature": warm}
     for begin in range(0, len(out), _BLOCK):
         some = slice(begin, begin + _BLOCK)
         measured = {name: given[some] for name in formula.inputs if (given := inputs[name]) is not None}

@@ -76,9 +76,9 @@ def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variab
 
 
 def _level(sensor: Sensor, guess: FieldGuess) -> Level:
-    """Initial noise level: that of the first guess where no noise is stated, that of rests where there are some."""
+    """Initial noise level of a sensor; without stated noise, a magnetometer's is that of the gyro's first guess."""
     if sensor.name != "mag":
-        return Level(sensor.noise, 1.0 if sensor.rested else max(1.0, sensor.level))
+        return Level(sensor.noise, sensor.initial_level)
     if sensor.noise.source != "default" or sensor.noise.known == 0.0:
         return Level(sensor.noise)
     return Level(sensor.noise, max(1.0, guess.sigma / float(np.median(sensor.sigma))))

@@ -57,7 +57,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
     if model.guess is not None:
         return chained(data, config, model, found)
     model = replace(model, sensors=sensors)
-    noises = [Level(sensor.noise, 1.0 if sensor.rested else max(1.0, sensor.level)) for sensor in model.sensors]
+    noises = [Level(sensor.noise, sensor.initial_level) for sensor in model.sensors]
     if model.moments is not None:
         noises.append(Level(model.moments.noise))
     return Problem(

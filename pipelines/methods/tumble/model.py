@@ -132,6 +132,11 @@ class Sensor:
     driven: tuple[ParameterSpec, ...] = ()
 
     @property
+    def initial_level(self) -> float:
+        """Noise level to begin with: as stated for means over rests, else at least the first guess's misfit."""
+        return 1.0 if self.rested else max(1.0, self.level)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the triad's parameters."""
         return triad_names(self.name, self.symmetric)
@@ -226,8 +231,6 @@ def prepare(data: TumbleData, config: Config) -> Model:
         if data.mag is not None and _is_upright(data, rests):
             data = replace(data, accel_t=None, accel=None)
             premises.append(_UPRIGHT)
-    if data.accel is not None:
-        sensors.append(_accelerometer(data, config, rests))
     if data.mag is not None and data.mag_t is not None:
         sensors.append(_magnetometer(data, config, field, alone=data.accel is None))
         if sensors[-1].unit == "1":
@@ -235,8 +238,10 @@ def prepare(data: TumbleData, config: Config) -> Model:
                 "No position: the field's strength is unknown, and K and b are in units of it; for T state "
                 "latitude_deg and longitude_deg, or field.strength, in the config."
             )
-    premises += [note for sensor in sensors if not sensor.is_si and (note := _maybe_a_unit(sensor))]
     gyro, more = _gyro(data, sensors)
+    if data.accel is not None:
+        sensors.insert(0, _accelerometer(data, config, rests, swung=rests is None and gyro is not None))
+    premises += [note for sensor in sensors if not sensor.is_si and (note := _maybe_a_unit(sensor))]
     premises += more
     if gyro is None and more and len(sensors) > 1 and _is_upright(replace(data, gyro=None), rests):
         data, sensors = replace(data, accel_t=None, accel=None), [_magnetometer(data, config, field, alone=True)]
@@ -447,13 +452,12 @@ def _at(time: Array, stamps: Array, values: Array) -> Array:
     return np.stack([np.interp(time, stamps, axis) for axis in values.T], axis=1)
 
 
-def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sensor:
+def _accelerometer(data: TumbleData, config: Config, rests: Array | None, swung: bool) -> Sensor:
     assert data.accel is not None
     assert data.accel_t is not None
     known = data.latitude is not None
     strength = float(gravity(data.latitude, data.height)) if data.latitude is not None else _GRAVITY
     of = strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"
-    swung = rests is None and data.gyro is not None
     found = _sensor("accel", (data.accel_t, data.accel, data.accel_density), rests, config, of, swung)
     causes = {ACCEL_SQUARE: found.nominal(found.raw) ** 2}
     if data.temperature is not None:
