@@ -181,7 +181,8 @@ def measured_once(topic: str, values: Array, dropped: dict[str, int]) -> NDArray
     repeats = np.append(False, (np.diff(values, axis=0) == 0.0).all(axis=1))
     # At rest a coarse sensor repeats itself as well, one value throughout, or not each as often as the others.
     runs = np.diff(np.flatnonzero(np.append(~repeats, True)))
-    if repeats.mean() < _HELD or len(runs) < 2 or np.mean(np.abs(runs - np.median(runs)) <= 1) < 0.9:
+    regular = np.abs(runs - np.median(runs)) <= 1
+    if repeats.mean() < _HELD or len(runs) < 2 or np.average(regular, weights=runs) < 0.9:
         return everything
     count(dropped, f"{topic}{HELD}", int(repeats.sum()))
     return np.flatnonzero(~repeats)

@@ -16,7 +16,7 @@ from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.parameters import ParameterSpec, prior_z_score, quantities
+from alidade.pipelines.estimation.parameters import DEAD_BAND, ParameterSpec, prior_z_score, quantities
 from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
@@ -125,7 +125,7 @@ def test_effects_that_a_recording_determines_are_found() -> None:
     _, truth = _recording()
     estimate = _estimate()
     assert set(estimate.names) == {
-        name for spec in PARAMETERS if spec not in (GYRO_SLOPE, VISION_MAP) for name in spec.names
+        name for spec in PARAMETERS if spec not in (GYRO_SLOPE, DEAD_BAND, VISION_MAP) for name in spec.names
     }
     error = (estimate.values - [truth[name] for name in estimate.names]) / estimate.sigmas
     assert np.abs(error).max() < 4.0
