@@ -20,9 +20,9 @@ import numpy as np
 from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.parameters import prior_z_score
+from alidade.pipelines.estimation.parameters import prior_z_scores
 from alidade.pipelines.estimation.problem import Estimate, Quantity, StepEstimate
-from alidade.pipelines.estimation.widening import widened
+from alidade.pipelines.estimation.widening import by_wider_priors, widened
 
 # Probability of calling a recording changed in which nothing changed.
 LEVEL = 1e-3
@@ -208,8 +208,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
         return None
     time = posterior_history.time[late]
     values, covariance = posterior_history.values[late], posterior_history.covariance[late]
-    estimated = zip(quantities, estimate.values, estimate.sigmas, estimate.widenings, strict=True)
-    z = np.abs([prior_z_score(q, float(value), float(sigma), float(by)) or 0.0 for q, value, sigma, by in estimated])
+    z = np.abs([each or 0.0 for each in prior_z_scores(estimate, quantities)])
     # Under priors so wide that no parameter lies far beyond its own.
     if (wider := by_wider_priors(quantities, np.where(z >= _BEYOND, z, 1.0), values, covariance)) is not None:
         values, covariance = values + wider[0], covariance + wider[1] @ np.swapaxes(wider[1], 1, 2)
@@ -237,32 +236,6 @@ def _long_enough(estimate: Estimate, numbers: int) -> float:
         if together > 1.0:
             latest = max(latest, float(times[needed - 1]) if needed <= len(times) else np.inf)
     return latest
-
-
-def by_wider_priors(
-    quantities: Sequence[Quantity], times: Array, values: Array, P: Array
-) -> tuple[Array, Array] | None:
-    """Shift (k, n) and S (k, n, m) of k posteriors under wider priors, P + S S'; None where none is wider.
-
-    Widening priors changes the information by numbers on the diagonal (Woodbury 1950), of all of them at once.
-    Variances above the priors', as terms of second order may make them, count as the priors'.
-
-    Args:
-        quantities: n of them.
-        times: (n,) that priors are wider; up to 1 leaves one.
-        values, P: (k, n), (k, n, n) the posteriors.
-    """
-    wide = np.flatnonzero(times > 1.0)
-    if not len(wide):
-        return None
-    priors = np.array([(q.prior_mean, q.prior_sigma or 0.0) for q in quantities])[wide]
-    taken = np.sqrt(1.0 - times[wide] ** -2) / priors[:, 1]
-    columns = P[:, :, wide] * taken
-    left, axes = np.linalg.eigh(np.eye(len(wide)) - columns[:, wide] * taken[:, None])
-    axes = axes / np.sqrt(np.maximum(left, (times[wide] ** -2).min()))[:, None]
-    gains = columns @ axes
-    off = ((values[:, wide] - priors[:, 0]) * taken)[:, None] @ axes
-    return (gains @ np.swapaxes(off, 1, 2))[..., 0], gains
 
 
 def _whitening(P: Array, last: Array) -> Array:

@@ -16,7 +16,7 @@ from alidade.pipelines.estimation.disturbances import intervals
 from alidade.pipelines.estimation.error_map import UNIT
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameters import prior_z_score
+from alidade.pipelines.estimation.parameters import prior_z_scores
 from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 
@@ -82,7 +82,7 @@ def diagnose(
     directions = () if hypotheses else weak_directions(quantities, estimate.covariance, advise, estimate.values)
     found = [*directions, *contradictions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
-        conflicts = tuple(prior_conflicts(estimate, quantities)) if conflicts is None else conflicts
+        conflicts = prior_conflicts(estimate, quantities) if conflicts is None else conflicts
         noise = tuple(_noise(estimate))
         # In noise that is none conflicts look immaterial, and may be what it comes from.
         symptom = any(each.severity == INCONSISTENT for each in noise)
@@ -125,16 +125,16 @@ def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
     )
 
 
-def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
+def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Finding, ...]:
     """Findings on nuisance and tightly stated parameters far from their priors, material ones first, worst first.
 
     Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
     """
     P, sigma, x, sensitivities = estimate.covariance, estimate.sigmas, estimate.values, estimate.sensitivities
     nuisance = [j for j, q in enumerate(quantities) if (q.assumed or q.tight) and sigma[j] > 0.0]
-    z = {j: prior_z_score(quantities[j], x[j], sigma[j], estimate.widenings[j]) or 0.0 for j in nuisance}
+    z = [each or 0.0 for each in prior_z_scores(estimate, quantities)]
     left = sorted((j for j in nuisance if abs(z[j]) > LIMITS.prior_z), key=lambda j: -abs(z[j]))
-    immaterial = []
+    found: list[tuple[bool, Finding]] = []
     while left:
         j, worst = left[0], quantities[left[0]]
         same = [k for k in nuisance if k != j and abs(P[j, k]) > LIMITS.inseparable * sigma[j] * sigma[k]]
@@ -143,13 +143,9 @@ def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> Itera
         material = any(abs(effect.get(q.name, 0.0)) >= LIMITS.material * q.require for q in quantities if q.required)
         severe = material and sigma[j] < LIMITS.determined * worst.scale
         others = tuple(sorted(quantities[k].name for k in same))
-        conflict = _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)
-        if material:
-            yield conflict
-        else:
-            immaterial.append(conflict)
+        found.append((material, _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)))
         left = [k for k in left[1:] if k not in same]
-    yield from immaterial
+    return tuple(conflict for _, conflict in sorted(found, key=lambda each: not each[0]))
 
 
 def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:

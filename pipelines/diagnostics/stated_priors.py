@@ -17,12 +17,12 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.factors.array import Array, Mask
-from alidade.pipelines.diagnostics.change_test import by_wider_priors
 from alidade.pipelines.diagnostics.diagnose import LIMITS
 from alidade.pipelines.diagnostics.observability import UNCHANGED
 from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.parameters import prior_z_scores
 from alidade.pipelines.estimation.problem import Estimate, Quantity, SqrtInformation
-from alidade.pipelines.estimation.widening import widened
+from alidade.pipelines.estimation.widening import by_wider_priors, widened
 from alidade.pipelines.settings import Config
 
 # In an error budget.
@@ -57,7 +57,8 @@ def with_conflicts(estimate: Estimate, quantities: Sequence[Quantity], conflicts
     if wider is None:
         return estimate
     columns = np.column_stack([by[:, None] * wider[1][0], wider[0][0]])
-    return replace(widened(estimate, CONFLICT, columns), sqrt_info=estimate.sqrt_info)
+    z_scores = tuple(prior_z_scores(estimate, quantities))
+    return replace(widened(estimate, CONFLICT, columns), sqrt_info=estimate.sqrt_info, prior_z=z_scores)
 
 
 def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | None:

@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 
 from alidade.factors.array import Array
-from alidade.pipelines.estimation.problem import Findings, Parameter, Quantity
+from alidade.pipelines.estimation.problem import Estimate, Findings, Parameter, Quantity
 from alidade.pipelines.settings import Config, check_names
 
 # The prior of a nuisance parameter that the config sets to null is so many times the usual one.
@@ -287,6 +287,17 @@ def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: flo
         return None
     elsewhere = sigma**2 - (white**2 / prior) ** 2
     return (value - quantity.prior_mean) / math.sqrt((prior - white**2 / prior) ** 2 + elsewhere)
+
+
+def prior_z_scores(estimate: Estimate, quantities: Sequence[Quantity]) -> list[float | None]:
+    """Shift of each number of an estimate from its prior, see `prior_z_score`; quantities in the estimate's order.
+
+    Of an estimate that prior conflicts have widened it is that before.
+    """
+    if estimate.prior_z is not None:
+        return list(estimate.prior_z)
+    numbers = (each.tolist() for each in (estimate.values, estimate.sigmas, estimate.widenings))
+    return [prior_z_score(*each) for each in zip(quantities, *numbers, strict=True)]
 
 
 def stated(config: Config, spec: ParameterSpec) -> float:

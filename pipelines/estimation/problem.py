@@ -612,6 +612,7 @@ class Estimate:
         sqrt_info: information without the device's priors; None: not asked for.
         error_map: errors by where measurements are made that were found, and are in it; None: none, or not looked for.
         second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
+        prior_z: see `prior_z_scores`, where prior conflicts have widened the covariance; None: as it is.
         concluded: whether an incremental solver's run ended with the solution of all rows together.
         seconds: phase -> wall time.
     """
@@ -641,6 +642,7 @@ class Estimate:
     sqrt_info: SqrtInformation | None = None
     error_map: FoundMap | None = None
     second: Minimum | None = None
+    prior_z: tuple[float | None, ...] | None = None
     concluded: bool = False
     seconds: Mapping[str, float] = field(default_factory=dict)
 

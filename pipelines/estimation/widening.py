@@ -1,4 +1,4 @@
-"""Estimates with an error in their covariance that their solution does not have."""
+"""Estimates with an error in their covariance that their solution does not have, and under wider priors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.factors.array import Array
-from alidade.pipelines.estimation.problem import Estimate, SqrtInformation
+from alidade.pipelines.estimation.problem import Estimate, Quantity, SqrtInformation
 
 
 def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.inf) -> Estimate:
@@ -36,6 +36,32 @@ def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.
     if sqrt_info is not None:
         sqrt_info = marginalised(sqrt_info, estimate.names, columns / estimate.inflations[:, None])
     return replace(estimate, covariance=covariance, history=history, budget=budget, sqrt_info=sqrt_info)
+
+
+def by_wider_priors(
+    quantities: Sequence[Quantity], times: Array, values: Array, P: Array
+) -> tuple[Array, Array] | None:
+    """Shift (k, n) and S (k, n, m) of k posteriors under wider priors, P + S S'; None where none is wider.
+
+    Widening priors changes the information by numbers on the diagonal (Woodbury 1950), of all of them at once.
+    Variances above the priors', as terms of second order may make them, count as the priors'.
+
+    Args:
+        quantities: n of them.
+        times: (n,) that priors are wider; up to 1 leaves one.
+        values, P: (k, n), (k, n, n) the posteriors.
+    """
+    wide = np.flatnonzero(times > 1.0)
+    if not len(wide):
+        return None
+    priors = np.array([(q.prior_mean, q.prior_sigma or 0.0) for q in quantities])[wide]
+    taken = np.sqrt(1.0 - times[wide] ** -2) / priors[:, 1]
+    columns = P[:, :, wide] * taken
+    left, axes = np.linalg.eigh(np.eye(len(wide)) - columns[:, wide] * taken[:, None])
+    axes = axes / np.sqrt(np.maximum(left, (times[wide] ** -2).min()))[:, None]
+    gains = columns @ axes
+    off = ((values[:, wide] - priors[:, 0]) * taken)[:, None] @ axes
+    return (gains @ np.swapaxes(off, 1, 2))[..., 0], gains
 
 
 def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[str, float]:

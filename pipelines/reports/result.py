@@ -35,7 +35,7 @@ from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameters import prior_z_score
+from alidade.pipelines.estimation.parameters import prior_z_scores
 from alidade.pipelines.estimation.problem import Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.gaussian_prior import GaussianPrior
@@ -104,21 +104,15 @@ class Calibration(SensorValues):
     def parameters(self) -> dict[str, ParameterResult]:
         """Parameters by name, as result.json lists them."""
         given = self.verdicts
+        quantities = quantities_of(self.problem, self.estimate)
         rows = zip(
-            quantities_of(self.problem, self.estimate),
+            quantities,
             self.estimate.values,
             self.estimate.sigmas,
             self.estimate.inflations,
-            self.estimate.widenings,
+            prior_z_scores(self.estimate, quantities),
             strict=True,
         )
-        # Conflicts widened the sigmas of what they are about.
-        conflicts = {
-            name: finding.evidence["z"]
-            for finding in self.findings
-            if finding.kind == "prior_conflict"
-            for name in (*finding.evidence["inseparable"], finding.evidence["parameter"])
-        }
         return {
             q.name: ParameterResult(
                 name=q.name,
@@ -130,12 +124,10 @@ class Calibration(SensorValues):
                 require=q.require if q.judged else None,
                 observability=given.get(q.name),
                 group=q.group,
-                pull=None
-                if q.group is None
-                else conflicts.get(q.name, prior_z_score(q, float(value), float(sigma), float(widening))),
+                pull=None if q.group is None else z,
                 inflation=float(inflation),
             )
-            for q, value, sigma, inflation, widening in rows
+            for q, value, sigma, inflation, z in rows
         }
 
     @property

@@ -11,18 +11,12 @@ import alidade
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.applications.follow.guidance import View, Watch
-from alidade.pipelines.diagnostics.change_test import (
-    CHANGE,
-    Stability,
-    by_wider_priors,
-    change_finding,
-    stability,
-    with_change,
-)
+from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import Estimate, History, PosteriorHistory, Quantity, SqrtInformation
+from alidade.pipelines.estimation.widening import by_wider_priors
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
