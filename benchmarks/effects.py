@@ -100,15 +100,19 @@ class Found:
 
 def effects(method: str, scenario: str | None, drawn: Mapping[str, Any] | None = None) -> dict[str, dict[str, float]]:
     """Effect -> the parameters it consists of, with their priors; `drawn` are settings on top of the scenario's."""
-    chosen = methods.method(method)
-    settings = chosen.settings(scenario)
-    settings = type(settings).model_validate(settings.model_dump() | (drawn or {}))
-    session = Session.of(chosen, chosen.simulate(settings, 0))
+    session = _simulated(method, scenario, drawn or {}, 0)
     found: dict[str, dict[str, float]] = {NOTHING: {}}
     for q in session.problem().quantities:
         if q.group == "assumption" and q.prior_sigma:
             found.setdefault(kind(q.name), {})[q.name] = q.prior_sigma
     return found
+
+
+def _simulated(method: str, scenario: str | None, drawn: Mapping[str, Any], seed: int) -> Session:
+    """Session of a recording simulated by a scenario with some settings drawn."""
+    chosen = methods.method(method)
+    settings = chosen.settings(scenario)
+    return Session.of(chosen, chosen.simulate(type(settings).model_validate(settings.model_dump() | drawn), seed))
 
 
 def several(case: Case) -> tuple[dict[str, Any], dict[str, float]]:
@@ -165,25 +169,23 @@ def _mounted(rng: np.random.Generator, sigma: float | None, value: Any) -> Any:
 
 def run(case: Case, numbers: Mapping[str, float]) -> Found:
     """Simulate and solve one recording."""
-    chosen = methods.method(case.method)
-    settings = chosen.settings(case.scenario)
     if case.effect == SEVERAL:
         drawn, numbers = several(case)
     else:
         signs = np.random.default_rng([case.seed, 2]).choice([-1.0, 1.0], len(numbers))
         drawn = {"effects": {n: float(s * case.size * p) for s, (n, p) in zip(signs, numbers.items(), strict=True)}}
-    settings = type(settings).model_validate(settings.model_dump() | drawn)
     try:
         with deadline.within(LIMIT_S):
-            calibration = Session.of(chosen, chosen.simulate(settings, case.seed)).calibrate(case.solver)
+            calibration = _simulated(case.method, case.scenario, drawn, case.seed).calibrate(case.solver)
     except InputError as error:
         return Found(case, "refused", 0.0, 0.0, False, False, False, str(error))
     truth = calibration.truth or {}
     parameters = calibration.parameters
     off = [
-        ((p.value - float(str(truth[name]))) / p.sigma, (p.value - float(str(truth[name]))) / p.require)
+        (error / p.sigma, error / p.require)
         for name, p in parameters.items()
         if p.group is None and p.require and name in truth and p.sigma > 0.0
+        for error in [p.value - float(str(truth[name]))]
     ]
     told = [parameters[name].sigma < 0.5 * prior for name, prior in numbers.items() if name in parameters]
     headline = calibration.headline

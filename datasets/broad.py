@@ -121,7 +121,7 @@ def to_session(trial: Trial, seed: int, sigma: float = VISION_SIGMA) -> HeadData
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of a calibration of a trial's session against the withheld reference.
+    """Errors of a calibration of a trial's session against the reference that it did not use.
 
     Attributes:
         attitude_rms: rad, of the fused attitude against the undisturbed motion capture.

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -37,9 +37,9 @@ _deadline: ContextVar[_Deadline | None] = ContextVar("deadline", default=None)
 
 
 @contextmanager
-def _set(deadline: _Deadline | None) -> Iterator[None]:
-    """Context manager that sets a deadline; None keeps the one that is set, if any."""
-    token = _deadline.set(deadline or _deadline.get())
+def _set(deadline: _Deadline) -> Iterator[None]:
+    """Context manager that sets a deadline."""
+    token = _deadline.set(deadline)
     try:
         yield
     finally:
@@ -48,13 +48,13 @@ def _set(deadline: _Deadline | None) -> Iterator[None]:
 
 def within(limit: float | None) -> AbstractContextManager[None]:
     """Context manager that sets a deadline in `limit` s; None keeps the deadline that is set, if any."""
-    return _set(None if limit is None else _Deadline(limit, time.monotonic() + limit, time.monotonic))
+    return nullcontext() if limit is None else _set(_Deadline(limit, time.monotonic() + limit, time.monotonic))
 
 
 def usual(duration: float, online: bool = False) -> AbstractContextManager[None]:
     """Context manager that sets the usual deadline for a recording of so many seconds, unless one is set."""
     if _deadline.get() is not None:
-        return _set(None)
+        return nullcontext()
     limit = max(LEAST_S, duration if online else SHARE * duration)
     return _set(_Deadline(limit, time.monotonic() + limit, time.monotonic, usual=True))
 
@@ -66,7 +66,7 @@ def of_processor() -> AbstractContextManager[None]:
     """
     deadline = _deadline.get()
     if deadline is None or not deadline.usual:
-        return _set(None)
+        return nullcontext()
     return _set(replace(deadline, until=time.thread_time() + deadline.limit, clock=time.thread_time))
 
 

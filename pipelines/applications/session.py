@@ -223,7 +223,7 @@ class Session:
 
     @cached_property
     def facts(self) -> SessionFacts:
-        """Facts about the recording: topics, rates, gaps, losses; frees the stamps. Of arrays the length alone."""
+        """Facts about the recording: topics, rates, gaps, losses; of arrays the length. The stamps are freed then."""
         if self.recording is None:
             start, stop = self.method.faults.span(self.data)
             return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
@@ -316,7 +316,7 @@ class Session:
             elif report and estimate.solver == "incremental" and published is None:
                 published = self._published()
             stable, change = self._change(estimate, quantities)
-            conflicts = tuple(prior_conflicts(estimate, quantities))
+            conflicts = prior_conflicts(estimate, quantities)
             if estimate.converged and estimate.solver != "published":
                 estimate = with_conflicts(estimate, quantities, conflicts)
             if change is not None and change.kind == "change" and change.severity == Severity.NOTE:

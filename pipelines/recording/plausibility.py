@@ -222,9 +222,11 @@ def hidden(t: Array, half_width: float, side: Array) -> Array | None:
         t: (N,) s.
         half_width, side: as `dead_band` has them.
     """
+    if not half_width:
+        return None
     within = (side == 0.0).any(axis=1)
     lasting = float(within.mean() * (t[-1] - t[0]))
-    return np.where(within, half_width * np.sqrt(lasting / 3.0), 0.0) if half_width else None
+    return np.where(within, half_width * np.sqrt(lasting / 3.0), 0.0)
 
 
 def _one_value(values: Array) -> float | None:
