@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
+from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar, Self, cast
 
@@ -42,6 +43,8 @@ ROT3, POSE3 = LieGroup.ROT3, LieGroup.POSE3
 Block = LieGroup | int
 # Measurements on which a model is tried.
 _CHECKED = 100
+# Measurements evaluated together: the rows of 16,384 leave the processor's cache, which costs a quarter of the time.
+TOGETHER = 4096
 # Fields of sigmas, which may be infinite where nothing is known.
 _SIGMAS = ("sigma",)
 # Of a block: one variable that all measurements share, or one for each of them.
@@ -86,6 +89,11 @@ class Model:
             _make_sound(self)
         except ValueError as error:
             raise ValueError(f"{type(self).__name__}: {error}") from error
+
+    @cached_property
+    def parts(self) -> list[Self]:
+        """Divide the measurements of a model that has `stacked` into parts, which keep what no variable moves."""
+        return [select_rows(self, slice(k, k + TOGETHER)) for k in range(0, len(self.time), TOGETHER)]
 
     if TYPE_CHECKING:
 
@@ -282,12 +290,12 @@ def stack_models(parts: Sequence[Any]) -> Any:
     return replace(first, **{name: stack_models([getattr(part, name) for part in parts]) for name in first.stacked})
 
 
-def select_rows(whole: Any, rows: Index) -> Any:
+def select_rows(whole: Any, rows: Index | slice) -> Any:
     """Select rows of a model's measurements, of an array, or of a list."""
     if whole is None or isinstance(whole, np.ndarray):
         return whole if whole is None else whole[rows]
     if isinstance(whole, list):
-        return [whole[row] for row in rows]
+        return whole[rows] if isinstance(rows, slice) else [whole[row] for row in rows]
     return replace(whole, **{name: select_rows(getattr(whole, name), rows) for name in whole.stacked})
 
 

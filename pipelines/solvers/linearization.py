@@ -28,7 +28,7 @@ import numpy as np
 from alidade.factors.array import Array, Mask
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.model import Block, Model, Residuals, dimension, select_rows, stack_models, stacking_key
+from alidade.factors.model import TOGETHER, Block, Model, Residuals, dimension, select_rows, stack_models, stacking_key
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import PART_STATES, Chain, ChainSystem, Index
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem
@@ -185,16 +185,16 @@ class Group:
         return self.of(some) if len(some) else None
 
     def divided(self) -> Iterator[Group]:
-        """Yield the group in parts of bounded size, to bound memory."""
+        """Yield the group in parts whose rows fit a processor's cache."""
         n = len(self.place)
-        if n <= PART_STATES or not self.is_divisible:
+        if n <= TOGETHER or not self.is_divisible:
             yield self
             return
-        for begin in range(0, n, PART_STATES):
-            yield self.of(np.arange(begin, min(begin + PART_STATES, n)))
+        for number, part in enumerate(self.model.parts):
+            yield self.of(np.arange(number * TOGETHER, min((number + 1) * TOGETHER, n)), part)
 
-    def of(self, some: Index) -> Group:
-        """Select some of the group's measurements."""
+    def of(self, some: Index, model: Model | None = None) -> Group:
+        """Select some of the group's measurements, whose model may be known."""
         if len(some) == len(self.place):
             return self
 
@@ -203,7 +203,7 @@ class Group:
 
         return replace(
             self,
-            model=select_rows(self.model, some),
+            model=model or select_rows(self.model, some),
             weights=None if self.weights is None else self.weights[some],
             factors=self.factors[some],
             beside=None if self.beside is None else self.beside[some],
@@ -316,7 +316,7 @@ class Linearization:
                 yield part
 
     def divided(self) -> Iterator[Group]:
-        """Yield all groups in parts of bounded size, to bound memory."""
+        """Yield all groups in parts whose rows fit a processor's cache."""
         for group in self.groups:
             yield from group.divided()
 
@@ -424,9 +424,10 @@ class LinearizedChain(Chain):
         measured, between = np.zeros((n, m, d + w)), np.zeros((n, b, 2 * d + w))
         for group in self.linearization.within(begin, end):
             out = measured if group.target == "state" else between
-            rows, square = group.rows(self.values, out.shape[2])
-            out[(group.place - begin)[:, None], group.row[:, None] + np.arange(rows.shape[1])] = rows
-            cost += square
+            for some in group.divided():
+                rows, square = some.rows(self.values, out.shape[2])
+                out[(some.place - begin)[:, None], some.row[:, None] + np.arange(rows.shape[1])] = rows
+                cost += square
         # Unit rows for the numbers of states that no variable has.
         absent = ~self.linearization.layout.kept[0][begin:end]
         keyframe, number = np.nonzero(absent)

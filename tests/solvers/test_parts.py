@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import alidade
+from alidade.factors import model
 from alidade.pipelines.solvers import chain, linearization
 
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -27,6 +28,8 @@ def test_parts_give_what_the_whole_gives(name: str, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(linearization, "KEPT_BYTES", 0)
     for module in (chain, linearization):
         monkeypatch.setattr(module, "PART_STATES", 100)
+    for module in (model, linearization):
+        monkeypatch.setattr(module, "TOGETHER", 30)
     parts = alidade.open(simulated).calibrate()
     sigmas = whole.estimate.sigmas
     assert (np.abs(parts.estimate.values - whole.estimate.values) <= 1e-5 * sigmas).all()
