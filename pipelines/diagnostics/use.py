@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from alidade.factors.array import Array
 
@@ -323,6 +322,9 @@ def _components(error: Array, signed: bool) -> Array:
 
 def _length_bound(mean: Array, S: Array) -> Array:
     """95 % quantile of the length of N(mean (U, d), S (U, d, d))."""
+    # Importing it takes longer than most commands that need no quantile.
+    from scipy.special import gammaincinv
+
     first = np.trace(S, axis1=-2, axis2=-1) + (mean**2).sum(-1)
     second = 2.0 * np.einsum("uij,uji->u", S, S) + 4.0 * np.einsum("ui,uij,uj->u", mean, S, mean)
     nu = np.clip(2.0 * first**2 / np.maximum(second, 1e-300), 1.0, 1e6)

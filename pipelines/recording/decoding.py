@@ -40,8 +40,9 @@ _CONVERSIONS = {
     "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
     "the messages as JSON, which `flatc --json --raw-binary` makes of each with its .fbs, into another MCAP file",
 }
-# Largest share of messages without a stamp that are left out; where there are more, log times stand for theirs.
-MAX_UNSTAMPED_SHARE = 0.1
+# Largest share of messages without a stamp that are left out; where there are more, all messages of the topic get their
+# log times: stamps of two clocks make no series.
+MAX_UNSTAMPED_SHARE = 0.5
 # Layouts of a topic's messages (they differ in frame names, say) that are decoded at once; others one by one.
 _MAX_LAYOUTS = 8
 # Largest message of numbers, bytes; usual ones have some hundred.
@@ -156,14 +157,14 @@ class ColumnTable:
         return int(np.count_nonzero(few))
 
     def times(self, filled: bool = True) -> Times:
-        """Return stamps (log times where missing) and log times of the filled rows, or of all rows added, Unix ns."""
+        """Return stamps (log times where most are missing) and log times of the filled rows, or of all, Unix ns."""
         rows: Any = self.filled if filled and not self.filled.all() else slice(self.count)
         return with_log_times(self._t_ns[rows], self._log_ns[rows])
 
     def sorted(self) -> tuple[Stamps, int, dict[str, Any]]:
-        """Return the stamps, the number of them that are log times, and the columns of the filled rows, by log time."""
-        from_log = is_unstamped(self._t_ns, self._log_ns) & self.filled
-        t_ns = np.where(from_log, self._log_ns, self._t_ns)
+        """Return the stamps, how many are missing (then all are log times), and the columns of the filled rows."""
+        absent = is_unstamped(self._t_ns, self._log_ns) & self.filled
+        t_ns = self._log_ns if absent.any() else self._t_ns
         rows: Any = slice(None)
         if not self.filled.all() or (np.diff(self._log_ns) < 0).any():
             rows = np.argsort(self._log_ns, kind="stable")
@@ -176,7 +177,7 @@ class ColumnTable:
             for name, constant in self._constant.items()
         }
         shaped = {name: column.reshape(len(t_ns), *self._shapes[name]) for name, column in columns.items()}
-        return t_ns, int(np.count_nonzero(from_log)), shaped
+        return t_ns, int(np.count_nonzero(absent)), shaped
 
     def _fill_column(self, name: str, rows: slice | NDArray[np.int64], values: NDArray[Any]) -> None:
         width = int(np.prod(self._shapes[name], dtype=int))
@@ -344,10 +345,10 @@ def few_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
-    """Return stamps and log times; few messages without a stamp are left out, many get their log times as stamps."""
+    """Return stamps and log times; few messages without a stamp are left out, with many all get their log times."""
     kept: Any = ~few if (few := few_unstamped(stamps, log_ns)).any() else slice(None)
     stamps, log_ns = stamps[kept], log_ns[kept]
-    return (stamps if stamps.all() else np.where(stamps == 0, log_ns, stamps)), log_ns
+    return (log_ns if is_unstamped(stamps, log_ns).any() else stamps), log_ns
 
 
 def header_stamps(has_header: bool, block: MessageBlock, wire: Wire) -> Stamps:

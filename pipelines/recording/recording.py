@@ -520,7 +520,7 @@ class Recording:
         return kind(t_ns, stamped_by_log=from_log, frame_id=next(iter(table.frames()), ""), **columns)
 
     def _sorted(self, topic: str, table: ColumnTable) -> tuple[NDArray[np.int64], int, dict[str, Array]]:
-        """Return stamps, how many of them are log times, and columns, by log time; InputError if the clock was set."""
+        """Return stamps, how many are missing, and columns, by log time; InputError if the clock was set."""
         if self.recorded[topic].type in SENSOR_STAMPED_TYPES:
             check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, from_log, columns = table.sorted()
@@ -574,7 +574,7 @@ class Recording:
         jitter = jitter_ns(np.diff(t_ns))
         self.stamp_sigma_s = max(self.stamp_sigma_s, float(np.hypot(UNKNOWN_LOG_DELAY_S, jitter * 1e-9)))
         self.remark(
-            f"topic {topic}: {from_log} of {len(t_ns)} messages have no stamp; the log times replace them, which are "
+            f"topic {topic}: {from_log} of {len(t_ns)} messages have no stamp; all get their log times, which are "
             f"late by an unknown delay (assumed {1e3 * UNKNOWN_LOG_DELAY_S:.0f} ms, one sigma) and jitter "
             f"by {jitter * 1e-6:.2g} ms (sigma)"
         )

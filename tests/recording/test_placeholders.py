@@ -178,6 +178,19 @@ def test_a_message_sent_before_there_was_a_clock_is_left_out(tmp_path: Path) -> 
     assert "topic /imu: 1 messages without a stamp, among others that have one, are left out" in recording.notes
 
 
+@pytest.mark.parametrize(("stamped_each", "kept", "by_log"), [(2, 25, 0), (3, 50, 33)])
+def test_a_topic_has_one_clock(stamped_each: int, kept: int, by_log: int, tmp_path: Path) -> None:
+    """Every second or third message has a stamp, of the device's clock; most messages decide for that or the log's."""
+    log = 1_790_000_000_000_000_000
+    messages = [
+        (log + 10_000_000 * i, _imu_message(10_000_000 * (i + 100) * (i % stamped_each == 0), "imu", float(i)))
+        for i in range(50)
+    ]
+    imu = open_recording(forms.ros2_recording(tmp_path / "mixed.mcap", {"/imu": messages})).imu("/imu")
+    assert (len(imu), imu.stamped_by_log) == (kept, by_log)
+    assert np.ptp(np.diff(imu.t_ns)) == 0
+
+
 def test_a_gyro_alone_in_a_series_says_so() -> None:
     imu = series.ImuSeries(T_NS, RATES, np.full(3, np.nan))
     assert is_there("gyro", imu.gyro, imu.gyro_cov)

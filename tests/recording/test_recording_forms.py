@@ -869,7 +869,7 @@ def test_messages_without_a_stamp_are_told_with_the_jitter_of_what_stands_in(tmp
     assert recording.vector("/v").stamped_by_log == 400
     recording.vector("/v")
     (note,) = recording.notes
-    assert note.startswith("topic /v: 400 of 400 messages have no stamp; the log times replace them")
+    assert note.startswith("topic /v: 400 of 400 messages have no stamp; all get their log times")
     assert 0.3 < float(note.split("jitter by ")[1].split(" ms")[0]) < 0.5
     assert recording.stamp_sigma_s == pytest.approx(np.hypot(0.01, 4e-4), rel=0.01)
 
@@ -967,7 +967,7 @@ def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_delay(
     assert abs(simulated.truth.get(delay, 0.0) - offset.value) == pytest.approx(8e-3, abs=2e-3)
     assert 0.01 < offset.sigma < 0.012
     assert found.status in ("calibrated", "weak"), found.headline
-    assert any("no stamp; the log times replace them" in note for note in found.notes)
+    assert any("no stamp; all get their log times" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(
