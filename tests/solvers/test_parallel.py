@@ -1,4 +1,4 @@
-"""Things that several processes keep: what they answer, and when they end."""
+"""Tasks that several processes do: what comes of them, and when the processes end."""
 
 from __future__ import annotations
 
@@ -8,51 +8,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
+from functools import partial
 
 import pytest
 from rich.console import Console
 
 from alidade.pipelines import parallel, progress
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.parallel import LostError, WorkerPool
+from alidade.pipelines.parallel import LostError
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere there is one process, as here without --jobs"
 )
-
-
-@dataclass
-class Counter:
-    """Counts what it is given."""
-
-    own: int
-    given: list[int] = field(default_factory=list)
-
-    def add(self, number: int) -> int:
-        if number < 0:
-            raise ValueError(f"{number} of {self.own}")
-        self.given.append(number)
-        return self.own + sum(self.given)
-
-    def process(self) -> int:
-        return os.getpid()
-
-    def end(self) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
-
-    def speak(self) -> str:
-        return type(sys.stderr).__name__
-
-    def fail(self) -> None:
-        raise TwoWordsError("two", "words")
-
-    def local(self) -> object:
-        return lambda: self.own
-
-    def sleep(self) -> None:
-        time.sleep(60.0)
 
 
 class TwoWordsError(Exception):
@@ -68,71 +35,78 @@ def three() -> Iterator[None]:
         yield
 
 
-def pool(count: int = 7) -> WorkerPool[Counter]:
-    return WorkerPool([Counter(i) for i in range(count)], most=10)
+def _root(number: int) -> tuple[float, int]:
+    if number < 0:
+        raise ValueError(f"{number} has none")
+    return number**0.5, os.getpid()
 
 
-def ask(of: WorkerPool[Counter], *numbers: int) -> list[int]:
-    return of.ask(Counter.add, [(number,) for number in numbers], "adding")
+def _end() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
-def processes(of: WorkerPool[Counter]) -> list[int]:
-    return of.ask(Counter.process, [()] * 7, "asking")
+def _fail() -> None:
+    raise TwoWordsError("two", "words")
+
+
+def _local() -> object:
+    return lambda: None
+
+
+def _speak() -> str:
+    return type(sys.stderr).__name__
 
 
 @pytest.mark.usefixtures("three")
-def test_things_are_kept_where_they_are() -> None:
-    """In turns, by three processes that are not this one, and asked again they know what they were given."""
-    of = pool()
-    assert ask(of, *range(7)) == [0, 2, 4, 6, 8, 10, 12]
-    assert ask(of, *[1] * 7) == [1, 3, 5, 7, 9, 11, 13]
-    where = processes(of)
+def test_results_are_in_order_and_tasks_go_round() -> None:
+    """By three processes that are not this one."""
+    found = parallel.done([partial(_root, number**2) for number in range(7)], "roots", 10)
+    assert [root for root, _ in found] == list(range(7))
+    where = [process for _, process in found]
     assert len({*where, os.getpid()}) == 4
     assert where == where[:3] * 2 + where[:1]
+    assert _gone(set(where))
 
 
 @pytest.mark.parametrize(("jobs", "most"), [(1, 10), (5, 1), (5, 0)])
 def test_one_process_does_it_itself(jobs: int, most: int) -> None:
     with parallel.processes(jobs):
-        of = WorkerPool([Counter(1), Counter(2)], most)
-    assert of.ask(Counter.process, [()] * 2, "asking") == [os.getpid()] * 2
+        assert parallel.done([os.getpid] * 2, "asking", most) == [os.getpid()] * 2
 
 
 @pytest.mark.usefixtures("three")
-def test_what_one_raises_is_raised_and_the_others_go_on() -> None:
-    of = pool()
-    with pytest.raises(ValueError, match="-1 of 3"):
-        ask(of, 0, 0, 0, -1, 0, -2, 0)
-    assert ask(of, *[0] * 7) == list(range(7))
+def test_the_first_that_is_raised_is_raised() -> None:
+    with pytest.raises(ValueError, match="-1 has none"):
+        parallel.done([partial(_root, number) for number in (0, 0, 0, -1, 0, -2, 0)], "roots", 10)
 
 
 @pytest.mark.usefixtures("three")
-def test_processes_end_with_their_crew() -> None:
-    of, other = pool(), pool()
-    here, there = set(processes(of)), set(processes(other))
-    assert not here & there
-    del of
-    assert _gone(here)
-    assert processes(other)
-
-
-@pytest.mark.usefixtures("three")
-def test_a_process_that_is_ended_is_told() -> None:
-    """And what others had answered by then is no answer to the next question."""
-    of = pool()
+def test_a_process_that_is_ended_is_named() -> None:
     with pytest.raises(InputError, match=r"ended from outside.*--jobs 1"):
-        of.ask(Counter.end, [()] * 7, "ending")
-    with pytest.raises(LostError):
-        ask(of, *[0] * 7)
+        parallel.done([_end, os.getpid, os.getpid], "ending", 10)
 
 
 @pytest.mark.usefixtures("three")
-@pytest.mark.parametrize(("question", "told"), [(Counter.fail, "two words"), (Counter.local, "pickle")])
-def test_what_cannot_be_sent_is_told(question: Callable[[Counter], object], told: str) -> None:
-    of = pool()
-    with pytest.raises(RuntimeError, match=told):
-        of.ask(question, [()] * 7, "asking")
-    assert ask(of, *[0] * 7) == list(range(7))
+@pytest.mark.parametrize(("task", "message"), [(_fail, "two words"), (_local, "pickle")])
+def test_what_cannot_be_sent_is_named(task: Callable[[], object], message: str) -> None:
+    with pytest.raises(RuntimeError, match=message):
+        parallel.done([task] * 7, "asking", 10)
+
+
+@pytest.mark.usefixtures("three")
+def test_an_interrupt_ends_what_is_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[int] = []
+
+    def interrupted(of: parallel._Worker) -> object:
+        started.append(of._process.pid or 0)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(parallel._Worker, "receive", interrupted)
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        parallel.done([partial(time.sleep, 60.0)] * 3, "sleeping", 10)
+    assert _gone(set(started))
+    assert time.monotonic() - began < 10.0
 
 
 @pytest.mark.usefixtures("three")
@@ -141,7 +115,7 @@ def test_processes_have_streams_of_their_own(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(Console, "is_terminal", True)
     with progress.shown():
         assert type(sys.stderr).__name__ == "FileProxy"
-        assert set(pool().ask(Counter.speak, [()] * 7, "asking")) == {"TextIOWrapper"}
+        assert set(parallel.done([_speak] * 7, "asking", 10)) == {"TextIOWrapper"}
 
 
 def test_a_process_lost_below_another_is_no_answer() -> None:
@@ -150,7 +124,7 @@ def test_a_process_lost_below_another_is_no_answer() -> None:
 
 
 def _lost() -> list[None]:
-    return WorkerPool([Counter(0)] * 2, 2).ask(Counter.end, [()] * 2, "ending")
+    return parallel.done([_end] * 2, "ending", 2)
 
 
 @pytest.mark.parametrize(("jobs", "share"), [(3, 1), (4, 2), (1, 1)])
@@ -167,44 +141,32 @@ def _divided() -> tuple[int, list[int]]:
     return parallel.allowed(), parallel.done([os.getpid, os.getpid], "dividing again", 2)
 
 
-def test_one_piece_of_work_at_a_time_where_no_more_are_worth_while() -> None:
-    with parallel.processes(2):
-        assert parallel.done([os.getpid] * 2, "asking", 1) == [os.getpid()] * 2
-
-
-@pytest.mark.parametrize(("limit", "free"), [(None, 3 << 30), ("max", 3 << 30), (str(2 << 30), 1 << 30)])
-def test_room_is_what_machine_and_container_leave(
-    limit: str | None, free: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert parallel.room() > 1 << 20
-    (tmp_path / "meminfo").write_text(f"MemTotal: {8 << 20} kB\nMemFree: 1 kB\nMemAvailable: {3 << 20} kB\n")
-    monkeypatch.setattr(parallel, "_MEMORY", tmp_path / "meminfo")
-    monkeypatch.setattr(parallel, "_CONTAINER", tmp_path)
-    if limit is not None:
-        (tmp_path / "memory.max").write_text(f"{limit}\n")
-        (tmp_path / "memory.current").write_text(f"{1 << 30}\n")
-    assert parallel.room() == free
-
-
 KILLED = """
-import os, signal
+import os, signal, time
+from functools import partial
 from alidade.pipelines import parallel
-from tests.solvers.test_parallel import Counter, pool, processes
-with parallel.processes(3):
-    first, second = pool(), pool()
-    print(*processes(first), *processes(second), flush=True)
-    for worker in second._workers:
-        worker.send((Counter.sleep, [()] * 3))
-    os.kill(os.getpid(), signal.SIGKILL)
+def task(alone):
+    print(os.getpid(), flush=True)
+    if alone:
+        time.sleep(60.0)
+    parallel.done([partial(task, True)] * 2, "sleeping", 2)
+with parallel.processes(4):
+    if not os.fork():
+        time.sleep(1.0)
+        os.kill(os.getppid(), signal.SIGKILL)
+        os._exit(0)
+    parallel.done([partial(task, False)] * 2, "dividing", 2)
 """
 
 
 def test_processes_end_when_the_main_one_is_killed() -> None:
-    """Whether they have something to do or not."""
+    """Those below others too."""
     run = subprocess.run([sys.executable, "-c", KILLED], capture_output=True, text=True, timeout=60)
     assert run.returncode == -signal.SIGKILL
     assert run.stderr == ""
-    assert _gone({int(process) for process in run.stdout.split()})
+    numbers = {int(process) for process in run.stdout.split()}
+    assert len(numbers) == 6
+    assert _gone(numbers)
 
 
 def _gone(processes: set[int], within_s: float = 10.0) -> bool:
