@@ -23,6 +23,8 @@ Complex = NDArray[np.complex128]
 
 # Below this angle (rad) the closed forms lose more digits to cancellation than their series truncate.
 _SMALL = 1e-2
+# Vectors that are opposite to this, rad, have no rotation that is clearly the shortest.
+_OPPOSITE = 1e-7
 # So many rows fit into a processor's cache with all that is made of them on the way.
 _ROWS = 8192
 
@@ -282,6 +284,17 @@ def align(a: ArrayLike, b: ArrayLike, weights: ArrayLike = 1.0) -> Array:
     # The nearest orthogonal matrix may be a reflection; the least certain axis is then turned round.
     u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return from_matrix(u @ vt)
+
+
+def shortest(a: ArrayLike, b: ArrayLike) -> Array:
+    """Shortest rotations (..., 4) that rotate unit vectors a to b, (..., 3); of opposite ones one of the half turns."""
+    a, b = np.broadcast_arrays(np.asarray(a, dtype=float), np.asarray(b, dtype=float))
+    q = np.concatenate([1.0 + (a * b).sum(axis=-1, keepdims=True), cross(a, b)], axis=-1)
+    opposite = np.linalg.norm(q, axis=-1) < _OPPOSITE
+    near = np.eye(3)[np.argmin(np.abs(a[opposite]), axis=-1)]
+    across = near - (near * a[opposite]).sum(axis=-1, keepdims=True) * a[opposite]
+    q[opposite] = np.pad(across, ((0, 0), (1, 0)))
+    return normalize(q)
 
 
 def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:

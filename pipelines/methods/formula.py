@@ -23,7 +23,11 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.parameters import DEAD_BAND
 from alidade.pipelines.estimation.problem import Parameter
+from alidade.pipelines.methods.temperature import FIRST
+from alidade.pipelines.recording.plausibility import dead_band
+from alidade.pipelines.recording.streams import Temperature
 
 # A vector has shape (..., 3), a rotation is a quaternion w, x, y, z (..., 4), a matrix is constant, (3, 3).
 Kind = Literal["scalar", "vector", "matrix", "rotation"]
@@ -33,6 +37,8 @@ _ROTATION, _VECTOR = (
     re.compile(r"\w*[a-zA-Z]R[a-zA-Z]\w*|\w*rotation\w*"),
     re.compile(r"(\w+_)?(gyro|accel|mag)(_\w+)?|d_b"),
 )
+# Samples of a gyro that are corrected at a time.
+_BLOCK = 100_000
 # `Exp(angle ez)`: a number before the name of an axis.
 _AXIS = re.compile(r"(\w+) (e[xyz])\b")
 AXES = {"ex": np.eye(3)[0], "ey": np.eye(3)[1], "ez": np.eye(3)[2]}
@@ -248,6 +254,40 @@ def gyro_rate(
         f"inverse({symmetric_text(s, known)}) * ({text})" if scaled else text,
         ("gyro", *(["accel"] if feels else []), *(["temperature"] if drifts else [])),
     )
+
+
+def corrected_rates(
+    t: Array,
+    gyro: Array,
+    force: Array | None,
+    temperature: Temperature | None,
+    values: Mapping[str, float],
+    names: tuple[Sequence[str], Sequence[str], Sequence[str]],
+) -> Array:
+    """Rates (N, 3), rad/s, of a gyro's samples, corrected by `gyro_rate`; errors with unmeasured causes remain.
+
+    Args:
+        t: (N,) s.
+        gyro: (N, 3) as recorded, rad/s, the dead band included.
+        force: (N, 3) m/s^2 by the accelerometer beside it; None: not measured.
+        temperature: of the gyro; None: not measured.
+        values: parameters by name; those not there are zero.
+        names: of the numbers of S, G and c, as `gyro_rate` has them.
+    """
+    warm = None if temperature is None else temperature.above(0.0, t)
+    known = {**({} if temperature is None else {FIRST: temperature.first}), **values}
+    for causes, cause in zip(names[1:], (force, warm), strict=True):
+        if cause is None:
+            known = {name: value for name, value in known.items() if name not in causes}
+    if DEAD_BAND.name in values:
+        gyro = gyro + values[DEAD_BAND.name] * dead_band(t, gyro)[1]
+    inputs = {"gyro": gyro, "accel": force, "temperature": warm}
+    formula, out = Formula("rate, rad/s", "w", *gyro_rate(known, *names)), np.empty_like(gyro)
+    for begin in range(0, len(out), _BLOCK):
+        some = slice(begin, begin + _BLOCK)
+        measured = {name: given[some] for name in formula.inputs if (given := inputs[name]) is not None}
+        out[some] = apply([formula], known, measured)["w"]
+    return out
 
 
 def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, known: Collection[str]) -> list[Formula]:

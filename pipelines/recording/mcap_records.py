@@ -6,6 +6,7 @@ that are not what they should be raise DamagedError.
 
 from __future__ import annotations
 
+import bz2
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
@@ -108,24 +109,42 @@ def chunk_head(start: bytes, length: int) -> ChunkHead:
     at += _COMPRESSED_SIZE.size
     if at + packed > length:
         raise DamagedError("it is shorter than its data")
-    if size > (packed if not compression else min(MAX_CHUNK_BYTES, _SMALL_CHUNK + MAX_CHUNK_RATIO * packed)):
+    if size > (most_unpacked(packed) if compression else packed):
         raise DamagedError(f"it says that {packed} bytes hold {size}")
     return ChunkHead(first, last, size, crc, compression, slice(at, at + packed))
+
+
+def most_unpacked(packed: int) -> int:
+    """Return the bytes that a chunk of so many compressed ones may hold."""
+    return min(MAX_CHUNK_BYTES, _SMALL_CHUNK + MAX_CHUNK_RATIO * packed)
 
 
 def decompress_chunk(chunk: bytes) -> NDArray[np.uint8]:
     """Return the records in a chunk, decompressed, with their checksum verified. Raises DamagedError."""
     head = chunk_head(chunk[:64], len(chunk))
-    packed = memoryview(chunk)[head.packed]
-    try:
-        data = _decompress(head, packed)
-    except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
-        raise DamagedError("it cannot be decompressed") from error
-    if len(data) != head.size:
-        raise DamagedError(f"{len(data)} bytes instead of {head.size}")
+    data = decompress(memoryview(chunk)[head.packed], head.compression, head.size)
     if head.crc not in (0, zlib.crc32(data)):
         raise DamagedError("its checksum is another")
     return np.frombuffer(data, np.uint8)
+
+
+def decompress(packed: bytes | memoryview, compression: str, size: int) -> bytes | memoryview:
+    """Decompress data that unpack to `size` bytes, into one byte more at most. Raises DamagedError."""
+    try:
+        if compression == "lz4":
+            packed = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+        elif compression == "bz2":
+            packed = bz2.BZ2Decompressor().decompress(packed, size + 1)
+        elif compression == "zstd":
+            # What the frame itself says of its size would be allocated before a byte is decompressed.
+            if zstandard.frame_content_size(packed[:32]) not in (-1, size):
+                raise ValueError("another size")
+            packed = zstandard.decompress(packed, max_output_size=size + 1) if size else b""
+    except (zstandard.ZstdError, OSError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+        raise DamagedError("it cannot be decompressed") from error
+    if len(packed) != size:
+        raise DamagedError(f"{len(packed)} bytes instead of {size}")
+    return packed
 
 
 def iter_records(data: memoryview, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, int, int]]:
@@ -205,15 +224,3 @@ def find_next_chunk(stream: BinaryIO, start: int, stop: int) -> int:
                 continue
         start += len(heads)
     return stop
-
-
-def _decompress(head: ChunkHead, packed: memoryview) -> bytes | memoryview:
-    """Decompress the data of a chunk, at most one byte more than the chunk states."""
-    if head.compression == "lz4":
-        return lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=head.size + 1)
-    if head.compression == "zstd":
-        # What the frame itself says of its size would be allocated before a byte is decompressed.
-        if zstandard.frame_content_size(packed[:32]) not in (-1, head.size):
-            raise ValueError("another size")
-        return zstandard.decompress(packed, max_output_size=head.size + 1) if head.size else b""
-    return packed

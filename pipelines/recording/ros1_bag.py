@@ -6,7 +6,6 @@ closed is read as well; where a record is not whole the walk ends, and what is b
 
 from __future__ import annotations
 
-import bz2
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,19 +13,17 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.container import Channel, Container, DataLoss, MessageBlock, Schema, total
-from alidade.pipelines.recording.mcap_records import DamagedError
+from alidade.pipelines.recording.mcap_records import MAX_CHUNK_BYTES, DamagedError, decompress, most_unpacked
 
 MAGIC = b"#ROSBAG V2.0\n"
 
 _MESSAGE, _INDEX, _CHUNK, _CHUNK_INFO, _BAG, _CONNECTION = 2, 4, 5, 6, 3, 7
-# No header, definition, chunk or number of topics of a recording comes near these.
-_LONGEST_HEADER, _LONGEST_TEXT, _LARGEST_CHUNK, _MOST_CONNECTIONS = 1 << 16, 1 << 20, 1 << 28, 10_000
-_LARGEST_RATIO, _SMALL = 2000, 1 << 16
+# No header, definition or number of topics of a recording comes near these.
+_LONGEST_HEADER, _LONGEST_TEXT, _MOST_CONNECTIONS = 1 << 16, 1 << 20, 10_000
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 
@@ -90,7 +87,7 @@ class Ros1Bag(Container):
                     size = int.from_bytes(header.get(b"size", b""), "little")
                     compression = header.get(b"compression", b"").decode(errors="replace")
                     unpacked += size
-                    if unpacked > _LARGEST_CHUNK + 100 * self.size:
+                    if unpacked > MAX_CHUNK_BYTES + 100 * self.size:
                         raise InputError(
                             f"{self.path}: its chunks say that they unpack to over {unpacked >> 20} MiB, 100 times "
                             "the file; it may be made to exhaust the memory"
@@ -210,15 +207,6 @@ def _unpacked(packed: bytes, compression: str, size: int) -> bytes:
     """Decompress the data of a chunk, at most one byte more than the chunk states. Raises DamagedError."""
     if compression not in ("none", "bz2", "lz4"):
         raise DamagedError(f"unknown compression {compression!r}")
-    if size > min(_LARGEST_CHUNK, _SMALL + _LARGEST_RATIO * len(packed)):
+    if size > most_unpacked(len(packed)):
         raise DamagedError(f"it says that {len(packed)} bytes hold {size}")
-    try:
-        if compression == "bz2":
-            packed = bz2.BZ2Decompressor().decompress(packed, size + 1)
-        elif compression == "lz4":
-            packed = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-    except (OSError, RuntimeError, ValueError, EOFError, MemoryError) as error:
-        raise DamagedError("it cannot be decompressed") from error
-    if len(packed) != size:
-        raise DamagedError(f"{len(packed)} bytes instead of {size}")
-    return packed
+    return bytes(decompress(packed, compression, size))

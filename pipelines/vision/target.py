@@ -248,7 +248,7 @@ def _los(ckRc0: Array, middle: Array, covariance: Array) -> tuple[Array, Array]:
     The target's frame t has y towards the target and is not twisted against l in the first picture; the roll is the
     twist of t about the line of sight (the texture turns the other way than the camera).
     """
-    l0Rt = _shortest(np.array([0.0, 1.0, 0.0]), _LRC @ middle)
+    l0Rt = so3.shortest([0.0, 1.0, 0.0], _LRC @ middle)
 
     def read(turn: Array) -> Array:
         R = so3.multiply(so3.exp(turn), ckRc0)
@@ -261,8 +261,3 @@ def _los(ckRc0: Array, middle: Array, covariance: Array) -> tuple[Array, Array]:
     step = 1e-6
     J = np.stack([(read(e) - read(-e)) / (2 * step) for e in step * np.eye(3)], axis=1)
     return read(np.zeros(3)), J @ covariance @ J.T
-
-
-def _shortest(a: Array, b: Array) -> Array:
-    """Shortest rotation (4,) from unit vector a to b."""
-    return so3.normalize(np.append(1.0 + a @ b, so3.cross(a, b)))

@@ -157,3 +157,14 @@ def test_many_rows_give_what_few_do() -> None:
     np.testing.assert_array_equal(so3.rotate(p[:, None], v[:3])[several], so3.rotate(p[several, None], v[:3]))
     # No angle about any axis, as formulas have it where nothing is known.
     np.testing.assert_array_equal(so3.exp(np.array(0.0)), so3.identity())
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, np.pi - 1e-5, np.pi - 1e-9, np.pi])
+def test_shortest_rotation_takes_one_vector_to_the_other(angle: float) -> None:
+    a = np.vstack([_unit(50), np.eye(3), -np.eye(3)])
+    axis = np.cross(a, _unit(len(a)))
+    b = so3.rotate(so3.exp(angle * axis / np.linalg.norm(axis, axis=1, keepdims=True)), a)
+    found = so3.shortest(a, b)
+    np.testing.assert_allclose(so3.rotate(found, a), b, atol=2e-7 if angle > 3.0 else 1e-12)
+    np.testing.assert_allclose(np.linalg.norm(so3.log(found), axis=1), angle, atol=2e-7 if angle > 3.0 else 1e-12)
+    np.testing.assert_array_equal(so3.shortest(a[0], b[0]), found[0])

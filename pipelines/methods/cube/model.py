@@ -345,10 +345,7 @@ def _attitudes(
 def _levelled(nRb: Array, accel: Array) -> Array:
     """Rotate nRb by the smallest angle that makes the specific force point up."""
     up = so3.rotate(nRb, accel / np.linalg.norm(accel))
-    axis = so3.cross(up, np.array([0.0, 0.0, 1.0]))
-    sine = float(np.linalg.norm(axis))
-    angle = float(np.arctan2(sine, up[2]))
-    return so3.multiply(so3.exp(axis * (angle / max(sine, 1e-12))), nRb)
+    return so3.multiply(so3.shortest(up, [0.0, 0.0, 1.0]), nRb)
 
 
 @computed_once

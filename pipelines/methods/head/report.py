@@ -17,11 +17,19 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import AXES, COLORS, PALE, Figure, Plot
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.parameters import DEAD_BAND, fixed_without_force
+from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.methods import Correction, Report, temperature
-from alidade.pipelines.methods.formula import Formula, apply, gyro_rate, picture_time, symmetric_text, vector_text
+from alidade.pipelines.methods import Correction, Report
+from alidade.pipelines.methods.formula import (
+    Formula,
+    apply,
+    corrected_rates,
+    gyro_rate,
+    picture_time,
+    symmetric_text,
+    vector_text,
+)
 from alidade.pipelines.methods.head.parameters import (
     CAMERA,
     HELMET,
@@ -34,7 +42,6 @@ from alidade.pipelines.methods.head.parameters import (
 from alidade.pipelines.methods.head.recording import HEAD_IMU, PLATFORM_IMU, HeadData
 from alidade.pipelines.methods.head.uses import uses
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
-from alidade.pipelines.recording.plausibility import dead_band
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -352,28 +359,16 @@ def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], a
 
 def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:
     """Helmet gyro without dead band, corrected by its formula; errors with unmeasured causes remain."""
-    measured: dict[str, Array | None] = {"gyro": data.head_gyro, "accel": data.head_force, "temperature": None}
-    if data.temperature is not None:
-        values = {temperature.FIRST: data.temperature.first, **values}
-        measured["temperature"] = data.temperature.above(0.0, data.head_t)
-    if DEAD_BAND.name in values:
-        measured["gyro"] = data.head_gyro + values[DEAD_BAND.name] * dead_band(data.head_t, data.head_gyro)[1]
-    causes = {SENSITIVITY: measured["accel"], GYRO_SLOPE: measured["temperature"]}
-    unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
-    known = {name: value for name, value in values.items() if name not in unknown}
-    return GyroPath(data.head_t, _rate("w_iv", known, measured))
+    names = _S, *_DRIVERS
+    rates = corrected_rates(data.head_t, data.head_gyro, data.head_force, data.temperature, values, names)
+    return GyroPath(data.head_t, rates)
 
 
 def _platform_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath | None:
     """Platform gyro minus its errors; None for a platform at rest."""
     if data.platform_t is None or data.platform_gyro is None:
         return None
-    known = any(each.name == "w_ib" for each in formulas(values))
-    rate = _rate("w_ib", values, {"platform_gyro": data.platform_gyro}) if known else data.platform_gyro
+    own = _platform_rate(values)
+    measured = {"platform_gyro": data.platform_gyro}
+    rate = apply(own, values, measured)["w_ib"] if own else data.platform_gyro
     return GyroPath(data.platform_t, rate)
-
-
-def _rate(name: str, values: Mapping[str, float], measured: Mapping[str, Array | None]) -> Array:
-    """Evaluate the formula of a rate: (n, 3), rad/s."""
-    own = next(each for each in formulas(values) if each.name == name)
-    return apply([own], values, {each: measured[each] for each in own.inputs})[name]

@@ -56,7 +56,7 @@ def camera(gimbal: Array, angles: Array, names: tuple[str, ...]) -> Array:
 def seen(cRm: Array, measured: Array) -> Array:
     """Attitude tRm (n, 4) from cRm and measured phx, phz, roll (n, 3), rad; a NaN roll counts as zero."""
     y = np.array([0.0, 1.0, 0.0])
-    swing = _shortest(np.broadcast_to(y, (len(cRm), 3)), los_direction(measured))
+    swing = so3.shortest(y, los_direction(measured))
     cRt = so3.multiply(swing, so3.exp(-np.nan_to_num(measured[:, 2])[:, None] * y))
     return so3.multiply(so3.inverse(cRt), cRm)
 
@@ -70,7 +70,7 @@ def initial_attitudes(
     for chain in chains:
         carried = _carried(time[chain], cRm[chain], measured[chain], gyro)
         expected = so3.rotate(so3.inverse(carried), [0.0, 1.0, 0.0])
-        out[chain] = so3.multiply(carried, _shortest(toward[chain], expected))
+        out[chain] = so3.multiply(carried, so3.shortest(toward[chain], expected))
     return out
 
 
@@ -228,11 +228,6 @@ def _pairs(chains: Sequence[NDArray[np.intp]], time: Array, most: int) -> tuple[
     i, j = np.concatenate(first), np.concatenate(second)
     stride = -(-len(i) // most) or 1
     return i[::stride], j[::stride]
-
-
-def _shortest(a: Array, b: Array) -> Array:
-    """Shortest rotations (n, 4) that rotate unit vectors a to b."""
-    return so3.normalize(np.concatenate([1.0 + (a * b).sum(axis=1, keepdims=True), so3.cross(a, b)], axis=1))
 
 
 # After a gap longer than this, s, the camera may hold on to another target.

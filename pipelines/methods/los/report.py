@@ -18,11 +18,19 @@ from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.estimation.camera_clock import Clock
-from alidade.pipelines.estimation.parameters import DEAD_BAND, fixed_without_force
+from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods import Correction, Report
-from alidade.pipelines.methods.formula import Formula, apply, axis_angles, gyro_rate, passive, picture_time
+from alidade.pipelines.methods.formula import (
+    Formula,
+    apply,
+    axis_angles,
+    corrected_rates,
+    gyro_rate,
+    passive,
+    picture_time,
+)
 from alidade.pipelines.methods.los.initial_values import (
     camera,
     carried_errors,
@@ -33,8 +41,7 @@ from alidade.pipelines.methods.los.initial_values import (
 from alidade.pipelines.methods.los.parameters import ANGLES, DELAY, ONCE_PER_TURN, SCALE, SENSITIVITY, TIME_OFFSET
 from alidade.pipelines.methods.los.recording import JOINTS, LosData
 from alidade.pipelines.methods.los.uses import uses
-from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
-from alidade.pipelines.recording.plausibility import dead_band
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -214,7 +221,8 @@ def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float
     gimbal = GimbalPath(data.gimbal_t, data.gimbal)
     recorded = gimbal.at(at)
     px = values.get("delta_px", 0.0)
-    rate = so3.rotate(_carrier_from_gyro(values), true)
+    mounts = [each for each in formulas(values) if not each.inputs]
+    rate = so3.rotate(apply(mounts, values, {})["M"], true)
     uncompensated = command(gyro, recorded)
     extra = np.zeros_like(recorded)
     for _ in range(_PASSES):
@@ -225,13 +233,6 @@ def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float
     would = was + np.stack([np.interp(t, at, extra[:, k]) for k in range(2)], axis=1)
     cRc = so3.multiply(_camera_attitude(would, px), so3.inverse(_camera_attitude(was, px)))
     return los_error(so3.rotate(cRc, los_direction(data.error[chain])))
-
-
-def _carrier_from_gyro(values: Mapping[str, float]) -> Array:
-    """Mounting rotation M = Rz(dz) Rx(-gx) Ry(-gy), (4,), from gyro to carrier."""
-    dz = values.get("delta_z", values.get("delta_pz", 0.0) - values.get("delta_gz", 0.0))
-    gx, gy = values.get("delta_gx", 0.0), values.get("delta_gy", 0.0)
-    return so3.compose(passive(2, dz), passive(0, -gx), passive(1, -gy))
 
 
 def _camera_attitude(gimbal: Array, px: float) -> Array:
@@ -256,26 +257,9 @@ def _without_drift(t: Array, error: Array) -> Array:
     return np.asarray(error - line @ np.linalg.lstsq(line, error)[0])
 
 
-# Samples of the gyro worked on together.
-_BLOCK = 100_000
-
-
 def rates(data: LosData, values: Mapping[str, float]) -> Array:
     """Corrected rates (N, 3), rad/s, at the gyro's samples; errors with unmeasured causes remain."""
-    warm = None if data.temperature is None or FIRST not in values else data.temperature.above(0.0, data.gyro_t)
-    causes = {SENSITIVITY: data.force, GYRO_SLOPE: warm}
-    unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
-    known = {name: value for name, value in values.items() if name not in unknown}
-    formula, out = Formula("rate, rad/s in m", "w_m", *gyro_rate(known, S, *DRIVERS)), np.empty_like(data.gyro)
-    gyro = data.gyro
-    if DEAD_BAND.name in values:
-        gyro = gyro + values[DEAD_BAND.name] * dead_band(data.gyro_t, gyro)[1]
-    inputs = {"gyro": gyro, "accel": data.force, "temperature": warm}
-    for begin in range(0, len(out), _BLOCK):
-        some = slice(begin, begin + _BLOCK)
-        measured = {name: given[some] for name in formula.inputs if (given := inputs[name]) is not None}
-        out[some] = apply([formula], known, measured)["w_m"]
-    return out
+    return corrected_rates(data.gyro_t, data.gyro, data.force, data.temperature, values, (S, *DRIVERS))
 
 
 def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:

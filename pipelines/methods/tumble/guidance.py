@@ -20,8 +20,6 @@ from alidade.pipelines.settings import Config
 
 # Part of all directions that a vector has to have come near, and the widest gap that is none, rad.
 _ENOUGH, _GAP = 0.9, np.deg2rad(45.0)
-# Less than this, rad, from the vertical is upright.
-_UPRIGHT = 1e-6
 _WHAT = {"mag": "directions of the field", "accel": "sides up"}
 _TURN = {"mag": "turn the device so that the field goes along", "accel": "rest it with this side up:"}
 
@@ -43,11 +41,7 @@ def _picture(sensor: str, where: Array) -> str:
     """Drawing of the device with a body direction (3,) along the field, or upwards."""
     if sensor == "mag":
         return along(where, "field")
-    axis = np.cross(where, [0.0, 0.0, 1.0])
-    sine = np.linalg.norm(axis)
-    if sine < _UPRIGHT:  # half a turn about x where it points down
-        return resting(so3.exp([0.0 if where[2] > 0.0 else np.pi, 0.0, 0.0]), lit=where)
-    return resting(so3.exp(axis / sine * np.arctan2(sine, where[2])), lit=where)
+    return resting(so3.shortest(where, [0.0, 0.0, 1.0]), lit=where)
 
 
 # Longer than an accelerometer needs to be seen at rest, s.

@@ -24,10 +24,11 @@ from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import sampled, stated
 from alidade.pipelines.methods.place import FIELD, field_at, known_strength
 from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
+from alidade.pipelines.methods.temperature import ACCEL_SLOPE
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess
 from alidade.pipelines.methods.tumble.published import FEWEST
-from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, NO_RATE, TumbleData
+from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, NO_RATE, TumbleData
 from alidade.pipelines.methods.tumble.ring import ring
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
 from alidade.pipelines.recording.plausibility import DEAD_BAND, SI, dead_band, likely_unit

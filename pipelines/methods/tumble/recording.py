@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.parameters import accel_square, temperature_slope
+from alidade.pipelines.estimation.parameters import accel_square
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import place_topics, read_place
 from alidade.pipelines.recording import series
@@ -30,11 +30,7 @@ REQUIREMENTS: tuple[Need, ...] = (((MAG,), (IMU, _METHOD)),)
 # Why a gyro is left out.
 NO_RATE = "gyro beyond what rad/s can be, not used"
 
-# What a temperature does to the offsets of consumer sensors, one sigma.
-SLOPES = GYRO_SLOPE, ACCEL_SLOPE = (
-    temperature_slope("gyro", "rad/s", 1e-4),
-    temperature_slope("accel", "m/s^2", 1e-2),
-)
+SLOPES = temperature.GYRO_SLOPE, temperature.ACCEL_SLOPE
 # Three of 1e-4 of what is felt at 1 g: what consumer accelerometers read beside it, along each axis.
 ACCEL_SQUARE = accel_square(3e-5)
 

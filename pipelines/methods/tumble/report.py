@@ -20,7 +20,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods import Report
 from alidade.pipelines.methods.formula import Formula, gyro_rate, temperature_text, vector_text
-from alidade.pipelines.methods.temperature import FIRST
+from alidade.pipelines.methods.temperature import ACCEL_SLOPE, FIRST, GYRO_SLOPE
 from alidade.pipelines.methods.triads import (
     CORRECTIONS,
     gain_names,
@@ -32,7 +32,7 @@ from alidade.pipelines.methods.triads import (
 )
 from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.parameters import STRENGTHS
-from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, ACCEL_SQUARE, GYRO_SLOPE, TumbleData
+from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData
 from alidade.pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
 from alidade.pipelines.methods.tumble.uses import uses
 from alidade.pipelines.reports.result import Calibration

@@ -34,7 +34,8 @@ from alidade.pipelines.estimation.problem import Parameter, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.estimation.walking_bias import FIRST
 from alidade.pipelines.methods.noise import sampled, stated, walking
-from alidade.pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
+from alidade.pipelines.methods.temperature import GYRO_SLOPE
+from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.recording.plausibility import dead_band, hidden
 from alidade.pipelines.settings import Config
 
@@ -377,7 +378,7 @@ def _attitudes(time: Array, path: GyroPath, mag: Seen, beside: tuple[Seen, Rows]
     field = np.stack([np.interp(time, mag.time, axis) for axis in mag.direction.T], axis=1)
     out = np.empty((len(time), 4))
     # Any attitude in which the field is along itself.
-    out[0] = _between(field[0], along)
+    out[0] = so3.shortest(field[0], along)
     for k in range(1, len(time)):
         carried = so3.multiply(out[k - 1], turns[k - 1])
         expected = so3.rotate(so3.inverse(carried), along)
@@ -389,12 +390,3 @@ def _attitudes(time: Array, path: GyroPath, mag: Seen, beside: tuple[Seen, Rows]
     across = np.array([0.0, np.sin(dip), np.cos(dip)])  # of up, what is across the field, and what is across both
     angle = np.arctan2((where @ so3.cross(across, along)).sum(), (where @ across).sum())
     return so3.multiply(so3.exp(angle * along), out)
-
-
-def _between(b: Array, a: Array) -> Array:
-    """Shortest rotation (4,) from unit vector b to a."""
-    axis, cosine = np.cross(b, a), float(b @ a)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:
-        return so3.identity() if cosine > 0.0 else so3.exp(np.pi * np.eye(3)[int(np.argmin(np.abs(b)))])
-    return so3.exp(axis / sine * np.arctan2(sine, cosine))
