@@ -13,6 +13,8 @@ import os
 import re
 import stat
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import StringIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -64,6 +66,23 @@ def open_binary(path: Path, named: Path | None = None) -> BinaryIO:
         return path.open("rb")
     except OSError as error:
         raise _cannot_open(named or path, error) from error
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Yield a temporary file that replaces `path` when the block ends without an error; InputError if it cannot."""
+    if not path.name or (path.exists() and not path.is_file()):
+        raise InputError(f"{path}: there is no file to be written, it is something else")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        try:
+            with part.open("wb") as stream:
+                yield stream
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def dump_yaml(content: object, width: int = 80, is_sorted: bool = True) -> str:

@@ -22,11 +22,12 @@ from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import replacing
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.methods.triads import numeric_jacobian
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.array_container import encode_series, ros2_schema
-from alidade.pipelines.recording.mcap_writer import McapOutput, replacing
+from alidade.pipelines.recording.mcap_writer import McapOutput
 from alidade.pipelines.recording.plausibility import is_there
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.streams import StreamReader

@@ -7,11 +7,9 @@ put together from blocks; the records around the chunks are the package's.
 from __future__ import annotations
 
 import json
-import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,7 +22,7 @@ from mcap.records import Attachment, AttachmentIndex, Chunk, ChunkIndex, DataEnd
 from numpy.typing import NDArray
 
 from alidade.pipelines import progress
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import replacing
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import encode_series, ros2_schema
 from alidade.pipelines.recording.container import MessageBlock, Schema, byte_windows
@@ -75,23 +73,6 @@ def write_session(
                     out.put(encoder.block(number, count))
             out.flush()
         out.finish()
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Yield a temporary file that replaces `path` when the block ends without an error; InputError if it cannot."""
-    if not path.name or (path.exists() and not path.is_file()):
-        raise InputError(f"{path}: there is no file to be written, it is something else")
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        try:
-            with part.open("wb") as stream:
-                yield stream
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 class McapOutput:

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import replacing
 
 # Of a file: its text or bytes, a function that writes it to a path, or None where there is none.
 Content = str | bytes | Callable[[Path], None] | None
@@ -108,18 +109,15 @@ def require_room(out_dir: Path | None) -> None:
 
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a single file, whole or not at all. Raises InputError when it cannot be written."""
-    try:
-        if path.exists() and not path.is_file():  # a pipe, a terminal
-            _write(path, content)
-            return
-        part = path.with_name(f"{_PART}{os.getpid()}.{path.name}")
+    data = content if isinstance(content, bytes) else content.encode()
+    if path.exists() and not path.is_file():  # a pipe, a terminal
         try:
-            _write(part, content)
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+            path.write_bytes(data)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+        return
+    with replacing(path) as stream:
+        stream.write(data)
 
 
 def _write(path: Path, content: Content) -> None:
