@@ -130,11 +130,12 @@ def python_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str
     reader, lines = _Reader(values), []
     for formula in formulas:
         node = reader.read(formula)
+        text = ast.unparse(ast.parse(_python(node), mode="eval"))
         lines += ["", "", f"# {formula.description}"]
         if node.value is not None:
-            lines.append(f"{formula.name} = {_python(node)}")
+            lines.append(f"{formula.name} = {text}")
         else:
-            lines += [f"def {formula.name}({', '.join(formula.inputs)}):", f"    return {_python(node)}"]
+            lines += [f"def {formula.name}({', '.join(formula.inputs)}):", f"    return {text}"]
     body = "\n".join(lines)
     helpers = [text for name, text in _PYTHON_HELPERS.items() if re.search(rf"\b{name}\(", body)]
     return "\n".join(["import numpy as np", *helpers]) + body + "\n"
@@ -152,7 +153,11 @@ _PYTHON_HELPERS = {
 }
 
 
+_SIGNS = {"add": "+", "sub": "-", "mul": "*", "div": "/", "pow": "**"}
+
+
 def _python(node: _Node) -> str:
+    """Return a node as Python, with more brackets than it needs."""
     if node.array is not None:
         text = repr(np.vectorize(_digits, otypes=[float])(node.array).tolist())
         return text if node.kind == "scalar" else f"np.array({text})"
@@ -165,25 +170,17 @@ def _python(node: _Node) -> str:
             return node.name
         case "call":
             return f"{node.name}({', '.join(node.arguments)})"
-        case "mul" if node.parts[0].kind == "matrix" and node.parts[1].kind != "scalar":
-            return f"{_bracketed(node.parts[0], parts[0])} @ {_bracketed(node.parts[1], parts[1], right=True)}"
         case "add" | "sub" | "mul" | "div" | "pow":
-            sign = {"add": "+", "sub": "-", "mul": "*", "div": "/", "pow": "**"}[node.op]
-            return f"{_bracketed(node.parts[0], parts[0])} {sign} {_bracketed(node.parts[1], parts[1], right=True)}"
+            is_product = node.op == "mul" and node.parts[0].kind == "matrix" and node.parts[1].kind != "scalar"
+            return f"({parts[0]}) {'@' if is_product else _SIGNS[node.op]} ({parts[1]})"
         case "minus":
-            return f"-{_bracketed(node.parts[0], parts[0], right=True)}"
+            return f"-({parts[0]})"
         case "inverse":
-            return f"{_bracketed(node.parts[0], parts[0], right=True)}.T"
+            return f"({parts[0]}).T"
         case "sin" | "cos":
             return f"np.{node.op}({parts[0]})"
         case _:
             return f"{node.op}({parts[0]})"
-
-
-def _bracketed(node: _Node, text: str, right: bool = False) -> str:
-    compound = node.value is None and node.op in ("add", "sub", "minus", "mul", "div", "pow")
-    loose = node.op in ("add", "sub", "minus") or right
-    return f"({text})" if compound and loose and not _axis_turn(node) else text
 
 
 def _axis_turn(node: _Node) -> tuple[str, _Node] | None:
@@ -285,7 +282,7 @@ def _c(node: _Node) -> str:
         case (("add" | "sub"), ["vector", "scalar"]):
             return f"shifted({parts[0]}, {'' if node.op == 'add' else '-'}({parts[1]}))"
         case (("add" | "sub" | "mul" | "div"), ["scalar", "scalar"]):
-            return f"({parts[0]} { {'add': '+', 'sub': '-', 'mul': '*', 'div': '/'}[node.op] } {parts[1]})"
+            return f"({parts[0]} {_SIGNS[node.op]} {parts[1]})"
         case "minus", ["scalar"]:
             return f"-({parts[0]})"
         case "inverse", _:
