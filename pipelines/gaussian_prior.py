@@ -11,6 +11,8 @@ from alidade.factors.array import Array
 
 # Of correlated numbers, the least variance of a combination that counts as known, in their own.
 _LEAST = 1e-14
+# Eigenvalues of a correlation matrix below this share of the largest are rounding.
+_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,7 @@ class GaussianPrior:
         one, other = (np.array([(n in known) is among for n in self.names], dtype=bool) for among in (False, True))
         scale = np.where(self.sigmas > 0.0, self.sigmas, 1.0)
         C = self.covariance / np.outer(scale, scale)
-        gain = C[np.ix_(one, other)] @ np.linalg.pinv(C[np.ix_(other, other)], hermitian=True)
+        gain = C[np.ix_(one, other)] @ np.linalg.pinv(C[np.ix_(other, other)], rtol=_RANK, hermitian=True)
         off = (np.array([known[name] for name in self.names if name in known]) - self.mean[other]) / scale[other]
         lost = np.outer(scale[one], scale[one]) * (gain @ C[np.ix_(other, one)])
         return GaussianPrior(rest.names, rest.mean + scale[one] * (gain @ off), rest.covariance - lost, self.source)

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from alidade.pipelines import deadline, progress
 from alidade.pipelines.applications.session import Session, open_session
 from alidade.pipelines.applications.sharing import device_prior, walks
@@ -16,11 +14,9 @@ from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.estimation.problem import Estimate
+from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.reports.calibration import SavedCalibration, load_known, saved, with_covariance
 from alidade.pipelines.reports.result import Calibration
-
-# Eigenvalues of a correlation matrix below this share of the largest are rounding.
-_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -147,19 +143,11 @@ def validate(
     held, estimate, own = found
     of_device = walks(chosen, settings, [name for name in own if name in known.parameters])
     fixed = {name: values[name] for name in of_device if name in values}
-    device = chosen.report.validate(data, settings, own | _conditioned(estimate, fixed))
+    others = GaussianPrior(estimate.names, estimate.values, estimate.covariance).given(fixed)
+    conditional = dict(zip(others.names, others.mean.tolist(), strict=True))
+    device = chosen.report.validate(data, settings, own | conditional | fixed)
     best = chosen.report.validate(data, settings, own)
     return Validated(known, path.name, validations, False, lost, held, device, best)
-
-
-def _conditioned(estimate: Estimate, fixed: dict[str, float]) -> dict[str, float]:
-    """Return values given fixed parameters: x + P_f P_ff^+ (fixed - x_f), the conditional mean, linearised."""
-    given = [i for i, name in enumerate(estimate.names) if estimate.sigmas[i] > 0.0 and name in fixed]
-    scale = np.where(estimate.sigmas > 0.0, estimate.sigmas, 1.0)
-    correlation = estimate.covariance[:, given] / np.outer(scale, scale[given])
-    moved = np.array([fixed[estimate.names[i]] - estimate.values[i] for i in given]) / scale[given]
-    weights = np.linalg.lstsq(correlation[given], moved, rcond=_RANK)[0]
-    return dict(zip(estimate.names, (estimate.values + scale * (correlation @ weights)).tolist(), strict=True)) | fixed
 
 
 def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Estimate, dict[str, float]] | None:
