@@ -129,10 +129,10 @@ class LosParameters:
         angles = [q for each in (*MOUNT, *(AZIMUTH_ZEROS if given else (AZIMUTH,))) for q in quantities(each, config)]
         errors = [q for each in GIMBAL_ERRORS for q in quantities(each, config) if q.prior_sigma != 0.0]
         return cls(
-            angles=Parameter(_key("a"), (*angles, *errors)),
+            angles=Parameter(gtsam.symbol("a", 0), (*angles, *errors)),
             bias=Parameter(FIRST_BIAS, quantities(BIAS, config)),
-            sight=stamped(parameter(_key("S"), TRACKER_ERRORS, config), TIME_OFFSET.name, stamp_sigma),
-            gyro=gyro_errors(_key("G"), SCALE, drivers, config),
+            sight=stamped(parameter(gtsam.symbol("S", 0), TRACKER_ERRORS, config), TIME_OFFSET.name, stamp_sigma),
+            gyro=gyro_errors(gtsam.symbol("G", 0), SCALE, drivers, config),
         )
 
     @property
@@ -144,7 +144,3 @@ class LosParameters:
     def all(self) -> tuple[Parameter, ...]:
         """All parameters in reporting order."""
         return tuple(each for each in (self.angles, self.bias, self.sight, self.gyro) if each is not None)
-
-
-def _key(letter: str) -> int:
-    return int(gtsam.symbol(letter, 0))
