@@ -82,7 +82,7 @@ def drawn(amplitude_deg: Sequence[float], seconds: float, seed: int) -> Drawn:
     )
     R = so3.multiply(so3.multiply(heading, pitch), roll)
     field = so3.rotate(so3.inverse(R), _FIELD)
-    turn = 10.0 * so3.log(so3.multiply(so3.inverse(R[:-1]), R[1:]))
+    turn = 10.0 * so3.local(R[:-1], R[1:])
     exact = field @ _SOFT.T + _HARD
     mag = exact + 1e-6 * rng.standard_normal(field.shape)
     gyro = np.vstack([turn[:1], turn]) + [0.004, -0.005, 0.002] + 0.01 * rng.standard_normal(field.shape)

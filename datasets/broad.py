@@ -146,7 +146,7 @@ def score(trial: Trial, values: Mapping[str, float], attitude_t: Array, attitude
     inside = (at >= attitude_t[0]) & (at <= attitude_t[-1])
     seen, at = seen[inside], at[inside]
     estimated = marker_attitudes(trial, values, attitude_t, attitude_wxyz, at)
-    error = so3.log(so3.multiply(so3.inverse(trial.attitude[seen]), estimated))
+    error = so3.local(trial.attitude[seen], estimated)
     return Score(
         attitude_rms=_rms(error),
         slow_rms=_rms(_averaged(error, round(1.0 / (trial.t[1] - trial.t[0])))),

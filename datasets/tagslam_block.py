@@ -114,9 +114,7 @@ def _apart(found: TagBody, published: TagBody, keep: Mask) -> tuple[float, float
     turn = so3.align(b - b.mean(axis=0), a - a.mean(axis=0))
     moved = so3.rotate(turn, found.position - a.mean(axis=0)) + b.mean(axis=0)
     distance = np.linalg.norm(moved - published.position[keep], axis=1)
-    angle = np.linalg.norm(
-        so3.log(so3.multiply(so3.inverse(so3.multiply(turn, found.bRt)), published.bRt[keep])), axis=1
-    )
+    angle = np.linalg.norm(so3.local(so3.multiply(turn, found.bRt), published.bRt[keep]), axis=1)
     return float(np.sqrt(np.mean(distance**2))), float(np.sqrt(np.mean(angle**2)))
 
 

@@ -1,4 +1,4 @@
-"""Types of arrays, by what they hold: numbers, indexes, yes or no."""
+"""Types of arrays, by what they hold: numbers, indexes, yes or no; and columns between their rows."""
 
 from __future__ import annotations
 
@@ -8,3 +8,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+
+
+def interpolated(at: Array, t: Array, values: Array) -> Array:
+    """Interpolate rows of numbers (n, d) at t (n,), increasing, linearly: (m, d) at `at` (m,); constant beyond."""
+    return np.stack([np.interp(at, t, column) for column in values.T], axis=1)

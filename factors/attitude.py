@@ -96,7 +96,7 @@ class VisionAttitudeFactor(Model):
             bRv = so3.multiply(so3.inverse(dB), bRv)
             rate = rate - so3.rotate(so3.inverse(bRv), platform_rate)
         seen, by_cRh, by_scale = self._seen(so3.compose(cRb, bRv, vRh), picture)
-        error = so3.log(so3.multiply(so3.inverse(seen), self.measured))
+        error = so3.local(seen, self.measured)
 
         def jacobians() -> tuple[Array, ...]:
             # A right perturbation eta of what is seen changes the error by -Jr^-1(-error) eta.
@@ -147,7 +147,7 @@ class VisionAttitudeFactor(Model):
         if picture.shape[1] == 1:
             return cRh, lambda: np.eye(3), np.empty((n, 3, 0))
         first, scale = needed(self.first), picture[:, [SCALE_COLUMN]]
-        turned = so3.log(so3.multiply(so3.inverse(first), cRh))
+        turned = so3.local(first, cRh)
         angle = np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
         share, slope = faded(angle)
         along = turned / angle

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
-from alidade.factors.array import Array, Index
+from alidade.factors.array import Array, Index, interpolated
 from alidade.factors.model import Stacked
 
 # Motion around a picture is smoothed over one of these times to either side, s: the longest that follows it. The first
@@ -121,7 +121,7 @@ class LocalMotion(Stacked):
             _local_cubics(at, gyro_t, sums[:, 2:], windows[1])[:, 1:].copy(),
             windows,
             following,
-            None if drivers is None else np.stack([np.interp(at, gyro_t, each) for each in drivers.T], axis=1),
+            None if drivers is None else interpolated(at, gyro_t, drivers),
         )
 
     def turned(self, begin: Array, end: Array) -> Array:

@@ -193,7 +193,7 @@ class GyroIncrementFactor(Model):
             base_bias, base_errors = platform_errors(self.platform, platform, len(i))
             dB, by_dB = corrected(self.platform_turns, base_bias - self.platform.bias_hat, base_errors)
             predicted = so3.multiply(so3.inverse(dB), predicted)
-        error = so3.log(so3.multiply(so3.inverse(predicted), j))
+        error = so3.local(predicted, j)
         weight = (1.0 / self.sigma)[:, None]
         units, by_own, by_platform, by_turning = self._units(errors, platform, j, error)
 

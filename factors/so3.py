@@ -188,6 +188,11 @@ def log(q: ArrayLike) -> Array:
     return v * (np.where(w < 0.0, -1.0, 1.0) * factor)[..., None]
 
 
+def local(p: ArrayLike, q: ArrayLike) -> Array:
+    """Rotation vectors v (..., 3) from p to q in p's axes: q = p Exp(v), as gtsam's localCoordinates."""
+    return log(multiply(inverse(p), q))
+
+
 @_in_cache
 def matrix(q: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of quaternions."""
@@ -304,7 +309,7 @@ def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
     """
     t, q, at = np.asarray(t, dtype=float), np.asarray(q, dtype=float), np.asarray(at, dtype=float)
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    arc = log(multiply(inverse(q[i]), q[i + 1]))
+    arc = local(q[i], q[i + 1])
     return multiply(q[i], exp(arc * ((at - t[i]) / (t[i + 1] - t[i]))[..., None]))
 
 

@@ -18,7 +18,7 @@ from typing import ClassVar
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.factors.ellipsoid import by_slope, drifted
 from alidade.factors.gyro import SCALE, Derivatives, carried, needed, rate_error
 from alidade.factors.model import ROT3, Block, Model, Residuals
@@ -217,7 +217,7 @@ class UpFactor(Model):
         gyro = self.gyro
 
         def rate(t: Array) -> Array:
-            return np.stack([np.interp(t, gyro.t, axis) for axis in gyro.read.T], axis=1) - gyro.bias_hat
+            return interpolated(t, gyro.t, gyro.read) - gyro.bias_hat
 
         read = rate(self.time), self._slope(rate)
         return (

@@ -81,7 +81,7 @@ class GyroRotationFactor(Model):
         dR = turns.rotation
         earth = (samples.t[samples.last] - samples.t[samples.first])[:, None] * self.earth_rate
         predicted = so3.compose(so3.exp(-earth), nRb_i, dR)
-        error = so3.log(so3.multiply(so3.inverse(predicted), nRb_j))
+        error = so3.local(predicted, nRb_j)
         weight = 1.0 / self.sigma
 
         def jacobians() -> tuple[Array, ...]:

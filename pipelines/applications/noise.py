@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, load_config
@@ -261,7 +261,7 @@ def even_pieces(t: Array, values: Array) -> tuple[list[Array], float, int]:
         part = values[rows]
         if place[-1] >= len(rows):
             grid = np.arange(place[-1] + 1)
-            part = np.stack([np.interp(grid, place, column) for column in part.T], axis=1)
+            part = interpolated(grid, place, part)
         pieces.append(part)
     return pieces, interval, int(lost[fill].sum())
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 
 Stamps = NDArray[np.int64]
 
@@ -65,7 +65,7 @@ class _Gyro:
 
     def __init__(self, t_ns: Stamps, rates: Array, start_ns: int) -> None:
         order = np.argsort(t_ns, kind="stable")
-        t = (t_ns[order] - start_ns) * 1e-9
+        t: Array = np.asarray((t_ns[order] - start_ns) * 1e-9, dtype=float)
         usable = np.isfinite(rates[order]).all(axis=1) & (np.diff(t, prepend=-1.0) > 0.0)
         self.t, rates = t[usable], rates[order][usable]
         turned = 0.5 * (rates[1:] + rates[:-1]) * np.diff(self.t)[:, None]
@@ -73,7 +73,7 @@ class _Gyro:
 
     def mean(self, a: Array, b: Array) -> Array:
         """Return the gyro's mean rates (n, 3), rad/s, from a to b (n,), s."""
-        ends = [np.stack([np.interp(x, self.t, column) for column in self._turned.T], axis=1) for x in (a, b)]
+        ends = [interpolated(x, self.t, self._turned) for x in (a, b)]
         return (ends[1] - ends[0]) / (b - a)[:, None]
 
     def covers(self, a: Array, b: Array) -> NDArray[np.bool_]:
@@ -209,7 +209,7 @@ def _delay(middle: Array, norm: Array, a: Array, b: Array, gyro: _Gyro) -> tuple
 
 def _rates(first: Array, second: Array, steps: Array) -> Array:
     """Return mean body rates (n, 3), rad/s, between pairs of quaternions (n, 4) that are `steps` (n,), s, apart."""
-    return so3.log(so3.multiply(so3.inverse(first), second)) / steps[:, None]
+    return so3.local(first, second) / steps[:, None]
 
 
 def _fit(ours: Array, theirs: Array) -> tuple[float, float]:

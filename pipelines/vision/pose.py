@@ -329,7 +329,7 @@ def _solve(
 
 def angles(p: Array, q: Array) -> Array:
     """Angles (...,), rad, of the rotations between attitudes (..., 4)."""
-    return np.asarray(np.linalg.norm(so3.log(so3.multiply(so3.inverse(p), q)), axis=-1))
+    return np.asarray(np.linalg.norm(so3.local(p, q), axis=-1))
 
 
 def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array, Array]:

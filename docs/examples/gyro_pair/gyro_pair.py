@@ -235,7 +235,7 @@ def simulate(scenario: GyroPairScenario, seed: int, _images: bool = False) -> Si
         t = sample_times(scenario.duration_s, gyro.rate_hz, gyro.phase)
         edges: Array = (np.arange(len(t) + 1, dtype=float) + gyro.phase - 0.5) / gyro.rate_hz + late
         attitude = so3.multiply(scenario.motion.attitude(edges), aRg)
-        rate = so3.log(so3.multiply(so3.inverse(attitude[:-1]), attitude[1:])) * gyro.rate_hz
+        rate = so3.local(attitude[:-1], attitude[1:]) * gyro.rate_hz
         biases.append(np.deg2rad(gyro.bias_deg_s) * rng.standard_normal(3))
         samples.append((t, rate + biases[-1] + gyro.density * np.sqrt(gyro.rate_hz) * rng.standard_normal(rate.shape)))
     data = GyroPairData(EPOCH_NS, *samples[0], *samples[1], scenario.gyro_a.density, scenario.gyro_b.density)

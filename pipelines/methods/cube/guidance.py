@@ -223,7 +223,7 @@ def _rows(known: _FisherInformation, nRb: Array, field: Array | None) -> list[tu
     found = [(known.accel, np.append(so3.rotate(bRn, [0.0, 0.0, 1.0]), 1.0))]
     if field is not None and known.mag is not None:
         found.append((known.mag, np.append(so3.rotate(bRn, field), 1.0)))
-    turned = np.zeros(3) if known.last is None else so3.log(so3.multiply(so3.inverse(known.last), nRb))
+    turned = np.zeros(3) if known.last is None else so3.local(known.last, nRb)
     return [*found, (known.turns, turned)]
 
 

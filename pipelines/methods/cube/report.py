@@ -351,7 +351,7 @@ def _turn_errors(
     """
     rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro), calibrated_rates(data, config, values)
     turned = (GyroPath(data.imu_t, rate).increments(*span.T).wxyz for rate in rates)
-    before, after = (so3.log(so3.multiply(so3.inverse(expected), each)) for each in turned)
+    before, after = (so3.local(expected, each) for each in turned)
     return before, after
 
 

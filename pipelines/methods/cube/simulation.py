@@ -194,7 +194,7 @@ class _World:
         edges = np.append(t[:1] - 0.5 / rate, (t[:, None] + (np.arange(1, _PARTS + 1) / _PARTS - 0.5) / rate).ravel())
         iRn = so3.exp(edges[:, None] * earth_rate(self.place_rad[0]))
         iRb = so3.multiply(iRn, self.motion.attitude(edges))
-        arcs = so3.log(so3.multiply(so3.inverse(iRb[:-1]), iRb[1:]))
+        arcs = so3.local(iRb[:-1], iRb[1:])
         rates = arcs.reshape(-1, _PARTS, 3).sum(axis=1) * rate
         moments = self._moments(t, rate)
         force = so3.rotate(self.nRC, self.motion.position(moments, 2))
@@ -332,7 +332,7 @@ class Motion:
         k, u, _ = self._phase(t)
         if len(self.start) == 1:
             return np.broadcast_to(self.nRb[0], (len(t), 4))
-        turn = np.append(so3.log(so3.multiply(so3.inverse(self.nRb[:-1]), self.nRb[1:])), np.zeros((1, 3)), axis=0)
+        turn = np.append(so3.local(self.nRb[:-1], self.nRb[1:]), np.zeros((1, 3)), axis=0)
         wobble = np.append(self.wobble, np.zeros((1, 3)), axis=0)
         return so3.compose(self.nRb[k], so3.exp(turn[k] * _STEP(u)[:, None]), so3.exp(wobble[k] * _BUMP(u)[:, None]))
 
@@ -365,7 +365,7 @@ def drawn_motion(s: CubeScenario, rng: np.random.Generator) -> Motion:
     nRb = drawn_attitudes(s, rng)
     n = len(nRb)
     place = np.array([0.0, 0.0, s.distance]) + [0.04, 0.03, 0.05] * rng.uniform(-1, 1, (n, 3))
-    angles = np.linalg.norm(so3.log(so3.multiply(so3.inverse(nRb[:-1]), nRb[1:])), axis=1)
+    angles = np.linalg.norm(so3.local(nRb[:-1], nRb[1:]), axis=1)
     turning = np.maximum(angles, 0.5) / s.turn_rad_s
     start = np.concatenate([[0.0], np.cumsum(s.static_s + turning)])
     wobble = (0.0 if s.turn_axes else 0.15) * rng.standard_normal((n - 1, 3))

@@ -45,7 +45,7 @@ def guess(gyro: GyroPath, vision_t: Array, iRh: Array, sigma: float) -> tuple[Ar
     start, stop = vision_t[i], vision_t[j]
     span = (stop - start)[:, None]
     rate = so3.log(gyro.increments(start, stop).wxyz) / span
-    seen = so3.log(so3.multiply(so3.inverse(iRh[i]), iRh[j])) / span
+    seen = so3.local(iRh[i], iRh[j]) / span
     mismatch = np.abs(np.linalg.norm(rate, axis=1) - np.linalg.norm(seen, axis=1))
     good = mismatch < 0.05 + 5.0 * sigma / span[:, 0]
     if good.sum() < _FEWEST_FRAMES:
@@ -104,7 +104,7 @@ def guess_picture_clock(
             turns = turns_at(*taken(x))
             predicted = so3.multiply(turns.wxyz, so3.exp(turns.bias_jacobian @ x[_BIAS]))
             vRh = so3.multiply(mount, so3.exp(x[None, _MOUNT]))
-            return so3.log(so3.multiply(so3.inverse(so3.compose(vRh, turn, so3.inverse(vRh))), predicted))
+            return so3.local(so3.compose(vRh, turn, so3.inverse(vRh)), predicted)
 
         return miss
 

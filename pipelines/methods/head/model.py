@@ -130,7 +130,7 @@ def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | 
     """
     assert estimate.attitudes is not None
     bRv = estimate.attitudes.wxyz
-    turned = so3.log(so3.multiply(so3.inverse(bRv[:1]), bRv))
+    turned = so3.local(bRv[:1], bRv)
     places = {f"{axis} of bRv": turned[:, i] for i, axis in enumerate("xyz")}
     return ErrorMap.of(
         VISION_MAP.name,
@@ -314,7 +314,7 @@ def _between(gyro: GyroPath, platform: GyroPath | None, taken: Array, bRv: Array
 
 def _all_around(attitudes: Array) -> bool:
     """Whether a significant share of attitudes (n, 4) is farther than FADE from the first."""
-    angles = np.linalg.norm(so3.log(so3.multiply(so3.inverse(attitudes[:1]), attitudes)), axis=1)
+    angles = np.linalg.norm(so3.local(attitudes[:1], attitudes), axis=1)
     return bool((angles > FADE).mean() > _FEW_OUTLIERS)
 
 

@@ -128,16 +128,17 @@ class HeadParameters:
             config = config.model_copy(update={"priors": {"vision_scale": 0.0, **config.priors}})
         check_parameters(PARAMETERS, config)
         mounts = quantities(HELMET, config), quantities(CAMERA, config, fixed=not platform)
-        clock = parameter(_key("T"), PICTURE_SPECS, config)
+        clock = parameter(gtsam.symbol("T", 0), PICTURE_SPECS, config)
         return cls(
             bias=Parameter(FIRST_BIAS, quantities(BIAS, config, extra_sigma=0.0 if platform else EARTH_RATE)),
-            helmet=Parameter(_key("H"), mounts[0], rotation_vector_coordinates),
-            camera=Parameter(_key("C"), mounts[1], rotation_vector_coordinates),
+            helmet=Parameter(gtsam.symbol("H", 0), mounts[0], rotation_vector_coordinates),
+            camera=Parameter(gtsam.symbol("C", 0), mounts[1], rotation_vector_coordinates),
             picture=Parameter(
-                _key("T"), (*quantities(OFFSET, config, extra_sigma=stamp_sigma), *(clock.quantities if clock else ()))
+                gtsam.symbol("T", 0),
+                (*quantities(OFFSET, config, extra_sigma=stamp_sigma), *(clock.quantities if clock else ())),
             ),
-            gyro=gyro_errors(_key("G"), SCALE, drivers, config),
-            platform=parameter(_key("P"), (PLATFORM_BIAS, *PLATFORM_SCALE), config) if platform else None,
+            gyro=gyro_errors(gtsam.symbol("G", 0), SCALE, drivers, config),
+            platform=parameter(gtsam.symbol("P", 0), (PLATFORM_BIAS, *PLATFORM_SCALE), config) if platform else None,
         )
 
     @property
@@ -150,7 +151,3 @@ class HeadParameters:
         """All parameters in reporting order."""
         found = (self.bias, self.helmet, self.camera, self.picture, self.gyro, self.platform)
         return tuple(each for each in found if each is not None)
-
-
-def _key(letter: str) -> int:
-    return int(gtsam.symbol(letter, 0))

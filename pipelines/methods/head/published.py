@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
 from alidade.pipelines.methods.head.recording import HeadData
@@ -218,15 +218,11 @@ def _steps(data: HeadData, vision_t: Array) -> list[list[tuple[float, Array, Arr
     """
     stamps = np.union1d(vision_t, data.head_t[(data.head_t > vision_t[0]) & (data.head_t < vision_t[-1])])
     middle, dt = 0.5 * (stamps[1:] + stamps[:-1]), np.diff(stamps)
-    w_iv = _rate_at(middle, data.head_t, data.head_gyro)
+    w_iv = interpolated(middle, data.head_t, data.head_gyro)
     if data.platform_t is None or data.platform_gyro is None:
         w_ib = np.zeros_like(w_iv)
     else:
-        w_ib = _rate_at(middle, data.platform_t, data.platform_gyro)
+        w_ib = interpolated(middle, data.platform_t, data.platform_gyro)
     ends = np.searchsorted(stamps, vision_t)
     steps = list(zip(dt.tolist(), w_iv, w_ib, strict=True))
     return [steps[a:b] for a, b in pairwise(ends)]
-
-
-def _rate_at(at: Array, t: Array, rate: Array) -> Array:
-    return np.column_stack([np.interp(at, t, rate[:, i]) for i in range(3)])

@@ -228,7 +228,7 @@ def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
 
 def white_angle(wxyz: Array) -> float:
     """White noise of attitudes (n, 4), rad per axis, from fourth differences where rotation is least."""
-    turns = so3.log(so3.multiply(so3.inverse(wxyz[:-1]), wxyz[1:]))
+    turns = so3.local(wxyz[:-1], wxyz[1:])
     fourth = np.diff(turns, 3, axis=0)
     if len(fourth) < _FEW:
         return np.inf

@@ -181,7 +181,7 @@ def _error(truth: Attitudes, attitudes: Attitudes) -> tuple[Array, Array]:
 def _delta(attitudes: Attitudes, others: Attitudes) -> Array:
     """Rotation vectors (n, 3), deg, from interpolated attitudes to others at the others' times."""
     at = so3.interpolate(attitudes.time, attitudes.wxyz, others.time)
-    return np.rad2deg(so3.log(so3.multiply(so3.inverse(at), others.wxyz)))
+    return np.rad2deg(so3.local(at, others.wxyz))
 
 
 def _vectors(wxyz: Array) -> Array:
@@ -234,16 +234,14 @@ def validate(data: HeadData, config: Config, values: Mapping[str, float]) -> tup
     start, stop = _windows(data, ways)
     carried = [_carried_on(data, way, start, stop) for way in ways]
     seen = data.vision_wxyz[stop]
-    by_vision = [
-        _rotation_error(so3.compose(way.cRb, bRv, way.vRh), seen) for way, bRv in zip(ways, carried, strict=True)
-    ]
+    by_vision = [so3.local(so3.compose(way.cRb, bRv, way.vRh), seen) for way, bRv in zip(ways, carried, strict=True)]
     time = data.vision_t[stop]
     out = [_validation("against vision", time, by_vision, _vision_noise(data, config, start, stop))]
     if data.truth_t is not None and data.truth_wxyz is not None:
         at = [way.time[stop] for way in ways]
         inside = (np.minimum(*at) >= data.truth_t[0]) & (np.maximum(*at) <= data.truth_t[-1])
         truth = [so3.interpolate(data.truth_t, data.truth_wxyz, t[inside]) for t in at]
-        by_truth = [_rotation_error(bRv[inside], true) for bRv, true in zip(carried, truth, strict=True)]
+        by_truth = [so3.local(bRv[inside], true) for bRv, true in zip(carried, truth, strict=True)]
         if inside.any():
             out.append(_validation("against the truth", time[inside], by_truth))
     return tuple(out)
@@ -271,10 +269,6 @@ def _carried_on(data: HeadData, way: _Applied, start: NDArray[np.intp], stop: ND
     bRv = so3.compose(so3.inverse(way.cRb), data.vision_wxyz[start], so3.inverse(way.vRh))
     bRv = so3.multiply(bRv, way.helmet.increments(t0, t1).wxyz)
     return bRv if way.platform is None else so3.multiply(so3.inverse(way.platform.increments(t0, t1).wxyz), bRv)
-
-
-def _rotation_error(predicted: Array, measured: Array) -> Array:
-    return so3.log(so3.multiply(so3.inverse(predicted), measured))
 
 
 def _validation(against: str, time: Array, errors: Sequence[Array], note: str = "") -> Validation:

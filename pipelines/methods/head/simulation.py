@@ -260,7 +260,7 @@ def _gyro(scenario: HeadScenario, rate_hz: float, phase: float, helmet: bool) ->
     attitude = _platform_attitude(scenario, edges)
     if helmet:
         attitude = so3.multiply(attitude, scenario.head.attitude(edges))
-    return t, so3.log(so3.multiply(so3.inverse(attitude[:-1]), attitude[1:])) * rate_hz
+    return t, so3.local(attitude[:-1], attitude[1:]) * rate_hz
 
 
 def _specific_force(scenario: HeadScenario, t: Array) -> Array:
@@ -293,14 +293,14 @@ def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array
     at = exposures(t, scenario.time_offset_s, effects["clock_skew"])
     filtered = so3.exp(effects["vision_filter"] * _acceleration(scenario, at))
     cRh = so3.compose(cRb, scenario.head.attitude(at), filtered, vRh)
-    turned = so3.log(so3.multiply(so3.inverse(cRh[0]), cRh))
+    turned = so3.local(cRh[0], cRh)
     return t, at, so3.multiply(cRh[0], so3.exp((1.0 + effects["vision_scale"]) * turned))
 
 
 def _acceleration(scenario: HeadScenario, at: Array, h: float = 2e-3) -> Array:
     """Angular acceleration of the helmet on its platform, (K, 3) rad/s^2 in v, by differences over h s."""
     before, now, after = (scenario.head.attitude(at + late) for late in (-h, 0.0, h))
-    ahead, behind = (so3.log(so3.multiply(so3.inverse(now), other)) for other in (after, before))
+    ahead, behind = (so3.local(now, other) for other in (after, before))
     return np.asarray((ahead + behind) / h**2)
 
 

@@ -62,7 +62,7 @@ def _attitude(rate_deg: float) -> Callable[[Applied, Truth], Array]:
         scaled = (1.0 + true.get("vision_scale"))[..., None, None] * seen
         found = applied(cRh=so3.multiply(first, so3.exp(scaled)))["bRv"]
         late = true.get("time_offset") - applied.values.get("time_offset", 0.0)
-        return so3.log(so3.multiply(so3.inverse(bRv), found)) + np.deg2rad(rate_deg) * late[..., None, None] * _EZ
+        return so3.local(bRv, found) + np.deg2rad(rate_deg) * late[..., None, None] * _EZ
 
     return compute
 

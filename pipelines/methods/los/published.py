@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import ChiSquare, Estimate, History, Problem, Residuals
 from alidade.pipelines.methods.los.recording import LosData
@@ -108,12 +108,11 @@ def rates(data: LosData, exact: bool = False) -> tuple[Array, Array, Array]:
         )
     t, error = data.image_t[inside], data.error[inside, :2]
     middle = data.gyro_t
-    azimuth = np.interp(middle, data.gimbal_t, data.gimbal[:, 0])
-    elevation = np.interp(middle, data.gimbal_t, data.gimbal[:, 1])
+    azimuth, elevation = interpolated(middle, data.gimbal_t, data.gimbal).T
     H = sensitivity(azimuth, elevation, data.gyro, exact)
     steps = 0.5 * np.diff(middle)[:, None, None] * (H[1:] + H[:-1])
     integral = np.concatenate([np.zeros((1, 8)), np.cumsum(steps.reshape(-1, 8), axis=0)])
-    at_pictures = np.stack([np.interp(t, middle, column) for column in integral.T], axis=1)
+    at_pictures = interpolated(t, middle, integral)
     duration = np.diff(t)[:, None]
     return t, np.diff(error, axis=0) / duration, (np.diff(at_pictures, axis=0) / duration).reshape(-1, 2, 4)
 

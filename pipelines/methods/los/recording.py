@@ -9,7 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.recording import messages, series
@@ -216,13 +216,12 @@ def _between_pictures(data: LosData) -> tuple[Array, Array, Array]:
     inside = (t >= max(data.gyro_t[0], data.gimbal_t[0])) & (t <= min(data.gyro_t[-1], data.gimbal_t[-1]))
     stride = max(1, round(_STRIDE / float(np.median(np.diff(t)))))
     at, error = t[inside][::stride], data.error[inside][::stride, [1, 0]]
-    gimbal = np.stack([np.interp(at, data.gimbal_t, data.gimbal[:, k]) for k in range(2)], axis=1)
+    gimbal = interpolated(at, data.gimbal_t, data.gimbal)
     turned = np.empty((len(at), 2, 3))
     for some, by_axes in _turned_by_carrier(data):
         t = data.gyro_t[some]
         mine = slice(np.searchsorted(at, t[0]), np.searchsorted(at, t[-1], side="right"))
-        columns = by_axes.reshape(len(t), 6).T
-        turned[mine] = np.stack([np.interp(at[mine], t, column) for column in columns], axis=1).reshape(-1, 2, 3)
+        turned[mine] = interpolated(at[mine], t, by_axes.reshape(len(t), 6)).reshape(-1, 2, 3)
     middle = 0.5 * (gimbal[1:, 1] + gimbal[:-1, 1])
     own = np.diff(gimbal, axis=0) * np.stack([np.cos(middle), np.ones_like(middle)], axis=1)
     return at, own - np.diff(error, axis=0), np.diff(turned, axis=0)
@@ -237,7 +236,7 @@ def _turned_by_carrier(data: LosData) -> Iterator[tuple[slice, Array]]:
     for begin in range(0, len(step), _BLOCK):
         some = slice(max(begin - 1, 0), begin + _BLOCK)
         t, (wx, wy, wz) = data.gyro_t[some], data.gyro[some].T
-        azimuth, elevation = (np.interp(t, data.gimbal_t, data.gimbal[:, k]) for k in range(2))
+        azimuth, elevation = interpolated(t, data.gimbal_t, data.gimbal).T
         s, c, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
         about_z = np.stack([se * s * wx, -se * c * wy, ce * wz], axis=1)
         about_x = np.stack([c * wx, s * wy, np.zeros_like(wz)], axis=1)

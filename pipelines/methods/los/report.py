@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.factors.gimbal import WINDOWS, GimbalPath, command
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
@@ -214,10 +214,7 @@ def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float
     t = data.image_t[chain]
     inside = (data.gyro_t > t[0]) & (data.gyro_t < t[-1])
     at = np.concatenate([t[:1], data.gyro_t[inside], t[-1:]])
-    gyro, true = (
-        np.stack([np.interp(at, data.gyro_t, each) for each in samples.T], axis=1)
-        for samples in (data.gyro, rates(data, values))
-    )
+    gyro, true = (interpolated(at, data.gyro_t, samples) for samples in (data.gyro, rates(data, values)))
     gimbal = GimbalPath(data.gimbal_t, data.gimbal)
     recorded = gimbal.at(at)
     px = values.get("delta_px", 0.0)
@@ -230,7 +227,7 @@ def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float
         steps = 0.5 * np.diff(at)[:, None] * (difference[1:] + difference[:-1])
         extra = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     was = gimbal.at(t)
-    would = was + np.stack([np.interp(t, at, extra[:, k]) for k in range(2)], axis=1)
+    would = was + interpolated(t, at, extra)
     cRc = so3.multiply(_camera_attitude(would, px), so3.inverse(_camera_attitude(was, px)))
     return los_error(so3.rotate(cRc, los_direction(data.error[chain])))
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import Simulator
@@ -166,7 +166,7 @@ class LosMotion:
 
     def gimbal_at(self, t: Array) -> Array:
         """Azimuth and elevation (n, 2), rad, at times (n,), s."""
-        return np.stack([np.interp(t, self.edges, self.gimbal[:, k]) for k in range(2)], axis=1)
+        return interpolated(t, self.edges, self.gimbal)
 
     def covers(self, t: Array) -> NDArray[np.bool_]:
         """Mask of the times (n,) within the simulated motion."""
@@ -226,7 +226,7 @@ def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np
     up = np.array([0.0, 0.0, float(gravity(np.deg2rad(scenario.latitude_deg or 0.0)))])
     for some in _blocks(len(gyro_t)):
         iRm = so3.multiply(carrier_attitude(scenario, edges[some.start : some.stop + 1]), _gyro_mount(scenario))
-        exact = so3.log(so3.multiply(so3.inverse(iRm[:-1]), iRm[1:])) * rate_hz
+        exact = so3.local(iRm[:-1], iRm[1:]) * rate_hz
         force[some] = _in_gyro(scenario, gyro_t[some], up)
         read = read_by(exact, "gyro", effects, force[some])
         gyro[some] = read + bias[some] + drift(scenario.temperature, "gyro", effects, gyro_t[some])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
 from alidade.pipelines.display.sphere_map import described
@@ -26,10 +26,9 @@ from alidade.pipelines.methods.place import FIELD, field_at, known_strength
 from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE
 from alidade.pipelines.methods.triads import triad_names
-from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess
+from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess, ring
 from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, NO_RATE, TumbleData
-from alidade.pipelines.methods.tumble.ring import ring
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
 from alidade.pipelines.recording.plausibility import DEAD_BAND, SI, dead_band, likely_unit
 from alidade.pipelines.settings import Config
@@ -431,9 +430,9 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
     gyro, others = None, []
     if data.gyro is not None and data.gyro_t is not None:
         density = sampled(stated("gyro_density", config, data.gyro_density), data.gyro_t, data.gyro).used
-        gyro = Stream(_at(t, data.gyro_t, data.gyro), density * root_rate, GYRO_TREMOR)
+        gyro = Stream(interpolated(t, data.gyro_t, data.gyro), density * root_rate, GYRO_TREMOR)
     if data.mag is not None and data.mag_t is not None:
-        mag = _at(t, data.mag_t, data.mag)
+        mag = interpolated(t, data.mag_t, data.mag)
         others.append(Stream(mag / mag.std(), 1e-3, 0.0))
     try:
         found = find_static_intervals(t, accel, gyro, *others)
@@ -446,11 +445,6 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
 def _scatter_within(t: Array, accel: Array, rests: Array) -> float:
     """Median over rests of an accelerometer's scatter over gravity, which reveals slow rotations."""
     return float(np.median([relative_scatter(accel[first:last]) for first, last in np.searchsorted(t, rests)]))
-
-
-def _at(time: Array, stamps: Array, values: Array) -> Array:
-    """Interpolate vectors (n, 3) linearly between their stamps, to given times."""
-    return np.stack([np.interp(time, stamps, axis) for axis in values.T], axis=1)
 
 
 def _accelerometer(data: TumbleData, config: Config, rests: Array | None, swung: bool) -> Sensor:
@@ -635,7 +629,7 @@ def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[ND
     step = 1.5 * float(np.median(np.diff(t)))
     after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
     rows = np.flatnonzero((at >= t[0]) & (at <= t[-1]) & (t[after] - t[after - 1] <= step))
-    readings = _at(at[rows], t, values)
+    readings = interpolated(at[rows], t, values)
     return rows, at[rows], readings, np.ones(len(rows))
 
 

@@ -119,7 +119,7 @@ class _Motion:
         lean = np.arccos(cosine)[:, None] * np.stack([np.cos(around), np.sin(around), np.zeros_like(around)], axis=1)
         about_up = heading[:, None] * np.array([0.0, 0.0, 1.0])
         self.nRb = so3.multiply(so3.exp(about_up), so3.exp(lean))
-        self.turns = so3.log(so3.multiply(so3.inverse(self.nRb[:-1]), self.nRb[1:]))
+        self.turns = so3.local(self.nRb[:-1], self.nRb[1:])
         lasting = np.linalg.norm(self.turns, axis=1) / scenario.turn_rad_s
         self.starts = scenario.rest_s + np.cumsum(np.append(0.0, lasting[:-1] + scenario.rest_s))
         self.lasting = np.maximum(lasting, 1e-3)
@@ -167,7 +167,7 @@ def _gyro(
     rate_hz = sensor.rate_hz if beside is None else beside.rate_hz
     t = sample_times(motion.duration, rate_hz, 0.3)
     before, now, after = (motion.attitude(t + step) for step in (-_STEP, 0.0, _STEP))
-    rate = so3.log(so3.multiply(so3.inverse(before), after)) / (2.0 * _STEP) + so3.rotate(so3.inverse(now), earth)
+    rate = so3.local(before, after) / (2.0 * _STEP) + so3.rotate(so3.inverse(now), earth)
     S, bias = sensor.scale * rng.standard_normal(6), sensor.bias * rng.standard_normal(3)
     G = (0.0 if beside is None else sensor.g_sensitivity) * rng.standard_normal((3, 3))
     gain = np.eye(3) + np.array([[S[0], S[3], S[4]], [S[3], S[1], S[5]], [S[4], S[5], S[2]]])

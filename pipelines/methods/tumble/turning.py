@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.factors.earth import EARTH_RATE, earth_rate
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.gyro_chain import GyroChain, shared_keyframes
@@ -296,8 +296,7 @@ def turning(
     walk = walking(config)
     drivers: dict[ParameterSpec, Array] = {}
     if accel is not None and data.accel_t is not None:
-        force = [np.interp(data.gyro_t, data.accel_t, axis) for axis in accel.whole.T]
-        drivers[SENSITIVITY] = np.stack(force, axis=1)
+        drivers[SENSITIVITY] = interpolated(data.gyro_t, data.accel_t, accel.whole)
     if data.temperature is not None:
         drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)
     half_width, beyond = dead_band(data.gyro_t, data.gyro)
@@ -375,7 +374,7 @@ def _attitudes(time: Array, path: GyroPath, mag: Seen, beside: tuple[Seen, Rows]
     """Initial attitudes aRb (k, 4): gyro propagation, corrected to the field's direction, then to up."""
     turns = path.increments(time[:-1], time[1:]).wxyz
     along = np.array([0.0, np.cos(dip), -np.sin(dip)])
-    field = np.stack([np.interp(time, mag.time, axis) for axis in mag.direction.T], axis=1)
+    field = interpolated(time, mag.time, mag.direction)
     out = np.empty((len(time), 4))
     # Any attitude in which the field is along itself.
     out[0] = so3.shortest(field[0], along)

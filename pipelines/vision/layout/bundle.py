@@ -456,7 +456,7 @@ def with_motion(bundle: Bundle, pictures: Index) -> Bundle:
         last = np.maximum(place + _BESIDE, np.searchsorted(time, time + _NEAR) - 1).clip(max=len(run) - 1)
         for k, a, b in zip(place, first, last, strict=True):
             about = run[a : b + 1]
-            turned = so3.log(so3.multiply(so3.inverse(bundle.cRb[run[k]]), bundle.cRb[about]))
+            turned = so3.local(bundle.cRb[run[k]], bundle.cRb[about])
             away = np.concatenate([turned, bundle.position[about]], axis=1)
             motion[run[k]] = _slope(time[a : b + 1] - time[k], away)
     return replace(bundle, motion=motion)
