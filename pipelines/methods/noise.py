@@ -109,6 +109,22 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     return level
 
 
+def at_most_sampled(noise: Noise, time: Array, samples: Array) -> Level:
+    """Bound a sensor's white noise level above by that of its samples in motion, which adds noise and takes none away.
+
+    Args:
+        noise: sigma of a sample.
+        time: (n,) s.
+        samples: (n, k).
+    """
+    level = Level(replace(noise, families=()))
+    differences = None if noise.known == 0.0 or noise.stated == 0.0 else _high_differences(time, samples, 1)
+    if differences is None:
+        return level
+    ratio = _white_sigma(differences) / noise.stated
+    return replace(level, scale=ratio, found=ratio, sigma=_TRUSTED * ratio) if ratio < 1.0 else level
+
+
 def at_least_at_rest(level: Level, time: Array, gyro: Array, force: Array | None) -> Level:
     """Bound a gyro's white noise level below by the noise that the gyro shows at rest.
 
@@ -231,23 +247,33 @@ def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
     From high differences of means of 1, 2, 4, ... samples, each of which sees a lower band: the first two that agree.
     None where none do, as behind a filter, under vibration, or where steps of the readings hide the noise.
     """
-    interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if not interval > 0.0:
-        return None
-    even = np.append(np.abs(np.diff(time) / interval - 1.0) < 0.5, False)
     before: float | None = None
     for count in _MEANS:
-        pieces = np.split(samples, np.flatnonzero(~even) + 1)
-        found = [_differences(piece, count) for piece in pieces]
-        differences = found[0] if len(found) == 1 else np.concatenate(found)
-        if differences.size < _FEWEST or np.mean(differences == 0.0) > 0.05:
+        differences = _high_differences(time, samples, count)
+        if differences is None:
             return None
-        density = robust_sigma(differences) / comb(2 * _ORDER, _ORDER) ** 0.5 * (count * interval) ** 0.5
+        density = _white_sigma(differences) * (count * float(np.median(np.diff(time)))) ** 0.5
         if before is not None and abs(np.log(density / before)) < _ALIKE:
             # Neighbouring differences are correlated, and the median is less efficient than the mean square.
             return before, float(2.0 * differences.size**-0.5)
         before = density
     return None
+
+
+def _white_sigma(differences: Array) -> float:
+    """Sigma of white samples with these high-order differences."""
+    return robust_sigma(differences) / comb(2 * _ORDER, _ORDER) ** 0.5
+
+
+def _high_differences(time: Array, samples: Array, count: int) -> Array | None:
+    """High-order differences of means of `count` samples (n, k) between gaps; None of few, or of rounded samples."""
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if not interval > 0.0:
+        return None
+    even = np.append(np.abs(np.diff(time) / interval - 1.0) < 0.5, False)
+    found = [_differences(piece, count) for piece in np.split(samples, np.flatnonzero(~even) + 1)]
+    differences = found[0] if len(found) == 1 else np.concatenate(found)
+    return None if differences.size < _FEWEST or np.mean(differences == 0.0) > 0.05 else differences
 
 
 def _differences(samples: Array, count: int) -> Array:

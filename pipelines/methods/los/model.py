@@ -55,7 +55,7 @@ from alidade.pipelines.methods.los.parameters import (
     LosParameters,
 )
 from alidade.pipelines.methods.los.recording import LosData
-from alidade.pipelines.methods.noise import sampled, stated, typical, walking
+from alidade.pipelines.methods.noise import at_most_sampled, sampled, stated, typical, walking
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.plausibility import DEAD_BAND as HAS_DEAD_BAND
 from alidade.pipelines.recording.plausibility import dead_band, hidden
@@ -158,7 +158,7 @@ def _noises(data: LosData, config: Config) -> dict[str, Level]:
     if np.isfinite(data.error[:, 2]).any():
         found.append(Level(stated("los_roll", config, roll, _FAMILIES[1:], (2,))))
     found.append(sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.gyro_t, data.gyro))
-    found += [walking(config), Level(stated("encoder", config))]
+    found += [walking(config), at_most_sampled(stated("encoder", config), data.gimbal_t, data.gimbal)]
     return {level.noise.name: level for level in found}
 
 
@@ -197,7 +197,9 @@ def _prepare(
     driving = acting(parameters.gyro, drivers)
     noises = _noises(data, config) if before is None else before.noises
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
-    used, dropped = _Used.of(data, config, gimbal, WINDOWS[0] if parameters.sight else 0.0, start)
+    used, dropped = _Used.of(
+        data, config, noises["encoder"].used, gimbal, WINDOWS[0] if parameters.sight else 0.0, start
+    )
     chains, time, measured = used.chains, used.time, used.measured
     if before is not None:
         guessed = before.mount, before.chain.gyro.bias_hat, before.delay
@@ -280,10 +282,13 @@ class _Used:
 
     @classmethod
     def of(
-        cls, data: LosData, config: Config, gimbal: GimbalPath, margin: float, start: float
+        cls, data: LosData, config: Config, noise: float, gimbal: GimbalPath, margin: float, start: float
     ) -> tuple[_Used, dict[str, int]]:
-        """Select pictures from `start` on and `margin` s away from gaps; return them and exclusion counts."""
-        encoder = _encoder_sigma(data.image_t, gimbal, config)
+        """Select pictures from `start` on and `margin` s away from gaps; return them and exclusion counts.
+
+        `noise` is the encoders', rad a sample.
+        """
+        encoder = noise * np.linalg.norm(gimbal.weights(data.image_t)[1], axis=1)
         covariance = _covariance(data, gimbal, config, encoder)
         rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), margin)
         late = data.image_t[rows] >= start
@@ -305,12 +310,6 @@ def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> 
         clock = Clock(start - before.around.elapsed[k])
         found[0] = start - before.around.tracked[k]
     return clock, used.time - found[np.cumsum(used.starts) - 1]
-
-
-def _encoder_sigma(time: Array, gimbal: GimbalPath, config: Config) -> Array:
-    """Encoder noise (K,), rad, of gimbal angles interpolated to times (K,)."""
-    _, weights = gimbal.weights(time)
-    return np.asarray(first_given(config.noise.encoder, DEFAULT_NOISE.encoder) * np.linalg.norm(weights, axis=1))
 
 
 def _covariance(data: LosData, gimbal: GimbalPath, config: Config, encoder: Array) -> Array:
