@@ -147,6 +147,7 @@ class BoundModel:
         """
         other = copy(self)
         other.weights = np.broadcast_to(weights, (len(self.model.time), self.model.rows))
+        other.model = self.model.at_noise(other.weights)
         other._last = None
         return other
 

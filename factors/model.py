@@ -116,6 +116,10 @@ class Model:
         """Return the model at the nearest measurements without noise, where its effect on the Jacobians matters."""
         return self
 
+    def at_noise(self, _: Array) -> Model:
+        """Return the model for noise of 1 / weights (n, m) of that used for whitening, where residuals depend on it."""
+        return self
+
     def on(
         self,
         *keys: Keys,
@@ -161,6 +165,10 @@ class WrappedModel(Model):
     def blocks(self) -> tuple[Block, ...]:
         """Kinds of the variable blocks."""
         return tuple(self.model.blocks)
+
+    def at_noise(self, weights: Array) -> Model:
+        """Return the wrapper of the wrapped model at the noise."""
+        return replace(self, model=self.model.at_noise(weights))
 
     @property
     def sqrt_information(self) -> Array:

@@ -10,7 +10,8 @@ that follow from angles and pictures by a further
 
 a_k the axes of those of the gimbal's turns that stand between gyro and a. So errors e_i change the noise of the gyro's
 increments to (1 + K) n, K n = sum e_i Y_i dg, with the steps dg by which n drives the gimbal; and that of pictures to
-(1 + K) v, K v = sum e_i Y_i dg, with the steps E(dg | v) that are the encoders' part of v.
+(1 + K) v, K v = sum e_i Y_i dg, with the steps E(dg | v) that are the encoders' part of v: the smaller a part, the
+larger v is than stated.
 
 Errors that are unknowns would be chosen to make that noise smaller, and be biased by a number of sigmas that grows with
 the square root of the recording's length. Multiplied with the inverse of 1 + K, residuals have the same noise whatever
@@ -20,14 +21,14 @@ the errors are. K is of first order in them, so they are counted from a first gu
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from alidade.factors.array import Array
 from alidade.factors.los import SIGHT_ERRORS
-from alidade.factors.model import Block, Residuals, Stacked, WrappedModel, dimension
+from alidade.factors.model import Block, Model, Residuals, Stacked, WrappedModel, dimension
 
 # The turns of gimbal and camera, from the gyro on.
 _AZIMUTH, _ELEVATION, _NONPERPENDICULARITY, _COLLIMATION, _ROLL = range(5)
@@ -116,6 +117,7 @@ class ThroughGimbalFactor(WrappedModel):
         gimbal: (n, 2) azimuth and elevation, rad.
         errors: of the gimbal.
         encoder: (n,) sigma of the encoders' noise within the pictures', rad.
+        weights: (n, m) inverse of the pictures' noise in units of the whitening noise; None: 1.
         following: the share of the gyro's commands that the gimbal follows.
         error_blocks: which of the model's blocks hold the errors; empty: they are appended after the model's.
     """
@@ -125,13 +127,18 @@ class ThroughGimbalFactor(WrappedModel):
     encoder: Array | None = None
     following: float = 1.0
     error_blocks: tuple[int, ...] = ()
+    weights: Array | None = None
     shapes: ClassVar = {"gimbal": (2,), "encoder": ()}
-    stacked: ClassVar = ("model", "gimbal", "errors", "encoder")
+    stacked: ClassVar = ("model", "gimbal", "errors", "encoder", "weights")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Blocks of the wrapped model and of the errors."""
         return (*self.model.blocks, *(() if self.error_blocks else self.errors.blocks))
+
+    def at_noise(self, weights: Array) -> Model:
+        """Return the model with the encoders' share of noise 1 / weights (n, m) times the one used for whitening."""
+        return replace(self, model=self.model.at_noise(weights), weights=weights)
 
     def __call__(self, *blocks: Array) -> Residuals:
         """Residual (1 + K)^-1 r, (n, m), with r the residual of the wrapped model."""
@@ -170,7 +177,9 @@ class ThroughGimbalFactor(WrappedModel):
             return -self.following * steps, camera
         by_angles = np.array([[zero, ce, se], [zero + 1.0, zero, zero]]).transpose(2, 1, 0)
         to_residuals = self.sqrt_information @ np.eye(3)[: self.rows]
-        return (self.encoder**2)[:, None, None] * (to_residuals @ by_angles).swapaxes(1, 2), to_residuals
+        information = np.ones_like(to_residuals[:, :, 0]) if self.weights is None else self.weights**2
+        to_steps = (information[..., None] * (to_residuals @ by_angles)).swapaxes(1, 2)
+        return (self.encoder**2)[:, None, None] * to_steps, to_residuals
 
     def _by_steps(self, errors: list[tuple[int, Array, Array]]) -> Array:
         """Matrices Y (errors, 3, 2, n), camera frame, of errors with rotation axis, function, angle derivatives."""

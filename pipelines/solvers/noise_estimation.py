@@ -102,7 +102,10 @@ def acting(levels: Iterable[Level]) -> list[Level]:
 
 def _at_levels(group: Group, levels: Sequence[Level]) -> Group:
     own = [level for level in levels if group.family in level.noise.families]
-    return replace(group, weights=level_weights(group.all_weights, own, group.beside, group.fixed)) if own else group
+    if not own:
+        return group
+    weights = level_weights(group.all_weights, own, group.beside, group.fixed)
+    return replace(group, weights=weights, model=group.model.at_noise(weights))
 
 
 def level_weights(weights: Array, levels: Iterable[Level], beside: Array | None, fixed: Array | None = None) -> Array:

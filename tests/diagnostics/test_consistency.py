@@ -68,9 +68,13 @@ def head_of(duration_s: float, sensors: Sensors | None = IDEAL, moving: bool = T
 
 @pytest.fixture(scope="module")
 def los() -> Case:
+    return los_of(1)
+
+
+def los_of(seed: int) -> Case:
     """15 s of sway about three axes."""
     scenario = LosScenario(duration_s=15, image_rate_hz=20, gyro_rate_hz=200, sensors=IDEAL)
-    data, _ = simulate_los(scenario, 1)
+    data, _ = simulate_los(scenario, seed)
     return method("los"), data, load_config(los_config(scenario).encode())
 
 
@@ -278,10 +282,14 @@ def test_encoders_read_20_ms_late(los: Case) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("key", ["los_error", "gyro_density"])
-def test_the_noise_that_is_too_small_is_told_from_the_others(los: Case, key: str) -> None:
-    find, data, config = los
-    assert list(noise_notes((find, data, with_noise(config, **{key: 0.35})))) == [key]
+@pytest.mark.parametrize(
+    ("key", "factor", "seed"),
+    [("gyro_density", 0.35, 1), ("los_error", 0.35, 1), ("los_error", 0.2, 2), ("encoder", 3.0, 1)],
+)
+def test_the_noise_that_is_stated_wrong_is_told_from_the_others(key: str, factor: float, seed: int) -> None:
+    """And from `los_scale`, of which the encoders' share of the pictures' noise would be a function otherwise."""
+    find, data, config = los_of(seed)
+    assert list(noise_notes((find, data, with_noise(config, **{key: factor})))) == [key]
 
 
 @pytest.mark.slow

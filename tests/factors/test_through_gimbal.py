@@ -96,9 +96,9 @@ def test_noise_of_increments_is_that_of_the_gyro_whatever_the_gimbal_is(followin
     np.testing.assert_allclose(ours(np.ones((N, 1)), *blocks)[0], n, atol=3e-5)
 
 
-@pytest.mark.parametrize("rows", [2, 3])
-def test_noise_of_pictures_is_as_stated_whatever_the_gimbal_is(rows: int) -> None:
-    """Covariance of encoder noise in pictures, by differences at the errors, whitened by the stated one: 1."""
+@pytest.mark.parametrize(("rows", "stated"), [(2, 1.0), (3, 1.0), (2, 0.4), (3, 2.0)])
+def test_noise_of_pictures_is_the_same_whatever_the_gimbal_is(rows: int, stated: float) -> None:
+    """Covariance of encoder noise in pictures, by differences at the errors, whitened at its true level: 1."""
     angles, encoder, scale, blocks = _errors(1e-3)
     sigma, own = 5e-6, 4e-6
 
@@ -112,15 +112,15 @@ def test_noise_of_pictures_is_as_stated_whatever_the_gimbal_is(rows: int) -> Non
             out += sigma**2 * by_angle[:, :, None] * by_angle[:, None, :]
         return out
 
-    root = np.linalg.cholesky(np.linalg.inv(covariance(np.zeros(len(NAMES)), np.zeros(4), 0.0))).swapaxes(1, 2)
+    root = np.linalg.cholesky(np.linalg.inv(covariance(np.zeros(len(NAMES)), np.zeros(4), 0.0))).swapaxes(1, 2) / stated
     spread = root @ np.linalg.cholesky(covariance(angles, encoder, scale))
     columns = []
     for column in np.moveaxis(spread, 2, 0):
         errors = GimbalErrors(NAMES, MOUNT)
         ours = ThroughGimbalFactor(_fixed(column, root), GIMBAL, errors, np.full(N, sigma))
-        columns.append(ours(np.ones((N, 1)), *blocks)[0])
+        columns.append(stated * ours.at_noise(np.full((N, rows), stated))(np.ones((N, 1)), *blocks)[0])
     whitened = np.stack(columns, axis=2)
-    assert np.abs(spread @ spread.swapaxes(1, 2) - np.eye(rows)).max() > 5e-4
+    assert np.abs(stated**2 * spread @ spread.swapaxes(1, 2) - np.eye(rows)).max() > 5e-4
     np.testing.assert_allclose(whitened @ whitened.swapaxes(1, 2), np.tile(np.eye(rows), (N, 1, 1)), atol=2e-5)
 
 
@@ -181,7 +181,8 @@ def test_jacobians_of_pictures_agree_with_differences(rows: int) -> None:
     root = rng.standard_normal((N, rows, rows)) + 3.0 * np.eye(rows)
     model = _fixed(rng.standard_normal((N, rows)), root)
     factor = ThroughGimbalFactor(model, GIMBAL, GimbalErrors(NAMES, MOUNT), np.full(N, 0.3))
-    assert_jacobians(factor, [np.full((N, 1), 0.7), *_errors(0.1)[3]])
+    for each in (factor, factor.at_noise(rng.uniform(0.5, 1.5, (N, rows)))):
+        assert_jacobians(each, [np.full((N, 1), 0.7), *_errors(0.1)[3]])
     functions = GimbalMap(rng.standard_normal((N, 3)), rng.standard_normal((N, 3, 2)))
     factor = ThroughGimbalFactor(model, GIMBAL, functions, np.full(N, 0.3))
     assert_jacobians(factor, [np.full((N, 1), 0.7), 0.1 * rng.standard_normal((N, 6))])
