@@ -24,6 +24,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors.array import Array
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
     Attitudes,
     ChiSquare,
@@ -47,6 +48,7 @@ from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import added_by_shares, sigma_ratio, variance_shares
 from alidade.pipelines.solvers.gating import Prediction, RowBuffer
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem, undetermined
+from alidade.pipelines.solvers.marginal_likelihood import levels_settled
 from alidade.pipelines.solvers.posterior import WIDEST, Reported
 from alidade.pipelines.solvers.smoother import (
     FixedLagSmoother,
@@ -404,18 +406,20 @@ class IncrementalSolver:
 
     def _solve_batch(self) -> None:
         """Solve all steps since the marginal in batch; if the result is linear enough, start the smoother."""
+        before = self.state.levels
         solved = self._batch_solution(self._all_steps_since())
         if self.state.marginal is None:
             self.state.gate.adopt(residuals_by_family(solved.engine, solved.solution.values))
         if self.initialising:
             since = self.time - self.steps_since[0].time
+            earlier = self.steps_since[0].time + self._of[1]
             self._solved, self._of, self._estimate = solved, (len(self.steps_since), since), None
             self.moments += 1
             if self._beyond.any():
                 # Second order that has once gone far enough does so from then on.
                 beyond = beyond_second_order(solved.compiled, solved.posterior)
                 self._beyond[solved.posterior.reported.free] &= beyond
-            if since < _MAX_INITIALISATION and not self._is_linear(solved):
+            if since < _MAX_INITIALISATION and not self._can_continue(solved, before, earlier):
                 self._record()
                 return
             history = self.estimate().posterior_history
@@ -435,12 +439,22 @@ class IncrementalSolver:
         self._start_from(solved)
         self._record()
 
-    def _is_linear(self, solved: Solved) -> bool:
-        """Whether a smoother can continue from a solution: no weak direction, little second-order variance."""
+    def _can_continue(self, solved: Solved, before: Sequence[Level], since: float) -> bool:
+        """Whether a smoother can continue from a solution: no weak direction, little second order, settled levels.
+
+        Args:
+            solved: the solution.
+            before: noise levels of the solution before.
+            since: its time, s.
+        """
         if self.state.trouble or len(self.steps_since) < MIN_STEPS or self.state.gate.too_few_to_decide():
             return False
         posterior = solved.posterior
-        return not posterior.directions.weak.shape[1] and posterior.second_order_share() < _MAX_CURVATURE
+        if posterior.directions.weak.shape[1] or posterior.second_order_share() >= _MAX_CURVATURE:
+            return False
+        if not (self.problem.marginal_likelihood and solved.compiled.engine.is_chain):
+            return True
+        return levels_settled(solved.compiled, solved.levels, solved.solution, before, since)
 
     def _all_steps_since(self) -> list[Step]:
         """Return the steps since the marginal, preceded by a step that holds the marginal itself."""

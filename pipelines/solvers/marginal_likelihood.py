@@ -61,6 +61,8 @@ SANDWICH_BLOCK_S = 5.0
 _ROUNDS, _MOST_SOLUTIONS, _STEADY = 2, 6, 0.05
 # Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`.
 _ABOVE = 2.0
+# Ratio of the noise of measurements at two sets of levels up to which these are the same.
+_SAME = 1.2
 # By which another maximum has to lower -2 log L: what one more noise does by chance once in a thousand.
 _CLEARLY = 10.8
 # Random right sides that estimate traces: a quarter of a level's own sigma.
@@ -827,6 +829,38 @@ def _at(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tupl
     """Linearise the chain about a solution; return it and the variances (n,) of each kind of rows."""
     chain = LinearChain.of(compiled.engine, solution.values)
     return chain, chain.variances(levels, unwidened(solution.engine.inliers(solution.values)), NO_SAY)
+
+
+def levels_settled(
+    compiled: Compiled, levels: Sequence[Level], solution: Solution, before: Sequence[Level], since: float
+) -> bool:
+    """Whether noise levels suffice for the measurements to come: determined, and the same as from less.
+
+    A default is determined if it could not be larger by its prior's sigma: -2 log L rises by what its prior adds
+    there. At rest it does not for what grows with motion. The same are levels with which the measurements since then
+    are as noisy, to a fifth, as with the levels before.
+
+    Args:
+        compiled, levels, solution: as above.
+        before: levels of the solution before.
+        since: time of that one, s.
+    """
+    chain, variances = _at(compiled, levels, solution)
+    for rows in chain.rows:
+        late = rows.time > since
+        now, then = (float(rows.variance(each)[late].mean()) if late.any() else 1.0 for each in (levels, before))
+        if not _SAME**-2 < now / then < _SAME**2:
+            return False
+    factors = [variance / rows.variance(levels) for rows, variance in zip(chain.rows, variances, strict=True)]
+    found = chain.solved(variances)
+    for i, level in enumerate(levels):
+        if found is None or not (level.noise.estimated and level.noise.source == "default"):
+            continue
+        larger = [*levels[:i], replace(level, scale=level.scale * float(np.exp(level.noise.known))), *levels[i + 1 :]]
+        tried = chain.solved([v * f for v, f in zip(chain.variances(larger), factors, strict=True)])
+        if tried is not None and tried.value < found.value + 1.0:
+            return False
+    return True
 
 
 def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> dict[str, Residuals]:
