@@ -59,7 +59,8 @@ _HALVINGS, _FINE = 6, 1e-3
 SANDWICH_BLOCK_S = 5.0
 # Linearisations before the first solution, solutions at most; levels have settled whose logarithms move by less.
 _ROUNDS, _MOST_SOLUTIONS, _STEADY = 2, 6, 0.05
-# Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`.
+# Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`, and up to which a default
+# is expected.
 _ABOVE = 2.0
 # Ratio of the noise of measurements at two sets of levels up to which these are the same.
 _SAME = 1.2
@@ -836,9 +837,9 @@ def levels_settled(
 ) -> bool:
     """Whether noise levels suffice for the measurements to come: determined, and the same as from less.
 
-    A default is determined if it could not be larger by its prior's sigma: -2 log L rises by what its prior adds
-    there. At rest it does not for what grows with motion. The same are levels with which the measurements since then
-    are as noisy, to a fifth, as with the levels before.
+    A default is determined if the measurements exclude levels above it as its prior does: at `_ABOVE` of the prior's
+    sigmas -2 log L rises by as much as the prior adds there. At rest it does not for what grows with motion. Levels are
+    the same that give the measurements since then the same noise, to a fifth, as the levels before.
 
     Args:
         compiled, levels, solution: as above.
@@ -856,9 +857,10 @@ def levels_settled(
     for i, level in enumerate(levels):
         if found is None or not (level.noise.estimated and level.noise.source == "default"):
             continue
-        larger = [*levels[:i], replace(level, scale=level.scale * float(np.exp(level.noise.known))), *levels[i + 1 :]]
+        above = replace(level, scale=level.scale * float(np.exp(_ABOVE * level.noise.known)))
+        larger = [*levels[:i], above, *levels[i + 1 :]]
         tried = chain.solved([v * f for v, f in zip(chain.variances(larger), factors, strict=True)])
-        if tried is not None and tried.value < found.value + 1.0:
+        if tried is not None and tried.value < found.value + _ABOVE**2:
             return False
     return True
 

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import alidade
 from alidade.factors.array import Array
 from alidade.pipelines.estimation.problem import Estimate, Problem
-from alidade.pipelines.methods.head.simulation import HeadScenario
+from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.sensors import EulerMotion
+from alidade.pipelines.solvers import incremental as online
 from alidade.pipelines.solvers.batch import minimum, solve, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver, solve_incremental
@@ -24,6 +26,8 @@ MOUNT = slice(3, 6)
 PRIOR = 0.35
 SCENARIO = HeadScenario(vision_rate_hz=10.0, gyro_rate_hz=100.0, sensors=Sensors(), helmet_mount_deg=(12.0, -8.0, 10.0))
 
+# s at rest, and noise of the gyro over its rate afterwards, 1/sqrt(Hz).
+REST_S, RATE_NOISE = 14.3, 2.8e-3
 # A run that has not begun is solved anew at each picture.
 FEW: dict[str, object] = {"vision_rate_hz": 7.0, "gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0}
 
@@ -129,6 +133,32 @@ def test_a_minute_at_rest_is_not_marginalised_while_noise_moves_the_mount() -> N
     found = followed(problem, truth, np.array([30.0, 57.0, 63.5]))
     assert not found.message
     assert max(found.nees) < chi2.ppf(0.999, found.numbers)
+
+
+def test_noise_levels_of_a_rest_are_not_those_of_the_motion_to_come(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With those found at the first motion, a level that grows with the rate is its default, 50 times too small."""
+    monkeypatch.setattr(online, "_FIRST_SOLVE", REST_S - 1.2)  # solutions of the rest alone end nothing
+    scenario = SCENARIO.model_copy(
+        update={
+            "duration_s": 40.0,
+            "head": _rest_first(REST_S),
+            "platform": None,
+            "noise": SCENARIO.noise.model_copy(update={"vision_attitude": 5e-4, "gyro_density": 2e-4}),
+        }
+    )
+    data, _ = simulate_head(scenario, 1)
+    rate = np.linalg.norm(data.head_gyro, axis=1, keepdims=True)
+    white = RATE_NOISE * np.random.default_rng(1).standard_normal(data.head_gyro.shape) * scenario.gyro_rate_hz**0.5
+    noisy = {**vars(data), "head_gyro": data.head_gyro + rate * white, "gyro_density": None, "vision_cov": None}
+    problem = alidade.open(noisy, method="head").problem()
+    following = IncrementalSolver(problem, DEFAULT_WINDOW)
+    for step in problem.steps(1):
+        following.add_step(step)
+        if not following.initialising:
+            break
+    assert not following.initialising
+    levels = {level.noise.name: level.used for level in following.state.levels}
+    assert levels["gyro_rate_noise"] == pytest.approx(RATE_NOISE, rel=0.5)
 
 
 @pytest.mark.slow

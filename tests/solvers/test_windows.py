@@ -65,6 +65,7 @@ def test_every_window_ends_where_batch_does(method: str, window: float | None) -
 )
 def test_so_many_keyframes_are_kept(method: str, changes: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(online, "MIN_STEPS", 20)
+    monkeypatch.setattr(online, "levels_settled", lambda *_: True)
     problem = made(method, duration_s=6.0, **changes)
     run = IncrementalSolver(problem, Keyframes(7))
     held = []
