@@ -5,8 +5,9 @@ outliers cannot be identified. So there is no smoother yet: everything so far is
 1.15^2, ... s, and until the next solution the estimate is the last one, with batch's weak directions and second-order
 terms (alidade.pipelines.solvers.weak_directions). While outliers may be the majority of a family, everything that has
 a prior stays there, and so do numbers for which second order does not go far enough, as with two or three attitudes of
-a triad. The phase ends when no direction of the calibrated numbers is weak any more and second-order terms are a small
-share of every variance; at the latest after 600 s.
+a triad. The phase ends when no direction of the calibrated numbers is weak any more, second-order terms are a small
+share of every variance, and noise levels have settled (`marginal_likelihood.levels_settled`): with those of a rest the
+smoother would reject the motion. At the latest it ends after 600 s.
 
 **Afterwards** states are marginalised out of a fixed-lag window: an update costs the same in hour ten as in minute one.
 From time to time all but the active variables are marginalised out, and a new smoother continues from that Gaussian
