@@ -77,7 +77,7 @@ _LEAST_VARIANCE = 1e-24
 _FREED = 10
 # Time from the first step to the first batch solution, s; ratio of the times of successive ones; and the time after
 # which the initialisation phase ends in any case, s: the cost of a batch solution grows with it.
-_FIRST_SOLVE, _SOLVE_GROWTH, _MAX_INITIALISATION = 1.0, 1.15, 600.0
+FIRST_SOLVE, _SOLVE_GROWTH, _MAX_INITIALISATION = 1.0, 1.15, 600.0
 # Steps before which that phase does not end: few large ones cost little to solve again.
 MIN_STEPS = 100
 # Largest share of a variance that is of second order with which it ends.
@@ -184,7 +184,7 @@ class IncrementalSolver:
             self._advance(self._smoother, step)
         since = step.time - (self.steps_since[0].time if self.state.marginal is None else self.state.marginal.time)
         if self.initialising:
-            if since >= max(_FIRST_SOLVE, _SOLVE_GROWTH * self._of[1]):
+            if since >= max(FIRST_SOLVE, _SOLVE_GROWTH * self._of[1]):
                 self._solve_batch()
         elif since >= _MARGINALIZE_EVERY and isinstance(self._smoother, FixedLagSmoother):
             graph, values = self._smoother.active_variables()

@@ -137,7 +137,7 @@ def test_a_minute_at_rest_is_not_marginalised_while_noise_moves_the_mount() -> N
 
 def test_noise_levels_of_a_rest_are_not_those_of_the_motion_to_come(monkeypatch: pytest.MonkeyPatch) -> None:
     """With those found at the first motion, a level that grows with the rate is its default, 50 times too small."""
-    monkeypatch.setattr(online, "_FIRST_SOLVE", REST_S - 1.2)  # solutions of the rest alone end nothing
+    monkeypatch.setattr(online, "FIRST_SOLVE", REST_S - 1.2)  # solutions of the rest alone end nothing
     scenario = SCENARIO.model_copy(
         update={
             "duration_s": 40.0,
