@@ -91,7 +91,7 @@ class Model:
             raise ValueError(f"{type(self).__name__}: {error}") from error
 
     @cached_property
-    def parts(self) -> list[Self]:
+    def in_parts(self) -> list[Self]:
         """Divide the measurements of a model that has `stacked` into parts, which keep what no variable moves."""
         return [select_rows(self, slice(k, k + TOGETHER)) for k in range(0, len(self.time), TOGETHER)]
 
@@ -168,7 +168,8 @@ class WrappedModel(Model):
 
     def at_noise(self, weights: Array) -> Model:
         """Return the wrapper of the wrapped model at the noise."""
-        return replace(self, model=self.model.at_noise(weights))
+        model = self.model.at_noise(weights)
+        return self if model is self.model else replace(self, model=model)
 
     @property
     def sqrt_information(self) -> Array:

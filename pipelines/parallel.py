@@ -63,8 +63,9 @@ def done(works: Sequence[Callable[[], Answer]], what: str, most: int) -> list[An
     count = min(allowed(), most, len(works)) if sys.platform == "linux" else 1
     if count <= 1:
         return [work() for work in progress.track(works, what, len(works))]
-    workers = [_Worker(works[i::count], allowed() // count) for i in range(count)]
+    workers: list[_Worker] = []
     try:
+        workers.extend(_Worker(works[i::count], allowed() // count) for i in range(count))
         turns = progress.track(range(len(works)), what, len(works))
         answers = [workers[i % count].receive() for i in turns]
     finally:

@@ -22,6 +22,8 @@ _ORDER = 6
 _MEANS, _ALIKE = (1, 2, 4, 8), 0.1
 # Differences worked out at a time.
 _BLOCK = 100_000
+# Differences up to this part of the largest sample are rounding, as of readings between which a driver interpolates.
+_ROUNDING = 1e-13
 # Fewer differences are not used; the best of them are not trusted to less than this, in the logarithm.
 _FEWEST, _TRUSTED = 200, 0.05
 # A walk is looked for in steps of this, in the logarithm, where the bias was seen so many times.
@@ -112,16 +114,18 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
 def at_most_sampled(noise: Noise, time: Array, samples: Array) -> Level:
     """Bound a sensor's white noise level above by that of its samples in motion, which adds noise and takes none away.
 
+    Samples whose noise is not white, as behind a filter, bound nothing.
+
     Args:
         noise: sigma of a sample.
         time: (n,) s.
         samples: (n, k).
     """
     level = Level(replace(noise, families=()))
-    differences = None if noise.known == 0.0 or noise.stated == 0.0 else _high_differences(time, samples, 1)
-    if differences is None:
+    found = white_density(time, samples) if noise.known > 0.0 and noise.stated > 0.0 else None
+    if found is None:
         return level
-    ratio = _white_sigma(differences) / noise.stated
+    ratio = found[0] / float(np.median(np.diff(time))) ** 0.5 / noise.stated
     return replace(level, scale=ratio, found=ratio, sigma=_TRUSTED * ratio) if ratio < 1.0 else level
 
 
@@ -247,33 +251,24 @@ def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
     From high differences of means of 1, 2, 4, ... samples, each of which sees a lower band: the first two that agree.
     None where none do, as behind a filter, under vibration, or where steps of the readings hide the noise.
     """
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if not interval > 0.0:
+        return None
+    even = np.append(np.abs(np.diff(time) / interval - 1.0) < 0.5, False)
+    pieces = np.split(samples, np.flatnonzero(~even) + 1)
+    rounding = _ROUNDING * float(np.abs(samples).max())
     before: float | None = None
     for count in _MEANS:
-        differences = _high_differences(time, samples, count)
-        if differences is None:
+        found = [_differences(piece, count) for piece in pieces]
+        differences = found[0] if len(found) == 1 else np.concatenate(found)
+        if differences.size < _FEWEST or np.mean(np.abs(differences) <= rounding) > 0.05:
             return None
-        density = _white_sigma(differences) * (count * float(np.median(np.diff(time)))) ** 0.5
+        density = robust_sigma(differences) / comb(2 * _ORDER, _ORDER) ** 0.5 * (count * interval) ** 0.5
         if before is not None and abs(np.log(density / before)) < _ALIKE:
             # Neighbouring differences are correlated, and the median is less efficient than the mean square.
             return before, float(2.0 * differences.size**-0.5)
         before = density
     return None
-
-
-def _white_sigma(differences: Array) -> float:
-    """Sigma of white samples with these high-order differences."""
-    return robust_sigma(differences) / comb(2 * _ORDER, _ORDER) ** 0.5
-
-
-def _high_differences(time: Array, samples: Array, count: int) -> Array | None:
-    """High-order differences of means of `count` samples (n, k) between gaps; None of few, or of rounded samples."""
-    interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if not interval > 0.0:
-        return None
-    even = np.append(np.abs(np.diff(time) / interval - 1.0) < 0.5, False)
-    found = [_differences(piece, count) for piece in np.split(samples, np.flatnonzero(~even) + 1)]
-    differences = found[0] if len(found) == 1 else np.concatenate(found)
-    return None if differences.size < _FEWEST or np.mean(differences == 0.0) > 0.05 else differences
 
 
 def _differences(samples: Array, count: int) -> Array:

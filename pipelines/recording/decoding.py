@@ -151,10 +151,11 @@ class ColumnTable:
         return {name: rows for name, rows in found.items() if rows.any()}
 
     def drop_unstamped(self) -> int:
-        """Drop the rows without a stamp where they are few; returns their number."""
-        few = few_unstamped(self._t_ns[: self.count], self._log_ns[: self.count])
-        self.filled[: self.count] &= ~few
-        return int(np.count_nonzero(few))
+        """Drop the filled rows without a stamp where they are few; returns their number."""
+        rows = np.flatnonzero(self.filled)
+        few = rows[few_unstamped(self._t_ns[rows], self._log_ns[rows])]
+        self.filled[few] = False
+        return len(few)
 
     def times(self, filled: bool = True) -> Times:
         """Return stamps (log times where most are missing) and log times of the filled rows, or of all, Unix ns."""
@@ -162,7 +163,7 @@ class ColumnTable:
         return with_log_times(self._t_ns[rows], self._log_ns[rows])
 
     def sorted(self) -> tuple[Stamps, int, dict[str, Any]]:
-        """Return the stamps, how many are missing (then all are log times), and the columns of the filled rows."""
+        """Return stamps, how many are missing (then all are log times), and columns of the filled rows, by log time."""
         absent = is_unstamped(self._t_ns, self._log_ns) & self.filled
         t_ns = self._log_ns if absent.any() else self._t_ns
         rows: Any = slice(None)

@@ -43,7 +43,6 @@ from alidade.pipelines.recording.decoding import (
     DecodedMessage,
     MessageFormat,
     Times,
-    is_unstamped,
     with_log_times,
 )
 from alidade.pipelines.recording.messages import MessageError
@@ -128,6 +127,7 @@ class Recording:
         self._transforms: dict[str, dict[tuple[str, str], series.PoseSeries]] = {}
         self._times: dict[str, Times] = {}
         self._unstamped: dict[str, int] = {}  # topic -> messages without a stamp that were left out
+        self._by_log: set[str] = set()  # topics whose messages have their log times in place of stamps
         # Topic -> least delay of the log times after the stamps, ns (None without messages), and sentences about these.
         self._stamp_facts: dict[str, tuple[int | None, tuple[str, ...]]] = {}
 
@@ -209,7 +209,7 @@ class Recording:
     def stamps(self, block: MessageBlock) -> NDArray[np.int64]:
         """Return the stamps of a block's messages, Unix ns; log times where there are none."""
         stamps = self._formats[block.channel].stamps(block)
-        return np.where(is_unstamped(stamps, block.log_ns), block.log_ns, stamps)
+        return block.log_ns if self.container.channels[block.channel].topic in self._by_log else stamps
 
     def there(self) -> str:
         """Return a phrase that lists the recorded topics and the lost data."""
@@ -453,8 +453,6 @@ class Recording:
             for error in self._fill({topic: table}).values():
                 raise error
         self._check_any(topic, table.count)
-        if without := table.drop_unstamped():
-            self._unstamped[topic] = without
         return table
 
     def _fill(self, tables: Mapping[str, ColumnTable]) -> dict[str, InputError]:
@@ -520,12 +518,14 @@ class Recording:
         return kind(t_ns, stamped_by_log=from_log, frame_id=next(iter(table.frames()), ""), **columns)
 
     def _sorted(self, topic: str, table: ColumnTable) -> tuple[NDArray[np.int64], int, dict[str, Array]]:
-        """Return stamps, how many are missing, and columns, by log time; InputError if the clock was set."""
+        """Return stamps, how many of them are log times, and columns, by log time; InputError if the clock was set."""
+        if without := table.drop_unstamped():
+            self._unstamped[topic] = without
         if self.recorded[topic].type in SENSOR_STAMPED_TYPES:
             check_clock(topic, *table.times(), self.epoch_ns)
-        t_ns, from_log, columns = table.sorted()
-        self._note_unstamped(topic, t_ns, from_log)
-        return t_ns, from_log, columns
+        t_ns, absent, columns = table.sorted()
+        self._note_unstamped(topic, t_ns, absent)
+        return t_ns, len(t_ns) if absent else 0, columns
 
     def _choose_frame(self, topic: str, table: ColumnTable, frame: str | None) -> None:
         """Keep the messages of one frame. Raises InputError if it has none, or if none of several is named.
@@ -567,14 +567,15 @@ class Recording:
             self._stamp_facts[name] = delay, stamp_notes(name, t_ns, log_ns) if is_sensor else ()
         return self._stamp_facts
 
-    def _note_unstamped(self, topic: str, t_ns: NDArray[np.int64], from_log: int) -> None:
-        """Note that log times replace the missing stamps of a topic, and the log times' jitter."""
-        if not from_log:
+    def _note_unstamped(self, topic: str, t_ns: NDArray[np.int64], absent: int) -> None:
+        """Note that stamps of a topic are missing, so that all are log times, and the log times' jitter."""
+        if not absent:
             return
+        self._by_log.add(topic)
         jitter = jitter_ns(np.diff(t_ns))
         self.stamp_sigma_s = max(self.stamp_sigma_s, float(np.hypot(UNKNOWN_LOG_DELAY_S, jitter * 1e-9)))
         self.remark(
-            f"topic {topic}: {from_log} of {len(t_ns)} messages have no stamp; all get their log times, which are "
+            f"topic {topic}: {absent} of {len(t_ns)} messages have no stamp; all get their log times, which are "
             f"late by an unknown delay (assumed {1e3 * UNKNOWN_LOG_DELAY_S:.0f} ms, one sigma) and jitter "
             f"by {jitter * 1e-6:.2g} ms (sigma)"
         )

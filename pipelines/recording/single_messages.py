@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from alidade.pipelines.recording import images, series
-from alidade.pipelines.recording.decoding import DecodedMessage
+from alidade.pipelines.recording.decoding import DecodedMessage, few_unstamped, is_unstamped, with_log_times
 from alidade.pipelines.recording.messages import MessageError
 
 
@@ -75,19 +75,21 @@ def tag_detections(messages: Iterable[DecodedMessage]) -> series.DetectionSeries
 
 def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], series.PoseSeries]:
     """Transforms in tf2_msgs/TFMessage messages with their log times, by (parent frame, child frame)."""
-    rows: dict[tuple[str, str], list[tuple[int, bool, Any]]] = {}
+    rows: dict[tuple[str, str], list[tuple[int, int, Any]]] = {}
     for message in messages:
         for one in message.content.transforms:
             t_ns = one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec
-            row = t_ns or message.t_ns, not t_ns, message.definition.numbers(one.transform)
+            row = t_ns, message.t_ns, message.definition.numbers(one.transform)
             pair = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
             rows.setdefault(pair, []).append(row)
     return {pair: _poses(found) for pair, found in rows.items()}
 
 
-def _poses(rows: list[tuple[int, bool, Any]]) -> series.PoseSeries:
-    """Make a series of poses from rows of stamp, whether that is a log time, and x, y, z, qx, qy, qz, qw."""
-    numbers = np.array([row[2] for row in rows]).reshape(len(rows), 7)
-    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
-    from_log = sum(row[1] for row in rows)
+def _poses(rows: list[tuple[int, int, Any]]) -> series.PoseSeries:
+    """Make a series of poses from rows of stamp (0: none), log time, and x, y, z, qx, qy, qz, qw."""
+    stamps, log_ns = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2).T
+    kept = ~few_unstamped(stamps, log_ns)
+    numbers = np.array([row[2] for row in rows]).reshape(-1, 7)[kept]
+    from_log = int(kept.sum()) if is_unstamped(stamps, log_ns)[kept].any() else 0
+    t_ns, _ = with_log_times(stamps, log_ns)
     return series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=from_log)

@@ -183,6 +183,8 @@ def _mapped(engine: Linearization, values: Values, error_map: ErrorMap) -> tuple
         model = error_map.of_model(group.family, group.model)
         if model is None:
             return group
+        if group.weights is not None:
+            model = model.at_noise(group.weights)
         columns = begin[group.target] + np.arange(k)
         return replace(
             group,

@@ -190,7 +190,7 @@ class Group:
         if n <= TOGETHER or not self.is_divisible:
             yield self
             return
-        for number, part in enumerate(self.model.parts):
+        for number, part in enumerate(self.model.in_parts):
             yield self.of(np.arange(number * TOGETHER, min((number + 1) * TOGETHER, n)), part)
 
     def of(self, some: Index, model: Model | None = None) -> Group:

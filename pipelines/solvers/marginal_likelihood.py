@@ -847,19 +847,20 @@ def levels_settled(
         since: time of that one, s.
     """
     chain, variances = _at(compiled, levels, solution)
+    found, widening = chain.solved(variances), unwidened(solution.engine.inliers(solution.values))
+    if found is None:
+        return False
     for rows in chain.rows:
         late = rows.time > since
         now, then = (float(rows.variance(each)[late].mean()) if late.any() else 1.0 for each in (levels, before))
         if not _SAME**-2 < now / then < _SAME**2:
             return False
-    factors = [variance / rows.variance(levels) for rows, variance in zip(chain.rows, variances, strict=True)]
-    found = chain.solved(variances)
     for i, level in enumerate(levels):
-        if found is None or not (level.noise.estimated and level.noise.source == "default"):
+        if not (level.noise.estimated and level.noise.source == "default"):
             continue
         above = replace(level, scale=level.scale * float(np.exp(_ABOVE * level.noise.known)))
         larger = [*levels[:i], above, *levels[i + 1 :]]
-        tried = chain.solved([v * f for v, f in zip(chain.variances(larger), factors, strict=True)])
+        tried = chain.solved(chain.variances(larger, widening, NO_SAY))
         if tried is not None and tried.value < found.value + _ABOVE**2:
             return False
     return True

@@ -22,6 +22,7 @@ from alidade.pipelines.recording.plausibility import (
 )
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.streams import StreamReader
+from alidade.pipelines.recording.topics import TopicSource
 from tests.support import forms
 
 RNG = np.random.default_rng(3)
@@ -178,7 +179,7 @@ def test_a_message_sent_before_there_was_a_clock_is_left_out(tmp_path: Path) -> 
     assert "topic /imu: 1 messages without a stamp, among others that have one, are left out" in recording.notes
 
 
-@pytest.mark.parametrize(("stamped_each", "kept", "by_log"), [(2, 25, 0), (3, 50, 33)])
+@pytest.mark.parametrize(("stamped_each", "kept", "by_log"), [(2, 25, 0), (3, 50, 50)])
 def test_a_topic_has_one_clock(stamped_each: int, kept: int, by_log: int, tmp_path: Path) -> None:
     """Every second or third message has a stamp, of the device's clock; most messages decide for that or the log's."""
     log = 1_790_000_000_000_000_000
@@ -186,9 +187,24 @@ def test_a_topic_has_one_clock(stamped_each: int, kept: int, by_log: int, tmp_pa
         (log + 10_000_000 * i, _imu_message(10_000_000 * (i + 100) * (i % stamped_each == 0), "imu", float(i)))
         for i in range(50)
     ]
-    imu = open_recording(forms.ros2_recording(tmp_path / "mixed.mcap", {"/imu": messages})).imu("/imu")
+    recording = open_recording(forms.ros2_recording(tmp_path / "mixed.mcap", {"/imu": messages}))
+    imu = recording.imu("/imu")
     assert (len(imu), imu.stamped_by_log) == (kept, by_log)
     assert np.ptp(np.diff(imu.t_ns)) == 0
+    found = [recording.stamps(block) for block in recording.container.blocks(set(recording.container.channels))]
+    assert np.isin(imu.t_ns, np.concatenate(found)).all()
+
+
+def test_one_of_two_devices_on_a_topic_has_no_stamps(tmp_path: Path) -> None:
+    log = 1_790_000_000_000_000_000
+    messages = [
+        (log + 10_000_000 * i, _imu_message(10_000_000 * (i + 100) * (i % 2), ("b", "a")[i % 2], float(i)))
+        for i in range(50)
+    ]
+    source = TopicSource(topic="/imu", frame="b")
+    recording = open_recording(forms.ros2_recording(tmp_path / "two.mcap", {"/imu": messages})).with_config([source])
+    imu = recording.imu(source.name)
+    assert (len(imu), imu.stamped_by_log) == (25, 25)
 
 
 def test_a_gyro_alone_in_a_series_says_so() -> None:

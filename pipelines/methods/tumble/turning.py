@@ -377,7 +377,7 @@ def _attitudes(time: Array, path: GyroPath, mag: Seen, beside: tuple[Seen, Rows]
     field = interpolated(time, mag.time, mag.direction)
     out = np.empty((len(time), 4))
     # Any attitude in which the field is along itself.
-    out[0] = so3.shortest(field[0], along)
+    out[0] = so3.shortest(field[0] / np.linalg.norm(field[0]), along)
     for k in range(1, len(time)):
         carried = so3.multiply(out[k - 1], turns[k - 1])
         expected = so3.rotate(so3.inverse(carried), along)
