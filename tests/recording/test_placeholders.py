@@ -153,7 +153,6 @@ def test_of_several_devices_on_one_topic_one_is_chosen_by_its_frame(tmp_path: Pa
     path = forms.ros2_recording(tmp_path / "two.mcap", {"/imu": messages})
     with pytest.raises(InputError, match=r"several devices, by their frames: imu_left \(30 messages\), imu_right"):
         open_recording(path).imu("/imu")
-    from alidade.pipelines.recording.topics import TopicSource
 
     recording = open_recording(path)
     source = TopicSource(topic="/imu", frame="imu_right", axes=("-y", "x", "z"))
