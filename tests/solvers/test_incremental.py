@@ -28,8 +28,6 @@ SCENARIO = HeadScenario(vision_rate_hz=10.0, gyro_rate_hz=100.0, sensors=Sensors
 
 # s at rest, and noise of the gyro over its rate afterwards, 1/sqrt(Hz).
 REST_S, RATE_NOISE = 14.3, 2.8e-3
-# A run that has not begun is solved anew at each picture.
-FEW: dict[str, object] = {"vision_rate_hz": 7.0, "gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0}
 
 
 def _made(seed: int, **changes: object) -> tuple[Problem, Array]:
@@ -54,23 +52,21 @@ def _apart(one: Estimate, other: Estimate) -> float:
     return float(np.abs((one.values - other.values)[free] / other.sigmas[free]).max())
 
 
-def test_nothing_is_made_up_at_rest() -> None:
-    problem, _ = _made(1, duration_s=9.0, head=_rest_first(6.0), **FEW)
-    history = solve_incremental(problem).history
+def test_nothing_is_made_up_at_rest_nor_about_the_only_axis_of_motion() -> None:
+    """At rest the mount keeps its prior, later the part about the axis; a run that has not begun is solved anew often."""
+    rates = {"vision_rate_hz": 4.0, "gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0}
+    problem, _ = _made(1, duration_s=6.0, head=beginning(SCENARIO.head, {"yaw": 3.5}), **rates)
+    batch, incremental = solve_batch(problem), solve_incremental(problem)
+    history = incremental.history
     assert history is not None
-    rest = (history.time > 1.0) & (history.time < 5.9)
-    assert rest.sum() > 10
+    rest = (history.time > 1.0) & (history.time < 3.4)
+    assert rest.sum() >= 5
     assert (history.sigmas[rest, MOUNT] > 0.97 * PRIOR).all()
     assert (np.abs(history.values[rest, MOUNT]) < 0.2 * PRIOR).all()
-    assert (history.sigmas[-1, MOUNT] < 0.1 * PRIOR).all()
-
-
-def test_a_mount_about_the_only_axis_of_motion_keeps_its_prior() -> None:
-    problem, _ = _made(2, duration_s=6.0, head=beginning(SCENARIO.head, {"yaw": 0.0}), **FEW)
-    batch, incremental = solve_batch(problem), solve_incremental(problem)
     for estimate in (batch, incremental):
-        widest = np.linalg.eigvalsh(estimate.covariance[MOUNT, MOUNT])[-1]
-        assert np.sqrt(widest) > 0.99 * PRIOR
+        variances = np.linalg.eigvalsh(estimate.covariance[MOUNT, MOUNT])
+        assert np.sqrt(variances[-1]) > 0.99 * PRIOR
+        assert np.sqrt(variances[1]) < 0.1 * PRIOR
     assert _apart(incremental, batch) < 0.1
 
 
@@ -109,20 +105,14 @@ def test_errors_fit_their_covariance_at_all_times() -> None:
     ],
 )
 def test_errors_fit_their_covariance_from_both_sides(method: str, case: str, from_moment: int) -> None:
-    """Linear about the last solution, heads that turn about one axis were at 155 of 24, slow gimbals at 1,000 of 35."""
+    """Linear about the last solution, heads that turn about one axis were at 155 of 24, slow gimbals at 1,000 of 35.
+
+    The other two angles of the mount follow the unknown one along a curve: without second order 8 times as much.
+    """
     found = [run(method, case, seed) for seed in range(4)]
     assert not any(each.message for each in found)
     mean = np.mean([each.nees for each in found], axis=0)
     assert_consistent(mean[from_moment:], found[0].numbers, len(found), 0.9999)
-
-
-def test_motion_about_one_axis_keeps_consistent() -> None:
-    """The other two angles of the mount follow the unknown one along a curve: without second order 8 times as much."""
-    settings, _ = CASES["head"]["one axis"](1001)
-    problem, truth = made("head", settings.model_copy(update={"duration_s": 12.0}), 1001)
-    found = followed(problem, truth, np.array([4.0, 8.0, 11.5]))
-    assert not found.message
-    assert_consistent(np.array(found.nees), found.numbers, 1, 0.9999)
 
 
 @pytest.mark.slow
@@ -175,7 +165,7 @@ def test_a_second_axis_after_45_s_of_one() -> None:
 def test_a_valley_that_bends_between_bias_and_mount_is_followed_to_its_end() -> None:
     """At rest a gimbal's bias is known by its mount alone: from the mount of the motion to come to that of the rest."""
     settings, _ = CASES["los"]["rest"](27)
-    problem, _ = made("los", settings, 27)
+    problem, _ = made("los", settings.model_copy(update={"image_rate_hz": 5.0, "gyro_rate_hz": 50.0}), 27)
     compiled = Compiled.of(problem, steps=[step for step in problem.steps(1) if step.time <= 47.0])
     found = minimum(compiled, problem.noises)
     assert found.converged, found.message
@@ -204,7 +194,7 @@ def test_outliers_among_few_pictures_lead_to_no_far_minimum() -> None:
     assert 0 < estimate.rejected["los"] < 0.4 * len(first)
 
 
-@pytest.mark.parametrize("seed", [2000, 2046])
+@pytest.mark.parametrize("seed", [2000, pytest.param(2046, marks=pytest.mark.slow)])
 def test_no_sigma_is_far_beyond_its_prior(seed: int) -> None:
     """Some directions of the ellipsoid are known a million times better than others; it was 5,000 times the prior."""
     settings, _ = CASES["tumble"]["slow"](seed)
