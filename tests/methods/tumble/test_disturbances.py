@@ -42,8 +42,14 @@ def _named(found: Any) -> list[tuple[float, float]]:
     return [(f.evidence["since_s"], f.evidence["time_s"]) for f in found if f.kind == "disturbance"]
 
 
-@pytest.mark.parametrize("gyro", [False, True])
-@pytest.mark.parametrize("kind", ["", "motor", "ring"])
+@pytest.mark.parametrize(
+    ("kind", "gyro"),
+    [
+        *((kind, False) for kind in ("", "motor", "ring")),
+        ("ring", True),
+        *(pytest.param(kind, True, marks=pytest.mark.slow) for kind in ("", "motor")),
+    ],
+)
 def test_disturbed_interval_is_named_and_the_rest_is_calibrated(kind: str, gyro: bool) -> None:
     calibration = Session.of(TUMBLE, _disturbed(kind, gyro, 0)).calibrate(report=False)
     assert calibration.status == "calibrated"
@@ -58,7 +64,15 @@ def test_disturbed_interval_is_named_and_the_rest_is_calibrated(kind: str, gyro:
     assert until == pytest.approx(end, abs=0.7)
 
 
-@pytest.mark.parametrize(("kind", "gyro", "seeds"), [("motor", False, 8), ("motor", True, 4), ("ring", True, 4)])
+@pytest.mark.parametrize(
+    ("kind", "gyro", "seeds"),
+    [
+        ("motor", False, 8),
+        ("ring", True, 1),
+        pytest.param("motor", True, 4, marks=pytest.mark.slow),
+        pytest.param("ring", True, 4, marks=pytest.mark.slow),
+    ],
+)
 def test_sigmas_are_true_beside_a_disturbance(kind: str, gyro: bool, seeds: int) -> None:
     total, dof = 0.0, 0
     for seed in range(seeds):

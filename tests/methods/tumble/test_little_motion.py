@@ -65,7 +65,12 @@ def _triad(calibration: Any) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize(
     ("motion", "gyro", "most_deg"),
-    [(FIGURE_EIGHT, False, 0.3), (FIGURE_EIGHT, True, 0.3), (RIDER, False, 4.0), (RIDER, True, 0.6)],
+    [
+        (FIGURE_EIGHT, False, 0.3),
+        (FIGURE_EIGHT, True, 0.3),
+        (RIDER, False, 4.0),
+        pytest.param(RIDER, True, 0.6, marks=pytest.mark.slow),
+    ],
 )
 def test_figure_eight_and_rider_are_calibrated_within_their_sigmas(motion: Any, gyro: bool, most_deg: float) -> None:
     """Strength unknown; the rider's bank of 22 deg leaves the vertical weak, which a gyro mends."""
@@ -83,8 +88,16 @@ def test_figure_eight_and_rider_are_calibrated_within_their_sigmas(motion: Any, 
     assert np.abs(off).max() < 4.0
 
 
-@pytest.mark.parametrize("beside", [{}, {"gyro": {}}, {"accelerometer": {}}, {"gyro": {}, "accelerometer": {}}])
-@pytest.mark.parametrize("latitude", [40.0, None])
+@pytest.mark.parametrize(
+    ("beside", "latitude"),
+    [
+        pytest.param(
+            beside, latitude, marks=[pytest.mark.slow] * (len(beside) == 1 or (latitude is None) == bool(beside))
+        )
+        for beside in ({}, {"gyro": {}}, {"accelerometer": {}}, {"gyro": {}, "accelerometer": {}})
+        for latitude in (40.0, None)
+    ],
+)
 def test_car_turning_on_the_spot_has_its_hard_iron_across_and_right_headings(
     beside: dict[str, Any], latitude: float | None
 ) -> None:
@@ -112,12 +125,19 @@ def _about(field: Array) -> Array:
     return np.arctan2(*(field @ axes[:2].T).T)
 
 
-@pytest.mark.parametrize("gyro", [{}, {"gyro": {}}])
-@pytest.mark.parametrize("latitude", [40.0, None])
-def test_nothing_is_confidently_wrong_about_one_axis(latitude: float | None, gyro: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    ("latitude", "gyro", "seeds"),
+    [
+        (40.0, {}, 8),
+        (None, {}, 8),
+        pytest.param(40.0, {"gyro": {}}, 8, marks=pytest.mark.slow),
+        pytest.param(None, {"gyro": {}}, 8, marks=pytest.mark.slow),
+    ],
+)
+def test_nothing_is_confidently_wrong_about_one_axis(latitude: float | None, gyro: dict[str, Any], seeds: int) -> None:
     scenario = TumbleScenario.model_validate({**CAR.model_dump(), "latitude_deg": latitude, **gyro})
     worst = []
-    for seed in range(8):
+    for seed in range(seeds):
         simulated = TUMBLE.simulate(scenario, seed)
         estimate = solve_batch(Session.of(TUMBLE, simulated).problem())
         known = [i for i, name in enumerate(estimate.names) if name in simulated.truth]

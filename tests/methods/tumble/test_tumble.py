@@ -136,7 +136,9 @@ def test_jacobians(symmetric: bool) -> None:
         assert_jacobians(replace(dip, drivers=drivers), [triads(9), triads(d), rng.uniform(-1.0, 1.0, (N, 1)), slope])
 
 
-@pytest.mark.parametrize("errors", [0, 6, 9, 15, 18])
+@pytest.mark.parametrize(
+    "errors", [0, 9, 18, pytest.param(6, marks=pytest.mark.slow), pytest.param(15, marks=pytest.mark.slow)]
+)
 def test_jacobians_beside_a_gyro(errors: int) -> None:
     rng, t = np.random.default_rng(errors), np.arange(0.0, 2.0, 0.01)
     rate = np.stack([np.sin(3.0 * t), np.cos(2.0 * t), 0.5 * np.sin(t + 1.0)], axis=1)
@@ -183,15 +185,15 @@ def test_without_noise_there_is_no_error() -> None:
 
 
 def test_a_magnetometer_alone_is_consistent() -> None:
-    _assert_consistent(BRIEF, range(12))
+    _assert_consistent(BRIEF, range(6))
 
 
 def test_a_magnetometer_of_unknown_place_is_consistent() -> None:
-    _assert_consistent(replace_scenario(BRIEF, latitude_deg=None), range(6))
+    _assert_consistent(replace_scenario(BRIEF, latitude_deg=None), range(4))
 
 
 def test_both_sensors_are_consistent() -> None:
-    _assert_consistent(RESTING, range(6))
+    _assert_consistent(RESTING, range(4))
 
 
 def _turned(hz: float, beside: bool) -> TumbleScenario:
@@ -205,7 +207,9 @@ def _turned(hz: float, beside: bool) -> TumbleScenario:
     )
 
 
-@pytest.mark.parametrize(("hz", "beside"), [(5.0, False), (25.0, True), (400.0, False)])
+@pytest.mark.parametrize(
+    ("hz", "beside"), [(5.0, False), pytest.param(25.0, True, marks=pytest.mark.slow), (400.0, False)]
+)
 def test_gyro_of_any_rate_is_consistent(hz: float, beside: bool) -> None:
     """Sensors rotated relative to each other, a late magnetometer, a gyro that is off and feels force."""
     _assert_consistent(_turned(hz, beside), range(2, 4))
@@ -225,8 +229,8 @@ def test_gyro_of_any_rate_is_consistent_over_many_seeds(hz: float) -> None:
     ("hz", "grades", "motions", "seeds"),
     [
         (100.0, ["tactical"], ["flight"], 1),
-        (5.0, ["tactical"], ["level"], 2),
-        (50.0, ["poor"], ["level"], 3),
+        pytest.param(5.0, ["tactical"], ["level"], 2, marks=pytest.mark.slow),
+        pytest.param(50.0, ["poor"], ["level"], 3, marks=pytest.mark.slow),
         *(
             pytest.param(hz, compass.GRADES, compass.TILTS, 6, marks=pytest.mark.slow)
             for hz in (5.0, 10.0, 25.0, 400.0)
@@ -282,7 +286,7 @@ def test_bias_of_readings_in_counts_is_shown_in_counts() -> None:
     assert any("if it is in g, state `units: {accel: g}`" in note for note in calibration.notes)
 
 
-@pytest.mark.parametrize("rests", [10, 12])
+@pytest.mark.parametrize("rests", [10, pytest.param(12, marks=pytest.mark.slow)])
 def test_few_rests_in_counts_are_consistent(rests: int) -> None:
     """One residual or three say little of the noise: what lengths scatter by within the rests does."""
     total, dof = np.sum([_counted(rests, seed) for seed in range(16)], axis=0)
@@ -310,10 +314,10 @@ def test_the_incremental_solver_agrees_beside_a_gyro() -> None:
     assert np.abs((step_by_step.values - batch.values) / np.maximum(batch.sigmas, 1e-12)).max() < 1.0
 
 
-@pytest.mark.parametrize("accelerometer", [None, {"rate_hz": 50.0}])
+@pytest.mark.parametrize("accelerometer", [pytest.param(None, marks=pytest.mark.slow), {"rate_hz": 50.0}])
 def test_gyro_at_an_unknown_place_is_consistent(accelerometer: dict[str, float] | None) -> None:
     """The earth's rate is a parameter with a prior of its size; without an accelerometer the field defines y."""
-    scenario = replace_scenario(TURNING, latitude_deg=None, attitudes=15)
+    scenario = replace_scenario(TURNING, latitude_deg=None, attitudes=12)
     _assert_consistent(scenario.model_copy(update={} if accelerometer else {"accelerometer": None}), range(2))
 
 
@@ -324,7 +328,7 @@ def _compass_error_deg(motion: str, seconds: float, seed: int, config: Config) -
 
 def test_slow_gyro_of_little_motion_is_used() -> None:
     """10 Hz, tilts of 5 deg: an ellipsoid alone is 7 to 22 deg off."""
-    assert _compass_error_deg("middle", 240.0, 0, Config()) < 0.6
+    assert _compass_error_deg("middle", 120.0, 0, Config()) < 0.6
 
 
 @pytest.mark.slow
@@ -336,7 +340,7 @@ def test_compass_error_of_three_motions(motion: str) -> None:
         assert max(errors) <= most, errors
 
 
-@pytest.mark.parametrize("seconds", [150.0, pytest.param(600.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seconds", [60.0, pytest.param(600.0, marks=pytest.mark.slow)])
 def test_heading_that_nothing_determines_is_fixed(seconds: float) -> None:
     """Free but for its prior it trades with the earth's rate: 63 iterations had no minimum where 3 do."""
     data = compass.drawn(compass.MOTIONS["middle"], seconds, 0).data
@@ -375,12 +379,13 @@ def test_a_gyro_in_degrees_is_not_used_and_that_is_told(tmp_path: Path) -> None:
     assert "is it in deg/s, or in counts?" in " ".join(session.problem().premises)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("axes", "named"),
     [
         ([[1, 0, 0], [0, -1, 0], [0, 0, 1]], True),
-        pytest.param([[0, 1, 0], [1, 0, 0], [0, 0, 1]], True, marks=pytest.mark.slow),
-        pytest.param([[-1, 0, 0], [0, -1, 0], [0, 0, 1]], False, marks=pytest.mark.slow),
+        ([[0, 1, 0], [1, 0, 0], [0, 0, 1]], True),
+        ([[-1, 0, 0], [0, -1, 0], [0, 0, 1]], False),
     ],
 )
 def test_an_accelerometer_of_other_axes_is_calibrated_beside_a_gyro(axes: list[list[int]], named: bool) -> None:
@@ -388,7 +393,7 @@ def test_an_accelerometer_of_other_axes_is_calibrated_beside_a_gyro(axes: list[l
     simulated, P = _simulated(TURNING, 2), np.array(axes, dtype=float)
     assert simulated.data.accel is not None
     data = replace(simulated.data, accel=simulated.data.accel @ P.T)
-    calibration = Session.of(TUMBLE, replace(simulated, data=data)).calibrate()
+    calibration = Session.of(TUMBLE, replace(simulated, data=data)).calibrate(report=False)
     names = [f"accel_k{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
     K = np.array([simulated.truth[name] for name in names]).reshape(3, 3) @ P.T
     at = [calibration.estimate.names.index(name) for name in names]
@@ -419,7 +424,7 @@ def test_much_noise_biases_an_algebraic_ellipsoid_and_not_the_graph() -> None:
     )
     sums = {"graph": 0.0, "published": 0.0}
     sigma = 0.0
-    for seed in range(8):
+    for seed in range(5):
         simulated = _simulated(loud, seed)
         session = Session.of(TUMBLE, simulated)
         problem = session.problem()
@@ -479,7 +484,7 @@ def test_readings_that_a_logger_repeats_are_used_once(tmp_path: Path) -> None:
 def test_left_handed_axes_are_told() -> None:
     simulated = _simulated(RESTING, 2)
     mirrored = replace(simulated.data, mag=simulated.data.mag * np.array([1.0, 1.0, -1.0]))
-    calibration = Session.of(TUMBLE, replace(simulated, data=mirrored)).calibrate()
+    calibration = Session.of(TUMBLE, replace(simulated, data=mirrored)).calibrate(report=False)
     assert "left-handed" in calibration.headline + " ".join(calibration.notes)
     values = dict(zip(calibration.estimate.names, calibration.estimate.values, strict=True))
     for i in "123":
@@ -487,13 +492,13 @@ def test_left_handed_axes_are_told() -> None:
         assert abs(error) < 4.0 * calibration.parameters[f"mag_k{i}3"].sigma
 
 
-@pytest.mark.parametrize("beside_a_gyro", [False, True])
+@pytest.mark.parametrize("beside_a_gyro", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_accelerometer_that_shows_gravity_down_is_told_and_the_magnetometer_keeps_its_signs(
     beside_a_gyro: bool,
 ) -> None:
     simulated = _simulated(replace_scenario(TURNING, rest_s=1.5) if beside_a_gyro else RESTING, 2)
     data = replace(simulated.data, accel=-simulated.data.accel)
-    calibration = Session.of(TUMBLE, replace(simulated, data=data)).calibrate()
+    calibration = Session.of(TUMBLE, replace(simulated, data=data)).calibrate(report=False)
     assert calibration.status == "calibrated"
     assert "shows gravity down" in " ".join(calibration.notes)
     found = calibration.parameters
@@ -518,7 +523,7 @@ def test_a_magnetometer_on_other_axes_is_turned_into_those_of_the_accelerometer(
     turned = so3.exp(np.array([np.pi, 0.0, 0.0]))
     calibration = Session.of(
         TUMBLE, replace(simulated, data=replace(simulated.data, mag=so3.rotate(turned, simulated.data.mag)))
-    ).calibrate()
+    ).calibrate(report=False)
     assert calibration.status == "calibrated"
     K = np.array([[calibration.parameters[f"mag_k{i}{j}"].value for j in "123"] for i in "123"])
     true = np.array([[simulated.truth[f"mag_k{i}{j}"] for j in "123"] for i in "123"]) @ so3.matrix(turned).T
@@ -656,7 +661,7 @@ def test_the_mean_of_points_of_an_ellipsoid_lies_inside_it() -> None:
 SECOND = TumbleScenario(attitudes=20, rest_s=1.0, gyro=TumbledGyro(), accelerometer=TumbledAccelerometer())
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_rests_of_a_second_are_found_and_turning_points_are_none(seed: int) -> None:
     for rest_s, found in ((1.0, True), (0.0, False)):
         simulated = _simulated(replace_scenario(SECOND, rest_s=rest_s), seed)
@@ -668,7 +673,7 @@ def test_rests_of_a_second_are_found_and_turning_points_are_none(seed: int) -> N
 @pytest.mark.parametrize("seed", [3, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_nothing_changed_in_a_clean_recording_with_rests_of_a_second(seed: int) -> None:
     simulated = _simulated(SECOND, seed)
-    calibration = Session.of(TUMBLE, simulated).calibrate()
+    calibration = Session.of(TUMBLE, simulated).calibrate(report=False)
     assert calibration.status == "calibrated"
     found = {name: each for name, each in calibration.parameters.items() if each.sigma}
     off = [(found[name].value - true) / found[name].sigma for name, true in simulated.truth.items() if name in found]
@@ -691,7 +696,7 @@ def test_gyro_clipped_at_its_range_is_noticed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("seed", "subtracted", "rest_s", "step"),
     [
-        (1, 0.3, 1.0, 0.0),
+        pytest.param(1, 0.3, 1.0, 0.0, marks=pytest.mark.slow),
         (2, 0.3, 0.0, 1.0 / 16.4),
         *(
             pytest.param(seed, subtracted, rest_s, step, marks=pytest.mark.slow)
@@ -709,7 +714,9 @@ def test_gyro_that_subtracts_its_dead_band(seed: int, subtracted: float, rest_s:
     gyro, band = simulated.data.gyro, np.deg2rad(subtracted)
     left = np.where(np.abs(gyro) < max(band, np.deg2rad(0.3)), 0.0, gyro - band * np.sign(gyro))
     left = np.round(left / np.deg2rad(step)) * np.deg2rad(step) if step else left
-    calibration = Session.of(TUMBLE, replace(simulated, data=replace(simulated.data, gyro=left))).calibrate()
+    calibration = Session.of(TUMBLE, replace(simulated, data=replace(simulated.data, gyro=left))).calibrate(
+        report=False
+    )
     assert calibration.status == "calibrated"
     assert "The gyro has a dead band" in " ".join(calibration.notes)
     found = {name: each for name, each in calibration.parameters.items() if each.sigma}
@@ -867,7 +874,9 @@ def test_a_real_accelerometer_alone() -> None:
     """38 static poses of an ADXL355 against the published calibration, in the axes in which that K is symmetric."""
     path = _shared("openaxes_imu9") / "adxl.mcap"
     calibration, straight = (
-        Session.read(open_recording(path), "tumble", Config.model_validate({"latitude_deg": 52.38} | each)).calibrate()
+        Session.read(open_recording(path), "tumble", Config.model_validate({"latitude_deg": 52.38} | each)).calibrate(
+            report=False
+        )
         for each in ({}, {"sensors": {"accel": {"square": 0.0}}})
     )
     # It has a square term, which leaves three fifths of the noise; the published model has none.
@@ -925,7 +934,7 @@ def test_a_cube_recording_without_all_the_rest(beside: str, tmp_path: Path) -> N
     write_session(tmp_path / "mag.mcap", topics, {})
     at = {"latitude_deg": 40.0, "longitude_deg": 116.3, "altitude_m": 50.0, "date": "2026-11-20"}
     place = Config.model_validate(at)
-    calibration = Session.read(open_recording(tmp_path / "mag.mcap"), None, place).calibrate()
+    calibration = Session.read(open_recording(tmp_path / "mag.mcap"), None, place).calibrate(report=False)
     truth = json.loads((_shared("contract") / "cube_nominal.truth.json").read_text())
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
     for name in ("accel", "mag") if beside else ("mag",):
