@@ -113,11 +113,11 @@ def _conflicts(calibration: Calibration) -> list[str]:
 
 def test_a_gyro_that_feels_force_far_beyond_its_data_sheet_is_named_first() -> None:
     simulated = alidade.simulate("cube", _scenario(effects={"gyro_g_xz": 1.2e-3}), seed=4)
-    wrong = alidade.open(simulated).calibrate()
+    wrong = alidade.open(simulated).calibrate(report=False)
     assert wrong.status == "inconsistent"
     assert _conflicts(wrong)[0] == "gyro_g_xz"
     stated = Config.model_validate({"sensors": {"gyro": {"g_sensitivity": 1.2e-3}}})
-    told = alidade.open(simulated, config=stated).calibrate()
+    told = alidade.open(simulated, config=stated).calibrate(report=False)
     assert told.status == "calibrated"
     gyro_g = told.parameters["gyro_g_xz"]
     assert abs(gyro_g.value - 1.2e-3) < 4.0 * gyro_g.sigma
@@ -128,7 +128,7 @@ def test_what_contradicts_a_data_sheet_by_little_is_in_the_sigmas() -> None:
     """Cubic terms ten times their prior, of which the recording shows some: K was 7 of its sigmas off."""
     cubic = {f"accel_cube_{axis}": 1e-5 for axis in "123"}
     simulated = alidade.simulate("cube", _scenario(static_s=4.0, poses=20, effects=cubic), seed=0)
-    found = alidade.open(simulated).calibrate()
+    found = alidade.open(simulated).calibrate(report=False)
     assert found.status == "calibrated"
     assert any("contradicts its data sheet" in note for note in found.notes)
     judged = [p for p in found.parameters.values() if p.group is None and p.sigma > 0.0]
@@ -138,7 +138,7 @@ def test_what_contradicts_a_data_sheet_by_little_is_in_the_sigmas() -> None:
 def test_a_tilt_of_the_reference_that_no_residual_shows_is_named() -> None:
     """Of a reference that stands still it is as the camera's mount: both go wrong together, within 5e-3 rad unseen."""
     tilted = _scenario(effects={"reference_tilt_e": 6e-3, "reference_tilt_n": -6e-3})
-    found = alidade.open(alidade.simulate("cube", tilted, seed=0)).calibrate()
+    found = alidade.open(alidade.simulate("cube", tilted, seed=0)).calibrate(report=False)
     assert any("check sensors.reference.tilt" in note for note in found.notes)
 
 
@@ -146,11 +146,11 @@ def test_a_field_far_from_its_model_is_named_and_has_room_where_stated() -> None
     """What a building does to the field's direction it does to its strength, which no motion tells from a scale."""
     far = {"direction": 5e-6, "strength": 5e-6, "measured": None}
     simulated = alidade.simulate("cube", _scenario(field=far), seed=3)
-    wrong = alidade.open(simulated).calibrate()
+    wrong = alidade.open(simulated).calibrate(report=False)
     assert wrong.status == "inconsistent"
     assert _conflicts(wrong)[0] == "field_e"
     stated = Config.model_validate({"sensors": {"field": {"model_error": 5e-6}}})
-    told = alidade.open(simulated, config=stated).calibrate()
+    told = alidade.open(simulated, config=stated).calibrate(report=False)
     assert told.status == "weak"
     assert "mag_scale" in told.headline
     assert told.parameters["mag_k11"].sigma > 0.05
@@ -188,7 +188,7 @@ def _assert_consistent(seeds: range, solve: Any, **options: Any) -> None:
 
 
 def test_sigmas_are_consistent() -> None:
-    _assert_consistent(range(1000, 1003), solve_batch)
+    _assert_consistent(range(1000, 1002), solve_batch)
 
 
 @pytest.mark.slow

@@ -58,7 +58,7 @@ def layout(hidden: Path) -> Layout:
 
 def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> None:
     squares = []
-    for seed in range(3):
+    for seed in range(2):
         truth = _session(tmp_path / "s.mcap", seed, DENSE)
         recording = open_recording(tmp_path / "s.mcap")
         config = load_config(recording.attachment("alidade.yaml"))

@@ -14,7 +14,7 @@ from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.vision import pose
 from tests.support.solved import calibrate
 
-POSES = 6
+POSES = 4
 SCENARIO = f"{{poses: {POSES}, static_s: 2.0, turn_rad_s: 4.0, camera: {{rate_hz: 1.0, pictures: {{rate_hz: 1.0}}}}}}"
 
 
