@@ -113,7 +113,9 @@ def turns_unlike_the_gyro(trial: Trial, offset: float) -> float:
     return float(np.rad2deg(np.median(np.linalg.norm(difference, axis=1))))
 
 
-@pytest.mark.parametrize("name", TRIALS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if i else []) for i, name in enumerate(TRIALS)]
+)
 def test_motion_capture_of_the_real_trials_is_stamped_early(name: str, shared_data: Path) -> None:
     """Frames (BROAD gives them as equal to 2 deg) and the sign of the offset, about 4 ms."""
     trial = read_trial(shared_data / "broad" / f"{name}.mat")

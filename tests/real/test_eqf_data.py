@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+import pytest
 
 from alidade.factors import so3
 from alidade.factors.array import Array
@@ -50,9 +51,9 @@ class _DirectionFactor(Model):
         return np.einsum("nij,nj->ni", basis, in_s), jacobians
 
 
-def _read() -> np.ndarray:
+def _read(last: int) -> np.ndarray:
     path = str(gtsam.findExampleDataFile("EqFdata.csv"))  # type: ignore[no-untyped-call]
-    return np.asarray(np.genfromtxt(path, delimiter=",", names=True))[:LAST]
+    return np.asarray(np.genfromtxt(path, delimiter=",", names=True))[:last]
 
 
 def _columns(data: np.ndarray, pattern: str, names: str = "xyz") -> Array:
@@ -113,12 +114,14 @@ def test_direction_jacobians() -> None:
     assert_jacobians(model, [so3.exp(rng.normal(size=(9, 3))) for _ in range(2)])
 
 
-def test_bias_and_mount_within_three_sigma() -> None:
-    data = _read()
+@pytest.mark.parametrize("last", [LAST // 4, pytest.param(LAST, marks=pytest.mark.slow)])
+def test_bias_and_mount_within_three_sigma(last: int) -> None:
+    data = _read(last)
     estimate = solve_batch(_problem(data))
     assert estimate.converged, estimate.message
     truth = np.concatenate([_columns(data, "b_{}").mean(axis=0), so3.log(_columns(data, "cq_{}_0", "wxyz")[0])])
     z = (estimate.values - truth) / estimate.sigmas
     assert np.abs(z).max() < 3.0, z
-    assert estimate.sigmas[:3].max() < 2e-3  # the body spins about z, so x and y biases hardly move it
-    assert estimate.sigmas[3:].max() < 1e-2
+    wider = (LAST / last) ** 0.5
+    assert estimate.sigmas[:3].max() < 2e-3 * wider  # the body spins about z, so x and y biases hardly move it
+    assert estimate.sigmas[3:].max() < 1e-2 * wider

@@ -35,9 +35,8 @@ def test_a_cube_turned_by_hand_without_a_word_about_noise(shared_data: Path, tmp
     assert 1e-3 < used["accel_repeatability"] < 8e-3
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] if i else []) for i, name in enumerate(TRIALS)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRIALS)
 def test_a_helmet_without_a_word_about_noise(name: str, shared_data: Path, tmp_path: Path) -> None:
     trial = shared_data / "broad" / f"{name}.mat"
     converted(trial, tmp_path / "s.mcap")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +11,18 @@ import pytest
 
 import alidade
 from alidade.factors import so3
+from alidade.pipelines.config import load_config
 from alidade.pipelines.recording.plausibility import HELD
 from alidade.pipelines.reports.result import Calibration
-from tests.support.solved import calibrate
 
 # Found by an independent fit with the scales free, repeatable to 0.05 deg on another recording of the device.
 MOUNT_DEG = (-0.32, -0.38, -0.10)
+TRUE_SHEET = "sensors: {gyro: {scale: 0.1}}"
 
 
-def calibrated(recording: Path, config: str, tmp_path: Path) -> Calibration:
-    (tmp_path / "c.yaml").write_text(config)
-    return calibrate(recording, ["batch"], "head", tmp_path / "c.yaml")[0]
+@cache
+def calibrated(recording: Path, config: str) -> Calibration:
+    return alidade.open(recording, method="head", config=load_config(config.encode())).calibrate(report=False)
 
 
 @pytest.fixture
@@ -28,26 +30,32 @@ def recording(shared_data: Path) -> Path:
     return shared_data / "upenn_imu_vicon" / "u1.mcap"
 
 
-def test_the_scale_is_named_first(recording: Path, tmp_path: Path) -> None:
-    """Fixed at 0 it turns the mount by more than half of what is required: as it moves with a scale .01 smaller.
+def test_the_scale_is_named_first(recording: Path) -> None:
+    """Fixed at 0 it turns the mount by more than half of what is required.
 
     With slow errors its sigma is .85 of its prior's: the recording hardly determines it, so that it is a note.
     """
-    found = calibrated(recording, "{}", tmp_path)
+    found = calibrated(recording, "{}")
     conflicts = [finding.evidence for finding in found.findings if finding.kind == "prior_conflict"]
     assert conflicts[0]["parameter"] == "gyro_scale_x"
     assert abs(conflicts[0]["z"]) > 6.0  # 6.3: its slow errors double the sigma
-    scale, mount = (found.parameters[name].value for name in ("gyro_scale_x", "helmet_mount_y"))
-    less = calibrated(recording, f"priors: {{gyro_scale_x: {{mean: {scale - 0.01}, sigma: 1e-6}}}}", tmp_path)
-    slope = (less.parameters["helmet_mount_y"].value - mount) / -0.01
-    assert conflicts[0]["effect"]["helmet_mount_y"] == pytest.approx(slope * scale, rel=0.1)
-    assert abs(slope * scale) > 0.5 * np.deg2rad(1.0)
     # A contradicted parameter is applied: without it the rates of turns are off by 7 %.
     assert {"gyro_scale_x", "gyro_scale_y"} <= set(found.applied)
 
 
-def test_with_its_true_data_sheet_the_mount_is_right(recording: Path, tmp_path: Path) -> None:
-    found = calibrated(recording, "sensors: {gyro: {scale: 0.1}}", tmp_path)
+@pytest.mark.slow
+def test_effect_of_the_scale_on_the_mount_is_that_of_a_scale_stated_smaller(recording: Path) -> None:
+    found = calibrated(recording, "{}")
+    conflicts = [finding.evidence for finding in found.findings if finding.kind == "prior_conflict"]
+    scale, mount = (found.parameters[name].value for name in ("gyro_scale_x", "helmet_mount_y"))
+    less = calibrated(recording, f"priors: {{gyro_scale_x: {{mean: {scale - 0.01}, sigma: 1e-6}}}}")
+    slope = (less.parameters["helmet_mount_y"].value - mount) / -0.01
+    assert conflicts[0]["effect"]["helmet_mount_y"] == pytest.approx(slope * scale, rel=0.1)
+    assert abs(slope * scale) > 0.5 * np.deg2rad(1.0)
+
+
+def test_with_its_true_data_sheet_the_mount_is_right(recording: Path) -> None:
+    found = calibrated(recording, TRUE_SHEET)
     mount = [found.parameters[f"helmet_mount_{axis}"] for axis in "xyz"]
     off = [p.value - np.deg2rad(true) for p, true in zip(mount, MOUNT_DEG, strict=True)]
     assert max(abs(error) / p.sigma for error, p in zip(off, mount, strict=True)) < 3.0
@@ -68,16 +76,15 @@ def test_its_last_twenty_seconds_alone_agree(recording: Path) -> None:
     assert np.abs(off).max() < 3.0
 
 
-@pytest.mark.parametrize(("name", "jump_s"), [("u1", None), ("u2", 33.46)])
+@pytest.mark.parametrize(("name", "jump_s"), [("u1", None), pytest.param("u2", 33.46, marks=pytest.mark.slow)])
 def test_markers_that_slip_by_two_degrees_half_way(name: str, jump_s: float | None, shared_data: Path) -> None:
     """In u2 motion capture itself turns by 1 deg between two attitudes, in which the gyro has nothing."""
-    session = alidade.open(
-        shared_data / "upenn_imu_vicon" / f"{name}.mcap", config={"sensors": {"gyro": {"scale": 0.1}}}
-    )
-    healthy = session.calibrate(report=False)
+    path = shared_data / "upenn_imu_vicon" / f"{name}.mcap"
+    healthy = calibrated(path, TRUE_SHEET)
     assert healthy.status == ("calibrated" if jump_s is None else "weak"), healthy.headline
     jumps = [each.evidence["time_s"] for each in healthy.findings if each.kind in ("change", "jump")]
     assert jumps == ([] if jump_s is None else [pytest.approx(jump_s, abs=0.05)])
+    session = alidade.open(path, config=load_config(TRUE_SHEET.encode()))
     data = session.data
     time = 0.5 * (data.head_t[0] + data.head_t[-1])
     turn = np.where((data.vision_t > time)[:, None], np.deg2rad([0.5, 1.2, 1.5]), 0.0)
@@ -88,13 +95,13 @@ def test_markers_that_slip_by_two_degrees_half_way(name: str, jump_s: float | No
     assert abs(finding.evidence["time_s"] - time) < 0.2
 
 
-def test_the_noise_of_the_gyro_is_at_least_that_at_rest_and_grows_with_the_rate(shared_data: Path) -> None:
+@pytest.mark.parametrize("name", ["u1", pytest.param("u2", marks=pytest.mark.slow)])
+def test_the_noise_of_the_gyro_is_at_least_that_at_rest_and_grows_with_the_rate(name: str, shared_data: Path) -> None:
     """9.5e-4 rad/s/sqrt(Hz) by its Allan deviation; 6e-6 also has a maximum of the likelihood."""
-    for name in ("u1", "u2"):
-        found = alidade.open(shared_data / "upenn_imu_vicon" / f"{name}.mcap").calibrate(report=False)
-        used = {each.noise.name: each.used for each in found.estimate.levels}
-        assert 6e-4 < used["gyro_density"] < 3e-3
-        assert 3e-3 < used["gyro_rate_noise"] < 1.5e-2
+    found = calibrated(shared_data / "upenn_imu_vicon" / f"{name}.mcap", "{}")
+    used = {each.noise.name: each.used for each in found.estimate.levels}
+    assert 6e-4 < used["gyro_density"] < 3e-3
+    assert 3e-3 < used["gyro_rate_noise"] < 1.5e-2
 
 
 def test_an_attitude_that_is_published_five_times_counts_once(recording: Path, tmp_path: Path) -> None:
