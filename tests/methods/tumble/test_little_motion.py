@@ -37,6 +37,9 @@ CAR = TumbleScenario.model_validate(
 )
 
 
+BESIDE: tuple[dict[str, Any], ...] = ({}, {"gyro": {}}, {"accelerometer": {}}, {"gyro": {}, "accelerometer": {}})
+
+
 def _recorded(seconds: float, angles: Callable[[Array], tuple[Array, Array, Array]], gyro: bool) -> TumbleData:
     """A magnetometer at 50 Hz, .4 uT, whose calibration is K and HARD, and a gyro of 1 mrad/s."""
     rng, t = np.random.default_rng(1), np.arange(0.0, seconds, 0.02)
@@ -94,7 +97,7 @@ def test_figure_eight_and_rider_are_calibrated_within_their_sigmas(motion: Any, 
         pytest.param(
             beside, latitude, marks=[pytest.mark.slow] * (len(beside) == 1 or (latitude is None) == bool(beside))
         )
-        for beside in ({}, {"gyro": {}}, {"accelerometer": {}}, {"gyro": {}, "accelerometer": {}})
+        for beside in BESIDE
         for latitude in (40.0, None)
     ],
 )
