@@ -69,10 +69,10 @@ CHAINS: dict[str, dict[str, Any]] = {
     "one level": {"n": 200, "s": 7},
     "two levels": {"n": 420, "s": 5, "seed": 2},
     "many shared unknowns": {"n": 220, "seed": 3},
-    "states of 12 numbers, uncoupled": {"n": 120, "d": 12, "s": 9, "m": 20, "b": 0, "seed": 5},
+    "states of 12 numbers, uncoupled": {"n": 70, "d": 12, "s": 9, "m": 20, "b": 0, "seed": 5},
     "nodes": {"n": 200, "s": 6, "c": 3, "pieces": 7, "seed": 6},
     "nodes and nothing else": {"n": 130, "d": 0, "b": 0, "s": 6, "c": 6, "pieces": 130, "m": 8},
-    "short pieces": {"n": 200, "s": 6, "c": 6, "m": 4, "pieces": 100, "seed": 7, "q": 1},
+    "short pieces": {"n": 140, "s": 6, "c": 6, "m": 4, "pieces": 70, "seed": 7, "q": 1},
     "shared unknowns alone": {"n": 1, "d": 0, "b": 0, "s": 6, "m": 40},
 }
 

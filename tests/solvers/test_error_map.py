@@ -15,6 +15,13 @@ from alidade.pipelines.reports.result import Calibration
 NAMES = {"los": ("los_nominal", "los_map"), "head": ("head_mounts", "vision_map")}
 
 
+# Samples as few as tests of a single recording need.
+FEW: dict[str, dict[str, float]] = {
+    "los": {"image_rate_hz": 20.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 50.0},
+    "head": {"vision_rate_hz": 10.0, "gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0},
+}
+
+
 def _session(method: str, rms: float, seed: int, duration: float, **more: Any) -> Session:
     scenario, key = NAMES[method]
     chosen = methods.method(method)
@@ -24,8 +31,13 @@ def _session(method: str, rms: float, seed: int, duration: float, **more: Any) -
 
 
 @cache
-def _calibrated(method: str, rms: float, seed: int, duration: float, solver: str = "batch") -> Calibration:
-    return _session(method, rms, seed, duration).calibrate(solver, report=False)
+def _calibrated(method: str, rms: float, seed: int, duration: float) -> Calibration:
+    return _session(method, rms, seed, duration).calibrate(report=False)
+
+
+@cache
+def _mapped(solver: str = "batch") -> Calibration:
+    return _session("los", 1e-4, 2, 20.0, **FEW["los"]).calibrate(solver, report=False)
 
 
 def _errors(calibration: Calibration) -> np.ndarray:
@@ -43,7 +55,7 @@ def _errors(calibration: Calibration) -> np.ndarray:
 @pytest.mark.parametrize("solver", ["batch", pytest.param("incremental", marks=pytest.mark.slow)])
 def test_los_errors_by_gimbal_angles_are_found_named_and_covered(solver: str) -> None:
     """Without the map delta_z is 13 sigmas and 9 times what is required off, and `calibrated`."""
-    found = _calibrated("los", 1e-4, 2, 20.0, solver)
+    found = _mapped(solver)
     assert found.status == "weak"
     assert np.abs(_errors(found)).max() < 3.0
     (note,) = [note for note in found.notes if note.startswith("los_map")]
@@ -53,7 +65,7 @@ def test_los_errors_by_gimbal_angles_are_found_named_and_covered(solver: str) ->
 
 
 def test_clean_los_recording_is_the_same_to_the_last_digit() -> None:
-    session = _session("los", 0.0, 1, 20.0)
+    session = _session("los", 0.0, 1, 8.0, **FEW["los"])
     searched = session.calibrate("batch", report=False)
     fixed = session.config.model_copy(
         update={
@@ -75,7 +87,7 @@ def test_vision_errors_by_attitude_widen_sigmas_and_move_nothing() -> None:
     from alidade.pipelines.solvers.engines import Compiled
     from alidade.pipelines.solvers.error_map_test import with_error_map
 
-    solved = solve(Compiled.of(_session("head", 5e-3, 2, 20.0).problem()))
+    solved = solve(Compiled.of(_session("head", 5e-3, 2, 20.0, **FEW["head"]).problem()))
     plain = whole_estimate(solved)
     found = with_error_map(solved.compiled.problem, solved.posterior, plain)
     assert found.error_map is not None
@@ -89,14 +101,15 @@ def test_vision_errors_by_attitude_widen_sigmas_and_move_nothing() -> None:
 def test_map_is_drawn_over_where_measurements_were_made() -> None:
     from alidade.pipelines.reports.plots import common_plots
 
-    titles = [plot.title for plot in common_plots(_calibrated("los", 1e-4, 2, 20.0))]
+    titles = [plot.title for plot in common_plots(_mapped())]
     assert any("los_map" in title for title in titles)
 
 
 def test_a_map_moves_nothing_that_the_recording_does_not_determine() -> None:
     """A carrier that only yaws leaves delta_px to its prior; freed with a map it went to -0.17 rad."""
     carrier = methods.method("los").settings("los_nominal").model_dump()["carrier"]
-    found = _session("los", 2e-4, 2, 12.0, carrier=carrier | {"pitch": [], "roll": []}).calibrate("batch", report=False)
+    yawing = {"carrier": carrier | {"pitch": [], "roll": []}, **FEW["los"], "image_rate_hz": 10.0}
+    found = _session("los", 2e-4, 2, 12.0, **yawing).calibrate("batch", report=False)
     assert found.estimate.error_map is not None
     assert abs(found.parameters["delta_px"].value) < 0.01
     history = found.estimate.posterior_history

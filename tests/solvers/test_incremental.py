@@ -53,7 +53,7 @@ def _apart(one: Estimate, other: Estimate) -> float:
 
 
 def test_nothing_is_made_up_at_rest_nor_about_the_only_axis_of_motion() -> None:
-    """At rest the mount keeps its prior, later the part about the axis; a run that has not begun is solved anew often."""
+    """At rest the mount keeps its prior, later the part about the axis. Few pictures: each is solved anew at first."""
     rates = {"vision_rate_hz": 4.0, "gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0}
     problem, _ = _made(1, duration_s=6.0, head=beginning(SCENARIO.head, {"yaw": 3.5}), **rates)
     batch, incremental = solve_batch(problem), solve_incremental(problem)

@@ -53,8 +53,8 @@ def _assert_same(estimate: Estimate, batch: Estimate, apart: float = 0.02) -> No
 @pytest.mark.parametrize(
     ("name", "window"),
     [
-        ("ideal", 1.0),
-        ("two_positions", None),
+        pytest.param("ideal", 1.0, marks=pytest.mark.slow),
+        pytest.param("two_positions", None, marks=pytest.mark.slow),
         pytest.param("large_angles", 1.0, marks=pytest.mark.slow),
         pytest.param("rough", None, marks=pytest.mark.slow),
         pytest.param("ideal", None, marks=pytest.mark.slow),
@@ -73,6 +73,7 @@ def test_ends_where_batch_does(name: str, window: float | None) -> None:
         assert np.abs(error[:3]).max() < 0.1 * ARCSEC
 
 
+@pytest.mark.slow
 def test_independent_simulator_within_three_sigma(shared_data: Path) -> None:
     recording = open_recording(shared_data / "contract" / "indexer_nominal.mcap")
     config = load_config(recording.attachment("alidade.yaml")).model_copy(update={"sensors": IDEAL})
@@ -83,7 +84,9 @@ def test_independent_simulator_within_three_sigma(shared_data: Path) -> None:
 
 
 def test_ends_where_batch_does_with_real_sensors() -> None:
-    scenario = load_scenario(IndexerScenario, "indexer_nominal").model_copy(update={"sensors": Sensors()})
+    scenario = load_scenario(IndexerScenario, "indexer_nominal").model_copy(
+        update={"sensors": Sensors(), "gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
+    )
     graph, truth = _problem(scenario, 1)
     batch, incremental = solve_batch(graph), solve_incremental(graph)
     _assert_same(incremental, batch)

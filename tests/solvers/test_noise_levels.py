@@ -68,7 +68,7 @@ def assert_as_right(as_it_is: Estimate, wrong: Estimate) -> None:
 @pytest.mark.parametrize(
     ("method", "factor"),
     [
-        pytest.param(name, factor, marks=[pytest.mark.slow] * (factor < 1.0 or name == "cube"))
+        pytest.param(name, factor, marks=[pytest.mark.slow] * (factor < 1.0 or name != "indexer"))
         for name in CASES
         for factor in (3.0, 1.0 / 3.0)
     ],
@@ -84,7 +84,7 @@ def test_all_noise_stated_wrong(method: str, factor: float) -> None:
 
 def test_the_incremental_solver_finds_them_too() -> None:
     simulated = simulate(
-        "head", {"duration_s": 10.0, "vision_rate_hz": 8.0, "gyro_rate_hz": 100.0, "sensors": {}}, seed=1
+        "head", {"duration_s": 8.0, "vision_rate_hz": 5.0, "gyro_rate_hz": 50.0, "sensors": {}}, seed=1
     )
     right_config = load_config(simulated.config.encode())
     wrong_config = stated(right_config, {"vision_attitude": 3.0, "gyro_density": 1.0 / 3.0})
@@ -174,6 +174,7 @@ def in_sigmas(problem: Problem, truth: Array, solve: Callable[[Problem], Estimat
     return ((estimate.values - truth)[free] / estimate.sigmas[free]), estimate.inflations[free]
 
 
+@pytest.mark.slow
 def test_colour_of_vision_is_in_the_levels() -> None:
     """Noise of 0.2 s passes for gyro noise, which widens the sigmas as it should: nothing is inflated afterwards."""
     pairs = [in_sigmas(*coloured(seed, 0.2), solve_batch) for seed in range(4)]
@@ -273,7 +274,7 @@ def test_nothing_stated_and_honest(method: str, grade: str) -> None:
     ],
 )
 def test_nothing_stated_and_honest_on_a_few(method: str, grade: str, rates: dict[str, float]) -> None:
-    assert 0.6 < unstated(method, grade, range(3), **rates) < 1.6
+    assert 0.6 < unstated(method, grade, range(2), **rates) < 1.6
 
 
 def test_white_noise_of_a_sensor_in_motion() -> None:

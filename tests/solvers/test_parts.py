@@ -12,25 +12,33 @@ from alidade.factors import model
 from alidade.pipelines.solvers import chain, linearization
 
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
-    "los": ("los", {"duration_s": 30.0, "gyro_rate_hz": 200.0}),
+    "los": ("los", {"duration_s": 8.0, "image_rate_hz": 20.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 50.0}),
     "head": ("head", {"duration_s": 20.0}),
     "indexer": ("indexer", {}),
     "cube": ("cube", {}),
-    "a bias that walks": ("head", {"duration_s": 60.0, "noise": {"gyro_bias_walk": 3e-4}}),
+    "a bias that walks": (
+        "head",
+        {"duration_s": 20.0, "vision_rate_hz": 12.0, "gyro_rate_hz": 100.0, "noise": {"gyro_bias_walk": 3e-4}},
+    ),
 }
 
 
-@pytest.mark.parametrize("name", RECORDINGS)
+QUICK = ("los", "a bias that walks")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in RECORDINGS]
+)
 def test_parts_give_what_the_whole_gives(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     method, scenario = RECORDINGS[name]
     simulated = alidade.simulate(method, scenario)
-    whole = alidade.open(simulated).calibrate()
+    whole = alidade.open(simulated).calibrate(report=False)
     monkeypatch.setattr(linearization, "KEPT_BYTES", 0)
     for module in (chain, linearization):
-        monkeypatch.setattr(module, "PART_STATES", 100)
+        monkeypatch.setattr(module, "PART_STATES", 30)
     for module in (model, linearization):
-        monkeypatch.setattr(module, "TOGETHER", 30)
-    parts = alidade.open(simulated).calibrate()
+        monkeypatch.setattr(module, "TOGETHER", 10)
+    parts = alidade.open(simulated).calibrate(report=False)
     sigmas = whole.estimate.sigmas
     assert (np.abs(parts.estimate.values - whole.estimate.values) <= 1e-5 * sigmas).all()
     np.testing.assert_allclose(parts.estimate.sigmas, sigmas, rtol=1e-6)

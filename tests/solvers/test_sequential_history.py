@@ -24,7 +24,7 @@ def _until(problem: Problem, stop: float) -> Problem:
     return replace(problem, steps=lambda _: (step for step in problem.steps(1) if step.time <= stop), denser_graph=None)
 
 
-@pytest.mark.parametrize("make", [los_problem, head_problem])
+@pytest.mark.parametrize("make", [los_problem, pytest.param(head_problem, marks=pytest.mark.slow)])
 def test_history_agrees_with_solving_the_past_alone(
     make: Callable[[], Problem], monkeypatch: pytest.MonkeyPatch
 ) -> None:
