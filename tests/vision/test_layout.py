@@ -272,6 +272,7 @@ def test_a_tag_that_was_moved_is_not_placed() -> None:
     assert "disagrees" in layout.unplaced[5] or "flip" in layout.unplaced[5]
 
 
+@pytest.mark.slow
 def test_a_tag_seen_once_from_afar_is_not_placed() -> None:
     far = Camera(1280, 960, np.array([[4600.0, 0, 641.3], [0, 4620.0, 477.8], [0, 0, 1]]))
     drawn = scene(8, 60, 3, far, (3.0, 4.0))
@@ -284,6 +285,7 @@ def test_a_tag_seen_once_from_afar_is_not_placed() -> None:
     assert "flip" in layout.unplaced[5]
 
 
+@pytest.mark.slow
 def test_tags_that_a_wrong_tag_alone_ties_to_the_others_are_not_placed() -> None:
     """Tags 0 to 3 and 4 to 7, never in one picture but for tag 8, which lies about loose."""
     drawn, rng = scene(9, 120, 6), np.random.default_rng(0)
@@ -297,6 +299,7 @@ def test_tags_that_a_wrong_tag_alone_ties_to_the_others_are_not_placed() -> None
     assert layout.body.ids[0] == 0
 
 
+@pytest.mark.slow
 def test_pictures_without_perspective_do_not_tell_inside_from_outside() -> None:
     far = Camera(1280, 960, np.array([[115000.0, 0, 640.0], [0, 115000.0, 480.0], [0, 0, 1]]))
     drawn = scene(5, 30, 0, far, (95.0, 100.0))
@@ -313,7 +316,7 @@ def test_mirror_image_of_the_mirror_image_is_the_body() -> None:
 
 
 def test_a_camera_that_is_off_is_found() -> None:
-    drawn = scene(8, 60, 4, distance=(0.35, 0.7))
+    drawn = scene(8, 45, 4, distance=(0.35, 0.7))
     wrong = CAMERA.with_intrinsics(CAMERA.intrinsics + [5.0, 5.0, 4.0, -4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     shots = [Shots(wrong, drawn.pictures)]
     layout = estimate_layout(shots, drawn.given(), refine_camera=True)
@@ -328,7 +331,7 @@ def test_a_camera_that_is_off_is_found() -> None:
 def test_pictures_that_err_alike_tell_less_of_a_camera_than_its_prior() -> None:
     """Corners that err by the same for fifteen pictures in a row: centres are drawn from their prior."""
     squares = []
-    for seed in range(2):
+    for seed in range(1):
         drawn, rng = scene(6, 45, 20 + seed, distance=(0.35, 0.7)), np.random.default_rng(seed)
         off = rng.normal(scale=5.0, size=2)
         for start in range(0, 45, 15):
@@ -349,6 +352,7 @@ def test_pictures_that_err_alike_tell_less_of_a_camera_than_its_prior() -> None:
     assert np.mean(squares) < 3.0
 
 
+@pytest.mark.slow
 def test_recordings_of_two_cameras_are_one_layout() -> None:
     other = Camera(1280, 960, np.array([[900.0, 0, 600.0], [0, 900.0, 500.0], [0, 0, 1]]))
     first, second = scene(6, 20, 5), scene(6, 20, 5, other, take=1)

@@ -56,7 +56,7 @@ def _picture(
 
 def test_attitudes_come_with_their_covariance(renderer: Renderer) -> None:
     rng = np.random.default_rng(1)
-    cRb = so3.multiply(so3.exp(0.25 * rng.normal(size=(25, 3))), FACING)
+    cRb = so3.multiply(so3.exp(0.25 * rng.normal(size=(15, 3))), FACING)
     images = [
         (10**9 + k * 40_000_000, encode(_picture(renderer, q, np.array([0.01, 0.02, 0.35]), rng)))
         for k, q in enumerate(cRb)
