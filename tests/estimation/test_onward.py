@@ -68,9 +68,10 @@ def _values(problem: Problem) -> Any:
     ("name", "rates"),
     [
         ("los", {"image_rate_hz": 4.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0, "temperature": Warming()}),
-        (
+        pytest.param(
             "head",
             {"gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 5.0, "temperature": Warming()},
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -112,7 +112,7 @@ def _recording() -> tuple[HeadData, dict[str, float]]:
 
 def _scenario() -> HeadScenario:
     settings = load_scenario(HeadScenario, "head_mounts").model_dump()
-    return HeadScenario.model_validate(settings | {"gyro_rate_hz": 200, "effects": EFFECTS})
+    return HeadScenario.model_validate(settings | {"gyro_rate_hz": 100, "vision_rate_hz": 20, "effects": EFFECTS})
 
 
 @cache

@@ -30,7 +30,7 @@ from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.support.one_graph import one_graph
-from tests.support.short_problems import COARSE, FOUR_POSITIONS, head_problem
+from tests.support.short_problems import COARSE, head_problem
 
 KNOWN = "noise_known: 0\n"
 # Sigma by hand, and of what the recording says: about equal, so that both count.
@@ -72,7 +72,7 @@ def test_a_prior_with_a_mean_is_a_measurement_of_it() -> None:
 
 
 def test_a_sigma_of_zero_fixes_a_parameter_where_it_is_said_to_be() -> None:
-    estimate = solve_batch(believed(head_problem(), 0.0))
+    estimate = solve_batch(believed(as_stated(head_problem()), 0.0))
     rows = [estimate.names.index(f"helmet_mount_{axis}") for axis in "xyz"]
     np.testing.assert_allclose(estimate.values[rows], MOUNT, atol=1e-7)
     assert (estimate.sigmas[rows] == 0.0).all()
@@ -99,9 +99,10 @@ def test_a_prior_of_which_no_solution_can_be_made_is_one_line(case: str) -> None
 
 
 def test_incremental_takes_the_same_prior() -> None:
-    simulated = alidade.simulate("indexer", FOUR_POSITIONS, seed=1)
+    simulated = alidade.simulate("indexer", COARSE, seed=1)
     problem, truth = alidade.open(simulated).problem(), simulated.truth["theta_y"]
     problem = with_priors(problem, [independent(["theta_y"], [truth + 3e-6], [1e-7])])
+    problem = as_stated(problem)
     batch, incremental = (solve(problem) for solve in (solve_batch, solve_incremental))
     row = batch.names.index("theta_y")
     assert abs(batch.values[row] - truth) > 2e-6  # the prior counts
@@ -128,7 +129,7 @@ def test_what_is_fixed_today_stays_fixed_and_tells_of_the_others() -> None:
     names = ("helmet_mount_x", "camera_mount_x")
     tight = GaussianPrior(names, np.array([0.06, 0.02]), 1e-8 * np.array([[1.0, 0.99], [0.99, 1.0]]), "yesterday's")
     fixed = Config.model_validate({"priors": {"camera_mount_x": 0.0}})
-    simulated = alidade.simulate("head", {"duration_s": 10.0}, seed=1)
+    simulated = alidade.simulate("head", {"duration_s": 5.0, "vision_rate_hz": 10.0, "gyro_rate_hz": 100.0}, seed=1)
     session = alidade.open(simulated, config=fixed)
     estimate = solve_batch(with_priors(session.problem(), [tight]))
     value = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
@@ -212,7 +213,9 @@ CASES: dict[str, tuple[dict[str, Any] | None, str, float]] = {
 }
 
 
-@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * (case == "indexer")) for case in CASES])
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] * (case != "indexer assumptions")) for case in CASES]
+)
 def test_yesterdays_result_with_todays_recording_is_both_together(case: str, tmp_path: Path) -> None:
     """Against both in one graph, whose only difference is where the first recording is linearised."""
     name = case.split()[0]
@@ -353,7 +356,7 @@ def test_methods_say_what_belongs_to_a_recording() -> None:
 
 
 def test_compare_and_follow_begin_from_an_earlier_calibration(tmp_path: Path) -> None:
-    (tmp_path / "short.yaml").write_text("duration_s: 3.0\nsensors: ideal\n")
+    (tmp_path / "short.yaml").write_text("{duration_s: 3.0, sensors: ideal, vision_rate_hz: 10, gyro_rate_hz: 100}")
     for seed, name in enumerate(("before", "today")):
         scenario = ["--scenario", str(tmp_path / "short.yaml"), "--out", str(tmp_path / f"{name}.mcap")]
         CliRunner().invoke(app, ["simulate", "head", "--seed", str(seed), *scenario])
