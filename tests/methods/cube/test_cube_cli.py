@@ -143,6 +143,7 @@ def test_blurred_pictures_only(alidade: Command, tmp_path: Path) -> None:
     _refused(alidade, tmp_path, "no tag is seen sharply in any of the .* are they blurred")
 
 
+@pytest.mark.slow
 def test_three_poses_are_unobservable_and_say_what_is_missing(alidade: Command, tmp_path: Path) -> None:
     scenario = SCENARIO.model_copy(update={"poses": 3})
     data, truth = simulate_cube(scenario, 2)

@@ -107,7 +107,7 @@ def assert_consistent(runs: Sequence[Run]) -> None:
 
 
 def test_batch_errors_fit_their_covariance() -> None:
-    assert_consistent([Run(scenario(), seed, solve_batch) for seed in range(6)])
+    assert_consistent([Run(scenario(), seed, solve_batch) for seed in range(2)])
 
 
 @pytest.mark.slow
@@ -121,18 +121,21 @@ def test_incremental_errors_fit_their_covariance() -> None:
 
 
 def test_incremental_agrees_with_batch() -> None:
-    batch, incremental = clean(solve_batch).estimate, clean(solve_incremental).estimate
+    """With the noise as stated: that both find the same levels is another matter."""
+    brief = scenario(duration_s=8, vision_rate_hz=6, gyro_rate_hz=50, platform_gyro_rate_hz=50)
+    batch, incremental = (Run(brief, 1, solve, known=0.0).estimate for solve in (solve_batch, solve_incremental))
     assert np.abs((incremental.values - batch.values) / batch.sigmas).max() < 0.2
     np.testing.assert_allclose(incremental.sigmas, batch.sigmas, rtol=0.05)
 
 
-@SOLVERS
+@BATCH_FIRST
 def test_right_noise_is_consistent(solve: Solve) -> None:
     assert clean(solve).assessment.status == "calibrated"
     assert clean(solve).worst < 3.0
 
 
-@pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@SOLVERS
 def test_vision_noise_set_too_small_is_found(solve: Solve) -> None:
     """Three times."""
     run = Run(scenario(), 1, solve, "vision_attitude")
@@ -151,6 +154,7 @@ def test_vision_noise_known_exactly_and_too_small_is_inconsistent() -> None:
     assert "vision" in assessment.headline
 
 
+@pytest.mark.slow
 def test_gyro_noise_set_too_small_is_found_in_the_residuals() -> None:
     """Where the gyro's noise, and not vision's, is what they are made of."""
     settings = scenario(noise={"gyro_density": 2e-3, "vision_attitude": 5e-4})
@@ -282,8 +286,8 @@ def test_keyframes_stand_where_pictures_of_another_clock_were_taken(early: float
     assert np.abs(late - early - truth["time_offset"]).max() < 0.02
 
 
-def test_errors_fit_their_covariance_over_ten_minutes_of_a_clock_that_drifts() -> None:
-    run = Run(_drifting(600.0, -1.5e-3), 2, solve_batch)
+def test_errors_fit_their_covariance_over_two_minutes_of_a_clock_that_drifts() -> None:
+    run = Run(_drifting(120.0, -1.5e-3), 2, solve_batch)
     assert run.nees < chi2.ppf(1 - 1e-3, len(run.error))
 
 

@@ -47,7 +47,7 @@ def sigmas_off(path: Path) -> tuple[np.ndarray, str]:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    settings = scenario(duration_s=8, vision_rate_hz=6)
+    settings = scenario(duration_s=8, vision_rate_hz=4)
     return written(tmp_path_factory.mktemp("pictures") / "s.mcap", settings, 1)
 
 
@@ -64,7 +64,7 @@ def test_every_parameter_from_pictures_alone(session: Path) -> None:
 
 def test_attitudes_seen_in_pictures_are_the_boards(session: Path) -> None:
     """Mounts and time offset included; their errors fit the covariance that came with them."""
-    settings = scenario(duration_s=8, vision_rate_hz=6)
+    settings = scenario(duration_s=8, vision_rate_hz=4)
     exact = settings.model_copy(update={"noise": settings.noise.model_copy(update={"vision_attitude": 0.0})})
     expected, _ = simulate_head(exact, 1)
     data = read(session)
