@@ -129,6 +129,7 @@ def test_noise_stated_three_times_too_small_is_no_cause_and_told(head: Case) -> 
     assert told == {"vision_attitude": pytest.approx(3.0, rel=0.1)}
 
 
+@pytest.mark.slow
 def test_noise_known_exactly_and_three_times_too_small_does_not_fit() -> None:
     find, data, config = head_of(5.0)
     known = with_noise(config, vision_attitude=1.0 / 3.0).model_copy(update={"noise_known": 0.0})
@@ -146,6 +147,7 @@ def test_signs_of_the_helmet_gyro(head: Case, signs: tuple[float, ...]) -> None:
     assert label == f"the sign of the helmet gyro's {axes} is wrong"
 
 
+@pytest.mark.slow
 def test_a_flipped_axis_where_mounts_and_scales_are_free_is_told_from_its_equivalents() -> None:
     """With nothing stated a scale of -1 and another mount fit as well, but for their priors."""
     scenario = HeadScenario(duration_s=12.0, vision_rate_hz=15, gyro_rate_hz=100, platform=None)
@@ -383,7 +385,7 @@ def test_halves_of_a_recording_agree_and_those_of_two_do_not(head: Case) -> None
     assert changed.step == pytest.approx(0.02, rel=0.3)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_corners_of_a_pose_held_out_are_predicted_by_the_turn_to_it(seed: int) -> None:
     """Alone that leaves the place open, and the attitude to some milliradians, tens of sigmas of a corner."""
     cube = method("cube")
@@ -420,10 +422,10 @@ def test_a_flipped_axis_ends_inconsistent_with_that_first(tmp_path: Path) -> Non
 
 
 def test_a_trial_that_raises_ends_alone_and_is_logged(
-    head: Case, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Three of twelve inconsistent recordings once ended in a RuntimeError of a trial's graph."""
-    find, data, config = head
+    find, data, config = head_of(6.0)
     flipped = replace(data, head_gyro=data.head_gyro * [1.0, -1.0, 1.0])
 
     def fragile(data: Any, config: Config) -> Any:

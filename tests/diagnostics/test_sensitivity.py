@@ -74,7 +74,7 @@ def moves(of: Session, name: str) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize(
     ("name", "exact"),
-    [("indexer", "latitude_deg"), ("cube", "latitude_deg"), ("cube", "tag_size")],
+    [("indexer", "latitude_deg"), ("cube", "latitude_deg"), pytest.param("cube", "tag_size", marks=pytest.mark.slow)],
 )
 def test_an_input_that_is_off_moves_what_is_foretold(name: str, exact: str) -> None:
     foretold, found = moves(session(name), exact)

@@ -98,11 +98,11 @@ def _smith(K: Array, b: Array, field: float, dip: float, h: Array) -> Array:
 
 @pytest.mark.parametrize("beside", [{}, {"gyro": {"rate_hz": 50.0, "mounting_deg": 4.0}}])
 def test_deviation_coefficients_are_those_of_smiths_formula_integrated(beside: dict[str, object]) -> None:
-    """Values by quadrature over 3,600 headings, sigmas by draws from the joint posterior; a gyro makes K whole."""
+    """Values by quadrature over 360 headings, sigmas by draws from the joint posterior; a gyro makes K whole."""
     scenario = {"attitudes": 15, "magnetometer": {"rate_hz": 20.0, "hard_iron": 1e-5}, **beside}
     c = alidade.calibrate(alidade.simulate("tumble", scenario, seed=1))
     found, posterior = c.uses[0], posterior_of(c)
-    h = np.linspace(0.0, 2.0 * np.pi, 3600, endpoint=False)
+    h = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
     waves = np.stack([0.5 * np.ones_like(h), np.sin(h), np.cos(h), np.sin(2 * h), np.cos(2 * h)]) * 2.0 / len(h)
 
     def direct(x: Array, applied: Mapping[str, float] | None) -> Array:
@@ -168,7 +168,7 @@ def test_results_have_the_sigmas_of_draws(name: str, tmp_path: Path) -> None:
     constants = {**dict.fromkeys((q.name for q in c.problem.quantities), 0.0), **c.problem.constants}
     errors: dict[str, list[Array]] = {}
     found = c.apply(sigma=True, **measured)
-    for draw in rng.multivariate_normal(c.estimate.values, c.covariance, 2000):
+    for draw in rng.multivariate_normal(c.estimate.values, c.covariance, 1000):
         space = {**constants, **dict(zip(c.estimate.names, draw.tolist(), strict=True))}
         for name, true in results(everything, space, measured).items():
             if name in found:
