@@ -104,15 +104,15 @@ def test_the_scan_is_exact() -> None:
     assert STEP_PRIOR == 0.35
 
 
-def test_a_recording_in_which_nothing_changes_has_no_finding() -> None:
-    for seed in (1, 2, 3):
-        estimate, finding = found(recorded(seed))
-        assert finding is None
-        assert estimate.steps is not None
-        assert step_stability(estimate.steps[0], DURATION_S).level > 0.05
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
+def test_a_recording_in_which_nothing_changes_has_no_finding(seed: int) -> None:
+    estimate, finding = found(recorded(seed))
+    assert finding is None
+    assert estimate.steps is not None
+    assert step_stability(estimate.steps[0], DURATION_S).level > 0.05
 
 
-@pytest.mark.parametrize(("deg", "time"), [(1.0, 9.0), (20.0, 24.0)])
+@pytest.mark.parametrize(("deg", "time"), [(1.0, 9.0), pytest.param(20.0, 24.0, marks=pytest.mark.slow)])
 def test_a_slip_is_found_that_levels_would_hide(deg: float, time: float) -> None:
     """Without the step the gyro's noise rises, and the recording would be calibrated."""
     estimate, finding = found(slipped(recorded(2), deg, time))
@@ -133,13 +133,14 @@ def test_a_glitch_of_the_reference_is_no_change() -> None:
     assert not any(step.jumped for step in estimate.steps if abs(step.time_s - 14.0) < 0.1)
 
 
-def test_a_glitch_hides_no_smaller_slip() -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(("deg", "least"), [(1.0, Severity.WEAK), (1.5, Severity.INCONSISTENT)])
+def test_a_glitch_hides_no_smaller_slip(deg: float, least: Severity) -> None:
     """Both have a jump; the glitch has the larger one, and passes for noise, so that motion tells less of the slip."""
-    for deg, least in ((1.0, Severity.WEAK), (1.5, Severity.INCONSISTENT)):
-        finding = found(slipped(glitching(recorded(1)), deg, 20.0))[1]
-        assert finding is not None
-        assert finding.severity >= least
-        assert abs(finding.evidence["time_s"] - 20.0) < 0.3
+    finding = found(slipped(glitching(recorded(1)), deg, 20.0))[1]
+    assert finding is not None
+    assert finding.severity >= least
+    assert abs(finding.evidence["time_s"] - 20.0) < 0.3
 
 
 def test_a_world_that_is_found_anew_is_no_change() -> None:
