@@ -355,6 +355,7 @@ def test_methods_say_what_belongs_to_a_recording() -> None:
         walks(method("head"), load_config(b"share: {gyro_bia: device}"), names)
 
 
+@pytest.mark.slow
 def test_compare_and_follow_begin_from_an_earlier_calibration(tmp_path: Path) -> None:
     (tmp_path / "short.yaml").write_text("{duration_s: 3.0, sensors: ideal, vision_rate_hz: 10, gyro_rate_hz: 100}")
     for seed, name in enumerate(("before", "today")):
