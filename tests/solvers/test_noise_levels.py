@@ -82,6 +82,7 @@ def test_all_noise_stated_wrong(method: str, factor: float) -> None:
             assert abs(level.found - 1.0 / factor) < 4.0 * level.sigma
 
 
+@pytest.mark.slow
 def test_the_incremental_solver_finds_them_too() -> None:
     simulated = simulate(
         "head", {"duration_s": 8.0, "vision_rate_hz": 5.0, "gyro_rate_hz": 50.0, "sensors": {}}, seed=1

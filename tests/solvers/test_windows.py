@@ -38,8 +38,8 @@ def in_batch(method: str) -> tuple[Problem, Estimate]:
     return problem, solve_batch(problem)
 
 
-# Each method and each window once.
-QUICK = [("los", None), ("indexer", None), ("head", Keyframes(10))]
+# Each window once.
+QUICK = [("los", None), ("head", Keyframes(10))]
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,7 @@ def layout(hidden: Path) -> Layout:
     return cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
 
 
+@pytest.mark.slow
 def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> None:
     squares = []
     for seed in range(2):

@@ -69,6 +69,7 @@ def test_the_course_is_that_of_the_run(online: Calibration, concluded: Calibrati
     assert not concluded.innovations
 
 
+@pytest.mark.slow
 def test_the_command_says_so(tmp_path: Path) -> None:
     data, truth = simulate_head(SCENARIO.model_copy(update={"duration_s": 4.0}), 1)
     method("head").write_data(tmp_path / "s.mcap", data, truth, "sensors: ideal")
