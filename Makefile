@@ -28,7 +28,7 @@ bench: $(VENV)/dev
 	$(BIN)/python -m benchmarks
 
 # Wheel and sdist, each installed into an environment of its own, away from the checkout; then a new user's path through
-# README, quick start and the page of each method, typed there.
+# README, quick start, the page of each method and the how-to guides that take long, typed there.
 dist: $(VENV)/dev
 	rm -rf build/smoke dist
 	$(BIN)/python -m build --outdir dist > build.log 2>&1 || { cat build.log; exit 1; }
@@ -39,13 +39,14 @@ dist: $(VENV)/dev
 	  build/smoke/bin/python -m pip install --quiet --disable-pip-version-check $$made -c constraints.txt && \
 	  cp tests/install/smoke.py tests/install/walk.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
 	done
-	cd build/smoke && bin/python walk.py $(CURDIR)/README.md $(CURDIR)/docs/quickstart.md $(CURDIR)/docs/methods/*.md
+	cd build/smoke && bin/python walk.py $(CURDIR)/README.md $(CURDIR)/docs/quickstart.md $(CURDIR)/docs/methods/*.md \
+	  $(CURDIR)/docs/howto/compass.md $(CURDIR)/docs/howto/follow.md $(CURDIR)/docs/howto/plan.md $(CURDIR)/docs/howto/python.md
 
 # A wheel of every pinned run-time dependency for Linux x86-64 and aarch64 and macOS arm64, Python 3.11 to 3.14.
 wheels: $(VENV)/dev
 	$(BIN)/python tests/install/wheels.py
 
-# The site; tests/applications/test_docs.py runs what its pages show.
+# The site; tests/applications/test_docs.py and `make dist` run what its pages show.
 docs: $(VENV)/dev
 	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees docs build/docs
 	@echo "The site: build/docs/index.html"

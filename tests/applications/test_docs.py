@@ -34,11 +34,15 @@ _HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 
 # Their commands need a process of their own.
 _APART = ("docs/howto/fleet.md", "docs/howto/write-a-method.md")
-# Their commands are those of other tests, on longer recordings; `make dist` walks README, quick start and all methods.
-_METHODS = ("docs/methods/cube.md", "docs/methods/indexer.md", "docs/methods/los.md")
+# `make dist` walks them in an environment of its own.
+_WALKED = {
+    page
+    for pattern in re.findall(r"\$\(CURDIR\)/(\S+)", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    for page in ROOT.glob(pattern)
+}
+# Their commands are those of other tests, on longer recordings.
 _LONG = (
     *_APART,
-    *_METHODS,
     "docs/howto/check-a-result.md",
     "docs/howto/print-a-cube.md",
     "docs/howto/several-recordings.md",
@@ -58,7 +62,11 @@ def _name(page: Path) -> str:
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(p, marks=[pytest.mark.slow] * (_name(p) in _LONG), id=_name(p)) for p in PAGES if steps(p)],
+    [
+        pytest.param(p, marks=[pytest.mark.slow] * (_name(p) in _LONG), id=_name(p))
+        for p in PAGES
+        if p not in _WALKED and steps(p)
+    ],
 )
 def test_page_works(
     page: Path,

@@ -60,6 +60,8 @@ def steps(page: Path) -> list[Step]:
         elif kind == "text":
             last = found[-1]
             found[-1] = Step(last.kind, last.text, last.file, last.exit_code, text)
+        elif kind == "python" and found and found[-1].kind == "python" and found[-1].output is None:
+            found[-1] = Step(kind, found[-1].text + text)
         else:
             found.append(Step(kind, text, block["file"] or ""))
     return found
