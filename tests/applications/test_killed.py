@@ -1,6 +1,7 @@
 """Commands that are killed (SIGKILL) at random moments leave results that are whole, or none, and no process.
 
-200 moments of each command, in parts, are slow; a few are tried always.
+200 moments of each command, in parts. tests/reports/test_whole.py kills a writer of results a few times,
+tests/applications/follow and fleet their commands once.
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ from alidade.pipelines.methods import simulate
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import load_calibration
 
+pytestmark = pytest.mark.slow
 
-def _parts(few: int, count: int) -> pytest.MarkDecorator:
-    """A few kills, and 200 in so many parts."""
-    slow = (pytest.param(i, 200 // count, id=f"part {i}", marks=pytest.mark.slow) for i in range(1, count + 1))
-    return pytest.mark.parametrize(("part", "kills"), [pytest.param(0, few, id="few"), *slow])
+
+def _parts(count: int) -> pytest.MarkDecorator:
+    """200 kills in so many parts."""
+    return pytest.mark.parametrize(
+        ("part", "kills"), [pytest.param(i, 200 // count, id=f"part {i}") for i in range(count)]
+    )
 
 
 # A server of its own forks the commands, which have imported what they need: a fork of a process with threads,
@@ -94,13 +98,13 @@ def _is_whole(out: Path, names: tuple[str, ...] = FILES) -> bool:
     return True
 
 
-@_parts(3, 4)
+@_parts(4)
 def test_calibrate(part: int, kills: int, recordings: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     _killed(["calibrate", str(recordings[0]), "--quiet"], out, lambda: _is_whole(out), kills, part)
 
 
-@_parts(2, 5)
+@_parts(5)
 def test_follow(part: int, kills: int, recordings: list[Path], tmp_path: Path) -> None:
     """What was recorded until then can be read."""
     out, kept, config = tmp_path / "out", tmp_path / "kept", tmp_path / "config.yaml"
@@ -117,7 +121,7 @@ def test_follow(part: int, kills: int, recordings: list[Path], tmp_path: Path) -
     _killed(arguments, out, look, kills, part, recordings[0])
 
 
-@_parts(1, 8)
+@_parts(8)
 def test_fleet(part: int, kills: int, recordings: list[Path], tmp_path: Path) -> None:
     """A line of results.jsonl is whole; the same command goes on with those that are missing."""
     pytest.importorskip("distributed")
