@@ -23,7 +23,7 @@ from tests.support.damage import boundaries, cuts, flips, rewrite, spoilt
 from tests.support.solved import calibrate
 
 LOS = LosScenario(
-    duration_s=7.0,
+    duration_s=5.0,
     carrier=EulerMotion(
         yaw=[Swing(amplitude_deg=20, frequency_hz=0.3)],
         pitch=[Swing(amplitude_deg=8, frequency_hz=0.62)],
@@ -47,40 +47,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-def judged(alidade: Command, data: bytes, folder: Path) -> str:
-    """The status that a damaged recording gets, `refused` if none; fails if it gets a wrong answer."""
-    path, out = folder / "x.mcap", folder / "out"
-    path.write_bytes(data)
-    run = alidade("calibrate", path, "--method", "los", "--out", out)
-    if run.code == 2:
-        assert run.err.startswith("alidade: ")
-        assert run.err.count("\n") == 1
-        assert not out.exists()
-        return "refused"
-    assert run.code in (0, 3, 4)
-    assert run.err == ""
-    assert {"result.json", "calibration.yaml", "report.html"} <= {file.name for file in out.iterdir()}
-    result = json.loads((out / "result.json").read_text())
-    if result["status"] == "calibrated":
-        errors = [abs(known["error_sigmas"] or 0.0) for known in result.get("truth", {}).values()]
-        assert max(errors, default=0.0) < 4.0
-        assert all("error_sigmas" in known for known in result.get("truth", {}).values())
-    for file in out.iterdir():
-        file.unlink()
-    out.rmdir()
-    return str(result["status"])
-
-
-def test_a_damaged_recording_is_calibrated_rightly_or_not_at_all(
-    alidade: Command, session: bytes, tmp_path: Path
-) -> None:
-    every = cuts(session)
-    found = Counter(judged(alidade, data, tmp_path) for data in [*every[4 :: len(every) // 3], *flips(session, 5, 1)])
-    assert found["calibrated"] > 3
-
-
 def solved(data: bytes, path: Path) -> str:
-    """As `judged`, without the pages, which take longest."""
+    """The status that a damaged recording gets, `refused` if none; fails if it gets a wrong answer."""
     path.write_bytes(data)
     try:
         (calibration,) = calibrate(path, ["batch"], "los")
@@ -90,6 +58,11 @@ def solved(data: bytes, path: Path) -> str:
     errors = [abs(known.error_sigmas or 0.0) for known in truth_errors(calibration).values()]
     assert status != "calibrated" or max(errors, default=0.0) < 4.0
     return status
+
+
+def test_a_damaged_recording_is_calibrated_rightly_or_not_at_all(session: bytes, tmp_path: Path) -> None:
+    copies = [*cuts(session)[4 :: len(cuts(session)) // 3], *flips(session, 5, 1)]
+    assert Counter(solved(data, tmp_path / "x.mcap") for data in copies)["calibrated"] > 3
 
 
 @pytest.mark.slow
@@ -108,7 +81,7 @@ def test_what_is_lost_is_in_the_result_the_report_and_the_terminal(
     alidade: Command, session: bytes, tmp_path: Path
 ) -> None:
     path = tmp_path / "x.mcap"
-    at = [place for place in boundaries(session)[:-1] if session[place] == Opcode.CHUNK][4] + 100
+    at = [place for place in boundaries(session)[:-1] if session[place] == Opcode.CHUNK][2] + 100
     path.write_bytes(session[:at] + bytes([session[at] ^ 1]) + session[at + 1 :])
     told = r"the recording is damaged: 1 chunk, "
     for command in (["info", path], ["calibrate", path, "--out", tmp_path / "out"], ["compare", path]):
@@ -121,7 +94,7 @@ def test_what_is_lost_is_in_the_result_the_report_and_the_terminal(
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert any(told in note for note in result["notes"])
     lost = result["session"]["dropped"]["/imu: lost with damaged bytes of the file"]
-    assert lost + result["session"]["counts"]["/imu"] == 7 * 100
+    assert lost + result["session"]["counts"]["/imu"] == 5 * 100
     assert (tmp_path / "out" / "report.html").read_text().count("is damaged: 1 chunk") == 2
     for command in (
         ["info", path],

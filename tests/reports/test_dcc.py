@@ -15,6 +15,7 @@ from alidade import calibrate, certificate, simulate
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.dcc import NEEDED, d_si_unit
 from tests.support.command import Command
+from tests.support.short_problems import COARSE
 
 FIELDS = """\
 number: C-2026-017
@@ -67,7 +68,7 @@ SPACES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("certified")
-    calibrate(simulate("indexer", None, seed=1)).write(folder)
+    calibrate(simulate("indexer", COARSE, seed=1)).write(folder)
     (folder / "fields.yaml").write_text(FIELDS, encoding="utf-8")
     certificate(folder, folder / "fields.yaml", dcc=True)
     return folder

@@ -29,6 +29,7 @@ from alidade.pipelines.reports.export_formats import ros_parameters
 from alidade.pipelines.settings import Config
 from tests.support.builders import make_calibration
 from tests.support.formulas import CASES
+from tests.support.short_problems import COARSE
 
 
 class Rotation:
@@ -150,7 +151,7 @@ def test_indexer_formulas_scale_the_gyro_and_tilt_the_axes_where_these_are_free(
 
 
 def test_a_calibration_applies_itself() -> None:
-    settings = {"duration_s": 12.0, "time_offset_s": 0.02}
+    settings = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0, "time_offset_s": 0.02}
     data, truth = alidade.simulate("head", {**settings, "effects": {"gyro_scale_x": 0.03}}, seed=1)
     calibration = alidade.calibrate(data, method="head")
     assert calibration.parameters["time_offset"].value == pytest.approx(truth["time_offset"], abs=5e-3)
@@ -176,7 +177,7 @@ def test_a_calibration_applies_itself() -> None:
 
 def test_what_the_published_solver_does_not_know_counts_as_zero() -> None:
     config = Config()
-    calibration = alidade.open(alidade.simulate("los", {"duration_s": 10.0}, seed=1)).calibrate("published")
+    calibration = alidade.open(alidade.simulate("los", {"duration_s": 4.0}, seed=1)).calibrate("published")
     assert "gyro_bias_x" not in calibration.parameters
     assert config.method is None
     gyro = np.array([0.1, -0.2, 0.3])
@@ -187,10 +188,10 @@ def test_what_the_published_solver_does_not_know_counts_as_zero() -> None:
 @pytest.mark.parametrize(
     ("name", "scenario"),
     [
-        ("los", {"duration_s": 10.0}),
-        ("indexer", None),
-        ("head", {"duration_s": 10.0}),
-        ("cube", {"poses": 8}),
+        ("los", {"duration_s": 3.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 5.0}),
+        ("indexer", COARSE),
+        ("head", {"duration_s": 3.0, "gyro_rate_hz": 50.0, "vision_rate_hz": 10.0}),
+        ("cube", {"poses": 4, "static_s": 1.0, "imu_rate_hz": 50.0, "camera": {"rate_hz": 2.0}}),
         ("tumble", None),
     ],
 )

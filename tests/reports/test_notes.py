@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
@@ -13,6 +14,7 @@ from tests.support.builders import make_calibration
 from tests.support.solved import calibrate
 
 
+@pytest.mark.slow
 def test_a_gyro_turned_by_90_degrees_is_found_and_told(tmp_path: Path) -> None:
     """The graph finds the turn, however far from the prior; that is no mounting error, and the reader is told."""
     scenario = LosScenario(duration_s=15.0, image_rate_hz=20.0, gyro_rate_hz=200.0)

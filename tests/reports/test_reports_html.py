@@ -229,7 +229,8 @@ def test_parameters_of_a_partial_estimate_keep_their_units() -> None:
 
 def test_the_page_solves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside an incremental estimate stands the published one, which the session has solved before."""
-    opened = alidade.open(alidade.simulate("los", {"duration_s": 6.0, "gyro_rate_hz": 50.0}, seed=1))
+    rates = {"gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 5.0}
+    opened = alidade.open(alidade.simulate("los", {"duration_s": 2.5, "sensors": "ideal", **rates}, seed=1))
     calibration = opened.calibrate("incremental")
     assert calibration.beside is not None
     assert opened.calibrate("incremental", report=False).beside is None

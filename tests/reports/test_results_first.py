@@ -63,6 +63,7 @@ def test_open_content_is_short_and_does_not_scroll_sideways(name: str, tmp_path:
         assert tab.value(first) < (500 if width == DESKTOP else 900)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_print_to_pdf_has_the_plots_that_are_collapsed_on_the_screen(tmp_path: Path) -> None:
     """A headless browser prints as soon as the page is loaded."""
@@ -119,6 +120,7 @@ def test_a_terminal_and_a_notebook_show_what_the_page_begins_with() -> None:
         assert all(number in shown for number in numbers for shown in (text, page, notebook))
 
 
+@pytest.mark.slow
 def test_the_verdict_is_one_sentence_whatever_fails() -> None:
     """A cube of three poses once had eleven lines of names."""
     few = alidade.calibrate(alidade.simulate("cube", {"poses": 3}, seed=1))
@@ -148,7 +150,7 @@ def test_scale_angles_and_bias_have_the_sigmas_of_draws() -> None:
     titles = [group.title for group in card.groups]
     assert titles == ["Mean scale error", "Scale error about mean", "Non-orthogonality", "Misalignment", "Bias"]
     names = list(c.values)
-    draws = np.random.default_rng(0).multivariate_normal(c.estimate.values, c.covariance, 4000)
+    draws = np.random.default_rng(0).multivariate_normal(c.estimate.values, c.covariance, 2000)
     parts = []
     for draw in draws:
         K, bias = sensor_model("mag", dict(zip(names, draw.tolist(), strict=True)))

@@ -38,7 +38,9 @@ def test_spectrum_shows_a_slow_error() -> None:
 
 
 def test_report_of_head_has_the_spectrum_of_vision() -> None:
-    calibration = alidade.open(alidade.simulate("head", {"duration_s": 20.0, "gyro_rate_hz": 100.0})).calibrate()
+    calibration = alidade.open(
+        alidade.simulate("head", {"duration_s": 8.0, "gyro_rate_hz": 50.0, "vision_rate_hz": 20.0})
+    ).calibrate()
     assert "Spectrum of vision" in [plot.title for plot in common_plots(calibration)]
     e = calibration.estimate.innovations["vision"].whitened
     assert abs((e**2).mean() - 1.0) < 5.0 * (2.0 / e.size) ** 0.5

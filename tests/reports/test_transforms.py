@@ -16,12 +16,13 @@ from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration, saved
 from alidade.pipelines.reports.export_formats import export, roll_pitch_yaw
 from alidade.pipelines.reports.result import Calibration
+from tests.support.short_problems import COARSE
 
 FRAMES = {
     "indexer": {"mRt": ("imu", "platform")},
     "head": {"vRh": ("helmet_imu", "markers"), "cRb": ("camera", "platform")},
 }
-SCENARIOS = {"indexer": {}, "head": {"duration_s": 20.0, "vision_rate_hz": 5.0}}
+SCENARIOS = {"indexer": COARSE, "head": {"duration_s": 10.0, "gyro_rate_hz": 50.0, "vision_rate_hz": 5.0}}
 
 
 @pytest.fixture(scope="module", params=sorted(FRAMES))
@@ -51,7 +52,7 @@ def test_the_covariance_is_that_of_rotations_about_the_parents_axes(calibration:
     rng = np.random.default_rng(0)
     estimate = calibration.estimate
     scale = 1e-2
-    draws = rng.multivariate_normal(np.zeros(len(estimate.names)), calibration.covariance, 4000) * scale
+    draws = rng.multivariate_normal(np.zeros(len(estimate.names)), calibration.covariance, 2000) * scale
     for name, each in saved(calibration).transforms.items():
         formulas = [f for f in calibration.formulas if f.name == name]
         turns = []
@@ -89,7 +90,7 @@ def test_tf_and_urdf_say_the_same(read_back: SavedCalibration) -> None:
 def test_a_cubes_mounts_are_those_of_its_config_corrected() -> None:
     cube = method("cube")
     simulated = cube.simulate(
-        cube.scenario.model_validate({"poses": 6, "static_s": 2.0, "camera": {"rate_hz": 4.0}}), 0
+        cube.scenario.model_validate({"poses": 4, "static_s": 1.0, "imu_rate_hz": 50.0, "camera": {"rate_hz": 2.0}}), 0
     )
     calibration = Session.of(cube, simulated).calibrate()
     transforms = saved(calibration).transforms
