@@ -136,6 +136,7 @@ def test_an_ardupilot_log_that_cannot_be_used_is_one_line(tmp_path: Path, monkey
         open_recording(path)
 
 
+@pytest.mark.slow
 def test_a_tumble_from_an_ardupilot_log(alidade: Command, tmp_path: Path) -> None:
     """Two IMUs and a compass: what the same recording gives as MCAP, but for the rounding to milligauss."""
     compass = TumbledMagnetometer(rate_hz=20.0, density=1e-7)

@@ -56,7 +56,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, Whole, P
     return path.read_bytes(), read(open_recording(path)), folder / "copy.mcap"
 
 
-@fuzzed(40, 3000)
+@fuzzed(12, 3000)
 def test_edits_of_a_recording(trial: settings, recording: tuple[bytes, Whole, Path]) -> None:
     """Bytes replaced, removed and inserted: never a number that was not recorded, never a loss that is not told."""
     data, whole, path = recording
@@ -75,7 +75,7 @@ def test_edits_of_a_recording(trial: settings, recording: tuple[bytes, Whole, Pa
     property_()
 
 
-@fuzzed(60, 5000)
+@fuzzed(40, 5000)
 def test_bytes_as_a_recording(trial: settings, recording: tuple[bytes, Whole, Path]) -> None:
     path = recording[2]
     opcodes = st.integers(1, 15).map(lambda opcode: bytes([opcode]))
@@ -112,7 +112,7 @@ def test_bytes_as_messages(trial: settings, kind: str, tmp_path: Path) -> None:
     property_()
 
 
-@fuzzed(60, 3000)
+@fuzzed(15, 3000)
 def test_texts_as_definitions(trial: settings, tmp_path: Path) -> None:
     lines = messages.definition_text(messages.JOINT_STATE).splitlines()
     words = ["float64", "string", "std_msgs/Header", "a/B", "int8[4]", "string[]", "x", "=" * 80, "MSG: a/B"]
@@ -179,7 +179,7 @@ def test_bytes_as_a_video(trial: settings) -> None:
     property_()
 
 
-@fuzzed(100, 10_000)
+@fuzzed(40, 10_000)
 def test_anything_as_a_config(trial: settings) -> None:
     keys = st.sampled_from(
         [*Config.model_fields, "imu", "tags", "board", "gyro_density", "delta_px", "size", "16", "raw"]

@@ -94,8 +94,7 @@ def methods(*quick: str) -> pytest.MarkDecorator:
 
 
 METHODS = methods(*SHORT)
-SLOW_BUT_THREE = methods("los", "head", "tumble")
-SLOW_BUT_HEAD = methods("head")
+SLOW_BUT_TUMBLE = methods("tumble")
 
 
 def simulated(name: str, seed: int = 0, **changes: object) -> Simulated:
@@ -155,7 +154,7 @@ def test_nonsense_is_refused(celsius: object, t: object, said: str, tmp_path: Pa
         told(tmp_path, celsius, t)
 
 
-@SLOW_BUT_THREE
+@SLOW_BUT_TUMBLE
 def test_a_slope_that_is_told_is_found_and_one_that_is_not_spoils_the_bias(name: str) -> None:
     made = simulated(name, 1, **SLOPES[name], **BRIEF.get(name, {}))
     problem = session_of(name, made).problem()
@@ -212,7 +211,7 @@ def assert_consistent(name: str, seeds: range) -> None:
     assert low < total < high
 
 
-@SLOW_BUT_THREE
+@SLOW_BUT_TUMBLE
 def test_errors_fit_their_covariance(name: str) -> None:
     assert_consistent(name, range(2))
 
@@ -223,7 +222,7 @@ def test_errors_fit_their_covariance_over_many_runs(name: str) -> None:
     assert_consistent(name, range(100, 300))
 
 
-@SLOW_BUT_HEAD
+@SLOW_BUT_TUMBLE
 def test_from_the_command_line(name: str, tmp_path: Path, alidade: Command) -> None:
     """Simulated, read from its file, solved, applied."""
     scenario = tmp_path / "warming.yaml"
