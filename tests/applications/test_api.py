@@ -57,11 +57,11 @@ def test_typing_is_announced() -> None:
         assert (Path(str(package.__file__)).parent / "py.typed").is_file()
 
 
-def test_a_file_its_data_and_its_arrays_give_the_same_calibration(
-    simulated: alidade.Simulated, calibration: alidade.Calibration, tmp_path: Path
-) -> None:
+def test_a_file_its_data_and_its_arrays_give_the_same_calibration(tmp_path: Path) -> None:
     from alidade.pipelines.methods import method
 
+    simulated = alidade.simulate("head", BRIEF["head"], seed=3)
+    calibration = alidade.open(simulated).calibrate()
     method("head").write(tmp_path / "s.mcap", simulated)
     data = simulated.data
     config = alidade.open(simulated).config
@@ -118,12 +118,12 @@ def test_a_plan_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         raise AssertionError("a file was asked for")
 
     monkeypatch.setattr(tempfile, "TemporaryDirectory", refuse)
-    rates = "gyro_rate_hz: 100, image_rate_hz: 10, gimbal_rate_hz: 100"
+    rates = "gyro_rate_hz: 50, image_rate_hz: 5, gimbal_rate_hz: 50"
     (tmp_path / "s.yaml").write_text(f"{{duration_s: 12, {rates}, sensors: ideal}}")
     plan = alidade.plan("los", tmp_path / "s.yaml")
     assert plan.now.status == "calibrated"
     blurred = alidade.Config.model_validate({"noise": {"los_error": 2e-2}})
-    assert alidade.plan("los", tmp_path / "s.yaml", config=blurred).now.status != "calibrated"
+    assert alidade.plan("los", tmp_path / "s.yaml", config=blurred, most_steps=0).now.status != "calibrated"
 
 
 @pytest.mark.parametrize(
@@ -434,7 +434,7 @@ def test_an_imu_in_many_attitudes_is_calibrated_in_one_line() -> None:
 def test_a_gyro_and_a_tracked_body_are_registered_in_one_line() -> None:
     from alidade.factors import so3
 
-    data, truth = alidade.simulate("head", {"duration_s": 20.0, "helmet_mount_deg": [5.0, 3.0, -4.0]}, seed=1)
+    data, truth = alidade.simulate("head", {**HEAD, "helmet_mount_deg": [5.0, 3.0, -4.0]}, seed=1)
     found = alidade.hand_eye(data.head_gyro, data.head_t, data.vision_wxyz, data.vision_t)
     R, delay = found
     mount = so3.matrix(so3.exp(np.array([truth[f"helmet_mount_{axis}"] for axis in "xyz"])))
@@ -453,20 +453,14 @@ def test_a_hand_eye_calibration_that_one_axis_does_not_determine_warns() -> None
         alidade.hand_eye(gyro, t, attitudes, t[::5])
 
 
-def test_all_that_the_command_does_is_there(
-    simulated: alidade.Simulated, calibration: alidade.Calibration, tmp_path: Path
-) -> None:
+def test_what_the_commands_do_is_there(calibration: alidade.Calibration, tmp_path: Path) -> None:
     from alidade.pipelines.methods import method
 
     calibration.write(tmp_path / "out")
-    method("head").write(tmp_path / "later.mcap", alidade.simulate("head", HEAD, seed=4))
-    for given in (tmp_path / "out" / "calibration.yaml", calibration):
-        validated = alidade.validate(tmp_path / "later.mcap", given)
-        assert validated.held is not None
-        assert validated.calibration.method == "head"
-    comparison = alidade.compare(simulated)
-    assert comparison.answer in ("yes", "no")
-    assert comparison.write(tmp_path / "compared").name == "compare.html"
+    method("head").write(tmp_path / "later.mcap", alidade.simulate("head", BRIEF["head"], seed=4))
+    validated = alidade.validate(tmp_path / "later.mcap", calibration)
+    assert validated.held is not None
+    assert validated.calibration.method == "head"
     assert "static_transform_publisher" in alidade.export(calibration, "tf")
     assert alidade.export(tmp_path / "out" / "calibration.yaml", "tf") == alidade.export(calibration, "tf")
     files, missing = alidade.certificate(tmp_path / "out")

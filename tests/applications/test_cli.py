@@ -25,7 +25,8 @@ from tests.support.command import Command, Run
 
 @pytest.fixture(scope="module")
 def scenario() -> HeadScenario:
-    return load_scenario(HeadScenario, "head_mounts").model_copy(update={"duration_s": 15.0})
+    short = {"duration_s": 15.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 10.0}
+    return load_scenario(HeadScenario, "head_mounts").model_copy(update=short)
 
 
 @pytest.fixture(scope="module")
@@ -79,14 +80,7 @@ def test_other_solvers_write_estimates_over_time(alidade: Command, brief: Path, 
     assert json.loads((tmp_path / "out" / "result.json").read_text())["solver"] == solver
 
 
-def test_compare_shows_truth_and_three_solvers(alidade: Command, brief: Path) -> None:
-    run = alidade("compare", brief)
-    assert run.code == 0
-    for word in ("truth", "published", "batch", "incremental", "time_offset"):
-        assert word in run.out
-
-
-def test_compare_splits_the_recording_that_it_read(
+def test_compare_shows_truth_and_three_solvers_and_splits_the_recording_that_it_read(
     alidade: Command, brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Halves were once read anew, without --auto-topics, --strict and --prior."""
@@ -102,6 +96,8 @@ def test_compare_splits_the_recording_that_it_read(
     renamed.write_bytes(brief.read_bytes().replace(b"/head/imu", b"/helm/imu"))
     run = alidade("compare", renamed, "--method", "head", "--auto-topics", "--out", tmp_path / "out")
     assert run.code == 0, run.err
+    for word in ("truth", "published", "batch", "incremental", "time_offset"):
+        assert word in run.out
     assert (tmp_path / "out" / "compare.html").is_file()
     assert len(opened) == 1
     assert "head_imu" in opened[0].config.topics
@@ -245,10 +241,11 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
         raise AssertionError("before it was told")
 
     with monkeypatch.context() as patched:
+        # The session's last: modules imported here take it as it is.
         for name in (
-            "alidade.pipelines.applications.session.open_session",
             "alidade.pipelines.applications.follow.follow.follow",
             "alidade.pipelines.applications.validate.validate",
+            "alidade.pipelines.applications.session.open_session",
         ):
             patched.setattr(name, worked)
         for command in ("calibrate", "compare", "follow"):

@@ -14,7 +14,7 @@ from alidade.pipelines.applications.discovery import suggestions, unused, with_s
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.recording import VISION_ATTITUDE, read_head
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
@@ -30,7 +30,8 @@ NONE = load_config(None)
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("discovery") / "head.mcap"
-    simulate("head", "head_mounts", 3, path)
+    head = method("head")
+    head.write(path, head.simulate(head.settings("head_mounts").model_copy(update={"duration_s": 20.0}), 3))
     return path
 
 
@@ -213,8 +214,8 @@ def test_the_commands_suggest_and_say_what_is_nearest(simulated: Path, tmp_path:
     assert told["methods"]["head"]["suggested"]["platform_imu"] == "/vehicle/imu"
     assert told["methods"]["head"]["still_missing"] == []
     assert not told["methods"]["los"]["served"]
-    for method in ([], ["--method", "head"]):
-        refused = alidade("calibrate", path, *method)
+    for options in ([], ["--method", "head"]):
+        refused = alidade("calibrate", path, *options)
         assert refused.code == 2
         assert "nearest is for head: /tracker/pose matches /xsens/data" in refused.err
         assert "`topics: {head_imu: /xsens/data, vision_attitude: /tracker/pose" in refused.err

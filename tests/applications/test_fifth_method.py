@@ -108,7 +108,7 @@ def test_compare_with_halves(command: Command, folder: Path, tmp_path: Path) -> 
 
 def test_plan_finds_the_second_axis(command: Command, folder: Path, tmp_path: Path) -> None:
     one_axis, better = tmp_path / "one_axis.yaml", tmp_path / "better.yaml"
-    one_axis.write_text("motion: {yaw: [{amplitude_deg: 60, frequency_hz: 0.3}]}")
+    one_axis.write_text(SHORT + "motion: {yaw: [{amplitude_deg: 60, frequency_hz: 0.3}]}")
     done = command(folder, "plan", "gyro_pair", "--scenario", str(one_axis), "--out", str(better), code=3)
     assert "The body: sway by 20 deg" in done.out
     command(folder, "plan", "gyro_pair", "--scenario", str(better), "--quiet")
@@ -120,6 +120,7 @@ def test_follow(command: Command, folder: Path, tmp_path: Path) -> None:
     assert result(tmp_path)["status"] == "calibrated"
 
 
+@pytest.mark.slow
 def test_montecarlo_of_the_nominal_scenario(command: Command, folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
     words = ("--runs", "2", "--jobs", "1", "--solvers", "published,batch", "--out", str(tmp_path), "--quiet")

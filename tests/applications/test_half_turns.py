@@ -32,6 +32,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_two_recordings_of_one_half_turn_agree(recordings: list[Path], tmp_path: Path) -> None:
     alone = [Session.read(open_recording(path), None, None).calibrate() for path in recordings]
     mounts = [[c.parameters[f"helmet_mount_{a}"].value for a in "xyz"] for c in alone]

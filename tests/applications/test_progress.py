@@ -29,6 +29,7 @@ def test_quiet_is_silent_on_a_terminal_and_the_others_are_not(
     assert "counting" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_tags_by_several_processes_are_those_by_one_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     import cv2
 

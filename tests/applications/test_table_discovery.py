@@ -234,7 +234,7 @@ def test_one_command_calibrates_a_phones_table(tmp_path: Path, alidade: Command)
 
 def test_a_decoded_blackbox_log_is_calibrated_and_its_offset_exported(tmp_path: Path) -> None:
     """Columns as blackbox_decode writes them: words among numbers, a compass that repeats its readings, counts."""
-    n, dt = 800, 0.01
+    n, dt = 500, 0.01
     t = dt * np.arange(n)
     rates = np.stack([2.0 * np.sin(1.1 * t), 2.3 * np.cos(0.7 * t), 1.5 + np.sin(0.31 * t)], axis=1)
     attitudes = [np.array([1.0, 0.0, 0.0, 0.0])]

@@ -185,7 +185,7 @@ def test_noise_takes_the_topics_for_which_there_is_time(tmp_path: Path, clock: l
     assert any("stopped the noise of /second/imu" in note for note in study.notes)
 
 
-@pytest.mark.parametrize("after", [0.5, 2.0, 3.5, 5.0])
+@pytest.mark.parametrize("after", [3.5, *(pytest.param(after, marks=pytest.mark.slow) for after in (0.5, 2.0, 5.0))])
 def test_ctrl_c_is_answered_within_a_second(after: float, recording: Path, tmp_path: Path) -> None:
     """Reading, solving, trying causes, in several processes."""
     (tmp_path / "c.yaml").write_text("noise: {los_error: 1.0e-7}\nnoise_known: 0\n")

@@ -121,17 +121,17 @@ def rows_of(out: Path) -> list[dict[str, str]]:
 def test_a_worker_killed_midway_costs_nothing(start: Start, scheduler: str, recordings: Path, tmp_path: Path) -> None:
     first, second = worker(start, scheduler), worker(start, scheduler)
     out = tmp_path / "out"
-    command = start("alidade", "fleet", recordings / "*.mcap", "--scheduler", scheduler, "--out", out)
-    until(lambda: len(finished(out)) >= 4)
+    command = start("alidade", "fleet", recordings / "U0*.mcap", "--scheduler", scheduler, "--out", out)
+    until(lambda: len(finished(out)) >= 2)
     first.send_signal(signal.SIGKILL)
-    assert len(finished(out)) < COUNT - 2, "too fast to be midway"
+    assert len(finished(out)) < 8, "too fast to be midway"
     output, error = command.communicate(timeout=60)
     assert (command.returncode, error) == (0, "")
-    assert f"{COUNT} of {COUNT} recordings, 0 from an earlier run" in output
+    assert "10 of 10 recordings, 0 from an earlier run" in output
     rows = rows_of(out)
-    assert [Path(row["recording"]).name for row in rows] == [f"U{i:02}.mcap" for i in range(COUNT)]
+    assert [Path(row["recording"]).name for row in rows] == [f"U{i:02}.mcap" for i in range(10)]
     assert {row["status"] for row in rows} <= {"calibrated", "weak"}
-    assert len(finished(out)) == COUNT
+    assert len(finished(out)) == 10
     assert first.wait() == -signal.SIGKILL
     assert second.poll() is None
 
@@ -210,25 +210,24 @@ def test_ctrl_c_keeps_what_is_finished(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "out"
-    words = ("fleet", recordings / "U0*.mcap", "--out", out)
+    words = ("fleet", recordings / "U0[0-4].mcap", "--out", out)
     command = start("alidade", *words, "--jobs", 1)
-    until(lambda: len(finished(out)) >= 2)
+    until(lambda: len(finished(out)) >= 1)
     # As a terminal does: to every process of the group.
     os.killpg(command.pid, signal.SIGINT)
     output, error = command.communicate(timeout=60)
     assert (command.returncode, error) == (130, "interrupted: what is finished is written\n")
     assert "interrupted; the same command continues" in output
     kept = len(finished(out))
-    assert 2 <= kept < 10
+    assert 1 <= kept < 5
     assert len(rows_of(out)) == kept
     assert alidade(monkeypatch, *words, "--scheduler", local_cluster) == 0
-    assert f"10 of 10 recordings, {kept} from an earlier run" in capsys.readouterr().out
-    assert len(rows_of(out)) == 10
+    assert f"5 of 5 recordings, {kept} from an earlier run" in capsys.readouterr().out
+    assert len(rows_of(out)) == 5
 
 
-@pytest.mark.parametrize(
-    "after", [3.0, pytest.param(4.5, marks=pytest.mark.slow), pytest.param(6.0, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("after", [3.0, 4.5, 6.0])
 def test_ctrl_c_is_heard_while_workers_start(after: float, start: Start, recordings: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = start("alidade", "fleet", recordings / "*.mcap", "--out", out, "--jobs", 2)
@@ -264,6 +263,7 @@ def test_a_recording_that_kills_workers_is_set_aside(
     assert len(finished(tmp_path / "out")) == COUNT - 1
 
 
+@pytest.mark.slow
 def test_workers_of_another_version_are_refused(start: Start, scheduler: str, recordings: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(ROOT / "alidade", other / "alidade", ignore=shutil.ignore_patterns("__pycache__"))
@@ -310,6 +310,7 @@ def test_overhead_order_and_faults(local_cluster: str) -> None:
     assert overhead < 0.05 * 2.0 / 2
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_dies_midway_is_told(start: Start, recordings: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     process, address = scheduling(start, tmp_path)

@@ -10,9 +10,8 @@ from tests.support.soak import soak
 from tests.support.solved import calibrate
 
 
-@pytest.mark.parametrize(
-    ("seconds", "clients"), [(15.0, 20), pytest.param(150.0, 200, marks=pytest.mark.slow)], ids=["small", "long"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("seconds", "clients"), [(15.0, 20), (150.0, 200)], ids=["small", "long"])
 def test_nothing_is_lost_and_memory_is_flat_under_attack(seconds: float, clients: int, tmp_path: Path) -> None:
     """For the time that `python -m tests.support.soak --minutes 30` takes, see there."""
     found = soak(tmp_path, seconds, clients)

@@ -28,6 +28,7 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
+from alidade.pipelines.solvers import incremental
 from tests.support import forms
 from tests.support.builders import IDEAL
 from tests.support.live import Bridge, messages, write
@@ -35,17 +36,25 @@ from tests.support.solved import calibrate
 
 connect = websockets().sync.client.connect
 SCENARIO = LosScenario(
-    duration_s=12.0,
+    duration_s=8.0,
     carrier=EulerMotion(
         roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
         pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
         yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
     ),
-    image_rate_hz=4.0,
+    image_rate_hz=5.0,
     gyro_rate_hz=50.0,
     gimbal_rate_hz=50.0,
     sensors=IDEAL,
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_batch_solutions() -> Iterator[None]:
+    """In the initialisation phase: they are most of what is computed, and no source's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(incremental, "_SOLVE_GROWTH", 1.6)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -121,12 +130,12 @@ def test_a_folder_of_several_recordings_is_one_line(tmp_path: Path) -> None:
 
 
 def test_standard_input(whole: Path, batch: Calibration, tmp_path: Path) -> None:
-    source = StandardInput(None, io.BytesIO(whole.read_bytes()))
-    calibration, _, _ = follow(source, Settings())
-    agree(calibration, batch, 1e-9)
     kept = tmp_path / "kept"
     calibration, _, _ = follow(StandardInput(kept, io.BytesIO(whole.read_bytes())), Settings())
+    agree(calibration, batch, 1e-9)
     assert [p.read_bytes() for p in kept.iterdir()] == [whole.read_bytes()]
+    with StandardInput(None, io.BytesIO(b"what comes"), lambda _: None) as source:
+        assert source._ended.wait(5.0)
     assert not source.path.exists()
 
 
@@ -143,7 +152,7 @@ def test_a_pipe_that_ends_early_gives_what_came(whole: Path) -> None:
     write(messages(whole), pipe := io.BytesIO(), 4096)
     half = io.BytesIO(pipe.getvalue()[: len(pipe.getvalue()) // 2])
     calibration, _, _ = follow(StandardInput(None, half), Settings(method="los"))
-    assert 3.0 < calibration.facts.duration_s < 9.0
+    assert 2.0 < calibration.facts.duration_s < 6.0
     assert any("truncated" in note for note in calibration.facts.notes)
 
 
@@ -197,20 +206,23 @@ def test_a_bridge_that_hangs_up_and_comes_back(whole: Path, config: Path, tmp_pa
     assert truth <= set(calibration.parameters)
     again = calibrate(next(kept.glob("*.mcap")), ["incremental"], None, config)[0]
     agree(calibration, again)
-    assert calibration.facts.duration_s > 11.0
+    assert calibration.facts.duration_s > 7.0
     assert [sentence.rpartition(": ")[2].partition(" ")[0] for sentence in said] in (
         [["connected", "no", "connected"], ["connected", "no", "connected", "no"], ["connected"]]
     ), said
-    assert views[-1].time > 11.0
+    assert views[-1].time > 7.0
 
 
-def test_a_bridge_is_asked_for_sensors_alone(whole: Path, config: Path) -> None:
+def test_a_bridge_is_asked_for_sensors_alone(whole: Path) -> None:
     sent = messages(whole)
     schema, channel, log_ns, _ = sent[0]
     text = replace(schema, name="std_msgs/msg/String", data=b"string data")
     other = text, replace(channel, topic="/chatter"), log_ns, b"\0\1\0\0\2\0\0\0a\0"
-    with Bridge([other, *sent], 40.0, also=("/chatter",)) as bridge:
-        follow(source_of(bridge.url, None, lambda _: None), Settings(config=config), lambda: bridge.is_over)
+    with Bridge([other, *sent], 40.0, also=("/chatter",)) as bridge, source_of(bridge.url, None, lambda _: None):
+        until = time.monotonic() + 30.0
+        while not bridge.is_over and time.monotonic() < until:
+            time.sleep(0.02)
+        assert bridge.is_over
         assert bridge.subscribed == {"/imu", "/gimbal/joint_states", "/los/error"}
 
 
@@ -279,7 +291,7 @@ def test_a_finished_recording_is_replayed_as_if_it_were_made_now(whole: Path, tm
     with Replay(whole, 8.0, tmp_path / "kept", lambda _: None) as source:
         settings = Settings(patience=10.0)
         calibration = Follower(source, settings, lambda view: seen.append(view.time), print, lambda: False).follow()
-    assert 12.0 / 8.0 <= time.monotonic() - started < 30.0
+    assert 8.0 / 8.0 <= time.monotonic() - started < 30.0
     (kept,) = (tmp_path / "kept").iterdir()
     assert kept.read_bytes() == whole.read_bytes()
     (once,) = calibrate(whole, ["incremental"])
