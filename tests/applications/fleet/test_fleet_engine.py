@@ -201,6 +201,7 @@ def untimed(result: Any) -> Any:
     return result
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished(
     start: Start,
     local_cluster: str,

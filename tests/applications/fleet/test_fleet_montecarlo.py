@@ -71,7 +71,9 @@ BRIEFEST: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in ("head", "tumble"))) for name in names()]
+)
 def test_arrays_give_what_the_same_recording_gives_from_a_file(name: str, tmp_path: Path) -> None:
     """All but noise densities are the same to the last bit; those go through a file as variances."""
     found = method(name)
@@ -179,6 +181,7 @@ def test_a_missing_extra_is_told(
     assert capsys.readouterr().err == "alidade: this command needs arro3: pip install 'alidade[fleet]'\n"
 
 
+@pytest.mark.slow
 def test_the_consistency_page_lists_every_solver(local_cluster: str, tmp_path: Path) -> None:
     study = run_study("tumble", None, range(2), SOLVERS, tmp_path / "out", local_cluster)
     page = consistency.page([(solver, study) for solver in SOLVERS], 2)

@@ -55,19 +55,19 @@ def write(path: Path, seed: int, mount_deg: Any, one_axis: bool = False) -> Path
 
 
 @pytest.fixture(scope="module")
-def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """30 units at one date and 5 at two, among them four faults."""
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """15 units at one date and 6 at two, among them four faults."""
     folder = tmp_path_factory.mktemp("recordings")
     rng = np.random.default_rng(5)
-    for unit in range(35):
+    for unit in range(21):
         mount = UNITS_VARY * rng.standard_normal(3)
         if unit == 7:
             mount += [0.0, 6.0, 0.0]  # has drifted away from the fleet
-        for i, date in enumerate(DATES if unit >= 30 else DATES[unit % 2 :][:1]):
-            if unit == 33 and i == 1:
+        for i, date in enumerate(DATES if unit >= 15 else DATES[unit % 2 :][:1]):
+            if unit == 18 and i == 1:
                 mount += [0.0, 0.0, 4.0]  # was knocked between the dates
             write(folder / f"U{unit:02}_{date}.mcap", 100 + 2 * unit + i, mount, one_axis=unit == 12)
-    corrupt = folder / f"U20_{DATES[0]}.mcap"
+    corrupt = folder / f"U14_{DATES[0]}.mcap"
     content = bytearray(corrupt.read_bytes())
     third = len(content) // 3
     content[third : 2 * third] = rng.bytes(third)
@@ -91,37 +91,40 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def calibrated(forty: Path, local_cluster: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The results of the command on the forty."""
+def calibrated(recordings: Path, local_cluster: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of the command on them."""
     out = tmp_path_factory.mktemp("fleet")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        assert alidade(monkeypatch, "fleet", forty / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", out) == 0
+        assert (
+            alidade(monkeypatch, "fleet", recordings / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", out)
+            == 0
+        )
     return out
 
 
 def test_the_table_as_json(
     calibrated: Path,
-    forty: Path,
+    recordings: Path,
     local_cluster: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    common = ("fleet", forty / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
+    common = ("fleet", recordings / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
     assert alidade(monkeypatch, *common, "--json") == 0
     told = json.loads(capsys.readouterr().out)
-    assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.fleet/1", 40, False)
+    assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.fleet/1", 27, False)
     rows = {row["recording"]: row for row in rows_of(calibrated / "fleet.csv")}
-    assert [unit["name"] for unit in told["attention"]] == ["U33", "U07", "U20", "U12"]
+    assert [unit["name"] for unit in told["attention"]] == ["U18", "U07", "U14", "U12"]
     assert {row["recording"]: row["status"] for row in told["recordings"]} == {k: v["status"] for k, v in rows.items()}
-    assert any(change["unit"] == "U33" for change in told["changes"])
+    assert any(change["unit"] == "U18" for change in told["changes"])
 
 
 def test_the_table_is_complete(calibrated: Path) -> None:
     rows = rows_of(calibrated / "fleet.csv")
-    assert len({row["recording"] for row in rows}) == len(rows) == 40
-    assert len({row["unit"] for row in rows}) == 35
+    assert len({row["recording"] for row in rows}) == len(rows) == 27
+    assert len({row["unit"] for row in rows}) == 21
     good = [row for row in rows if row["status"] == "calibrated"]
-    assert len(good) == 38
+    assert len(good) == 25
     for row in good:
         assert row["exit_code"] == "0"
         assert 0.0 < float(row["helmet_mount_x_sigma"]) < 0.01
@@ -129,30 +132,30 @@ def test_the_table_is_complete(calibrated: Path) -> None:
 
 def test_planted_faults_are_told_apart(calibrated: Path, tmp_path: Path) -> None:
     rows = {row["recording"].rsplit("/")[-1]: row for row in rows_of(calibrated / "fleet.csv")}
-    assert failures(rows) == {f"U20_{DATES[0]}.mcap": "2", f"U12_{DATES[0]}.mcap": "3"}
-    assert "damaged" in rows[f"U20_{DATES[0]}.mcap"]["reason"]
+    assert failures(rows) == {f"U14_{DATES[0]}.mcap": "2", f"U12_{DATES[0]}.mcap": "3"}
+    assert "damaged" in rows[f"U14_{DATES[0]}.mcap"]["reason"]
     assert "motion about two axes" in rows[f"U12_{DATES[0]}.mcap"]["reason"]
     changed = [row for row in rows_of(calibrated / "changes.csv") if row["changed"] == "1"]
-    assert [(row["unit"], row["parameter"]) for row in changed] == [("U33", "helmet_mount_z")]
+    assert [(row["unit"], row["parameter"]) for row in changed] == [("U18", "helmet_mount_z")]
     assert float(changed[0]["difference"]) == pytest.approx(np.deg2rad(4.0), abs=5.0 * float(changed[0]["sigma"]))
     fits((calibrated / "fleet.html").read_text(), tmp_path)
     text = page_text(calibrated / "fleet.html")
     attention = text.split("Which units need attention?")[1].split("Parameters")[0]
-    assert set(re.findall(r"U\d\d(?= )", attention)) >= {"U07", "U33", "U20", "U12"}
-    assert "4 units need attention: U33, U07" in attention
+    assert set(re.findall(r"U\d\d(?= )", attention)) >= {"U07", "U18", "U14", "U12"}
+    assert "4 units need attention: U18, U07" in attention
     assert "helmet_mount about z moved by 4.0" in attention
 
 
 def test_turn_on_biases_are_no_change(
     calibrated: Path,
-    forty: Path,
+    recordings: Path,
     local_cluster: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """They differ by many sigmas from recording to recording in every unit, and have a repeatability for it."""
     assert not [row for row in rows_of(calibrated / "changes.csv") if row["parameter"].startswith("gyro_bias")]
-    common = ("fleet", forty / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
+    common = ("fleet", recordings / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
     assert alidade(monkeypatch, *common, "--json") == 0
     parameters = {p["name"]: p for p in json.loads(capsys.readouterr().out)["parameters"]}
     bias, mount = parameters["gyro_bias_x"], parameters["helmet_mount_x"]
@@ -176,7 +179,7 @@ def test_parquet_and_csv_say_the_same(calibrated: Path) -> None:
 
 
 def test_nothing_is_done_twice(
-    forty: Path,
+    recordings: Path,
     local_cluster: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -189,7 +192,7 @@ def test_nothing_is_done_twice(
         assert alidade(monkeypatch, "fleet", tmp_path / pattern, *common, *options) == 0
         return capsys.readouterr().out
 
-    for path in sorted(forty.glob("U0[0-3]*.mcap")):
+    for path in sorted(recordings.glob("U0[0-3]*.mcap")):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     assert "3 of 3 recordings, 0 from an earlier run" in run("U0[0-2]*.mcap")
     before = (tmp_path / "out" / "results.jsonl").read_text()
@@ -207,10 +210,10 @@ def test_nothing_is_done_twice(
     assert "4 of 4 recordings, 0 from an earlier run" in run("*.mcap", "--config", config)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_no_damage_of_a_file_costs_more_than_its_row(forty: Path, tmp_path: Path, seed: int) -> None:
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 20))])
+def test_no_damage_of_a_file_costs_more_than_its_row(recordings: Path, tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    content = bytearray((forty / f"U00_{DATES[0]}.mcap").read_bytes())
+    content = bytearray((recordings / f"U00_{DATES[0]}.mcap").read_bytes())
     if seed % 2:
         del content[int(rng.integers(len(content))) :]
     else:
@@ -227,11 +230,11 @@ def test_no_damage_of_a_file_costs_more_than_its_row(forty: Path, tmp_path: Path
 
 
 def test_recordings_come_from_other_file_systems(
-    forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recordings: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An archive stands for S3: no path on this machine."""
     with zipfile.ZipFile(tmp_path / "campaign.zip", "w") as archive:
-        for path in sorted(forty.glob("U0[01]*.mcap")):
+        for path in sorted(recordings.glob("U0[01]*.mcap")):
             archive.write(path, path.name)
     where = f"zip://*.mcap::{tmp_path}/campaign.zip"
     assert alidade(monkeypatch, "fleet", where, *NAMES, "--scheduler", local_cluster, "--out", tmp_path / "out") == 0
@@ -240,10 +243,10 @@ def test_recordings_come_from_other_file_systems(
 
 
 def test_bag_folders_are_recordings(
-    calibrated: Path, forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    calibrated: Path, recordings: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By their names, by those of their parts, in an archive: each is one, with the numbers of the file it was."""
-    source = next(iter(sorted(forty.glob("U00*.mcap"))))
+    source = next(iter(sorted(recordings.glob("U00*.mcap"))))
     bags = tmp_path / "bags"
     bags.mkdir()
     bag = split(source, bags / "ride")
@@ -266,10 +269,10 @@ def test_bag_folders_are_recordings(
 
 
 def test_unit_and_date_come_from_metadata(
-    forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recordings: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of any record, or of rosbag2's custom data; else the file's name and the start of the recording stand in."""
-    source = next(iter(sorted(forty.glob("U00*.mcap"))))
+    source = next(iter(sorted(recordings.glob("U00*.mcap"))))
     yaml = "version: 9\nstorage_identifier: mcap\ncustom_data:\n  unit: 007\n  date: 2026-02-03\n"
     with_metadata(source, tmp_path / "a.mcap", "campaign", {"unit": "U99", "date": "2026-02-01T10:00"})
     with_metadata(source, tmp_path / "b.mcap", "rosbag2", {"serialized_metadata": yaml})
@@ -286,13 +289,13 @@ def test_unit_and_date_come_from_metadata(
 
 
 def test_each_unit_begins_from_its_own_calibration(
-    forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recordings: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A recording is done again when that has changed; one whose unit has none is told."""
-    for path in sorted(forty.glob("U3[012]_20260401*.mcap")):
+    for path in sorted(recordings.glob("U1[567]_20260401*.mcap")):
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    for unit in ("U30", "U31"):
-        before = forty / f"{unit}_{DATES[0]}.mcap"
+    for unit in ("U15", "U16"):
+        before = recordings / f"{unit}_{DATES[0]}.mcap"
         assert alidade(monkeypatch, "calibrate", before, "--quiet", "--out", tmp_path / "last" / unit) == 0
 
     def run() -> dict[str, dict[str, str]]:
@@ -301,17 +304,17 @@ def test_each_unit_begins_from_its_own_calibration(
         return {row["unit"]: row for row in rows_of(tmp_path / "out" / "fleet.csv")}
 
     rows = run()
-    assert [rows[unit]["exit_code"] for unit in ("U30", "U31", "U32")] == ["0", "0", "2"]
-    assert "cannot be opened" in rows["U32"]["reason"]
-    first = json.loads((tmp_path / "last" / "U30" / "result.json").read_text())
+    assert [rows[unit]["exit_code"] for unit in ("U15", "U16", "U17")] == ["0", "0", "2"]
+    assert "cannot be opened" in rows["U17"]["reason"]
+    first = json.loads((tmp_path / "last" / "U15" / "result.json").read_text())
     alone = {p["name"]: p["sigma"] for p in first["parameters"]}
     # About as much as the first recording again.
-    ratio = float(rows["U30"]["helmet_mount_x_sigma"]) / alone["helmet_mount_x"]
+    ratio = float(rows["U15"]["helmet_mount_x_sigma"]) / alone["helmet_mount_x"]
     assert ratio == pytest.approx(0.5**0.5, abs=0.1)
-    (tmp_path / "last" / "U31" / "result.json").write_bytes((tmp_path / "last" / "U30" / "result.json").read_bytes())
+    (tmp_path / "last" / "U16" / "result.json").write_bytes((tmp_path / "last" / "U15" / "result.json").read_bytes())
     again = run()
-    assert again["U30"] == rows["U30"]
-    assert again["U31"]["helmet_mount_x"] != rows["U31"]["helmet_mount_x"]
+    assert again["U15"] == rows["U15"]
+    assert again["U16"]["helmet_mount_x"] != rows["U16"]["helmet_mount_x"]
 
 
 def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]) -> None:
@@ -340,29 +343,29 @@ def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]
     ("arguments", "said"),
     [
         (["nowhere/*.mcap"], "no recording matches nowhere/*.mcap"),
-        (["{forty}/*.mcap", "--names", "{unit}-{date}"], "does not fit --names {unit}-{date}"),
-        (["{forty}/*.mcap", "--names", "unit"], "needs {unit}, {date} or both"),
-        (["{forty}/*.mcap", "--method", "gyro"], "no method 'gyro'"),
-        (["{forty}/*.mcap", "--config", "nowhere.yaml"], "nowhere.yaml"),
+        (["{recordings}/*.mcap", "--names", "{unit}-{date}"], "does not fit --names {unit}-{date}"),
+        (["{recordings}/*.mcap", "--names", "unit"], "needs {unit}, {date} or both"),
+        (["{recordings}/*.mcap", "--method", "gyro"], "no method 'gyro'"),
+        (["{recordings}/*.mcap", "--config", "nowhere.yaml"], "nowhere.yaml"),
         (
-            ["{forty}/*.mcap", "--out", "{forty}/U00_20260301.mcap/out"],
+            ["{recordings}/*.mcap", "--out", "{recordings}/U00_20260301.mcap/out"],
             "no folder to write results to (Not a directory)",
         ),
         (
-            ["{forty}/*.mcap", "--out", "s3://bucket/out"],
+            ["{recordings}/*.mcap", "--out", "s3://bucket/out"],
             "s3:/bucket/out: results are kept in a folder of this machine",
         ),
-        (["{forty}/*.mcap", "--jobs", "0"], "--jobs 0"),
-        (["{forty}/*.mcap", "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"], "not together with --scheduler"),
+        (["{recordings}/*.mcap", "--jobs", "0"], "--jobs 0"),
+        (["{recordings}/*.mcap", "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"], "not together with --scheduler"),
         (
-            ["{forty}/*.mcap", "--scheduler", "tcp://127.0.0.1:1"],
+            ["{recordings}/*.mcap", "--scheduler", "tcp://127.0.0.1:1"],
             "no scheduler at tcp://127.0.0.1:1: start one with `dask scheduler`, and workers with `dask worker tcp",
         ),
         (["gopher://x/*.mcap"], "gopher"),
     ],
 )
 def test_bad_input_is_one_line(
-    forty: Path,
+    recordings: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -371,7 +374,7 @@ def test_bad_input_is_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(engine, "_REACH", 1.0)
-    code = alidade(monkeypatch, "fleet", *(a.replace("{forty}", str(forty)) for a in arguments))
+    code = alidade(monkeypatch, "fleet", *(a.replace("{recordings}", str(recordings)) for a in arguments))
     error = capsys.readouterr().err
     assert code == 2
     assert len(error.splitlines()) == 1
