@@ -261,7 +261,8 @@ def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Arra
         return np.zeros((0, 0))
     follows = directions.followers
     drawn = np.empty((0, k, m))
-    for way in np.random.default_rng(0).standard_normal((DRAWS, m)):
+    # Drawn as moves of u, whatever the signs of the axes, which rounding decides.
+    for way in np.random.default_rng(0).standard_normal((DRAWS, m)) @ directions.axes:
         drawn = np.concatenate([drawn, slopes(directions, roots, follows, way[:, None])])
         spread = np.sqrt(directions.sigmas**2 + np.square(drawn).sum(axis=2).mean(axis=0))
         found = np.sqrt(np.square(drawn / spread[:, None]).sum(axis=(1, 2)))
