@@ -1,4 +1,4 @@
-"""Types of arrays, by what they hold: numbers, indexes, yes or no; and columns between their rows."""
+"""Types of arrays, by what they hold: numbers, indexes, yes or no; and linear interpolation of their rows."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ class Model:
 
     @cached_property
     def in_parts(self) -> list[Self]:
-        """Divide the measurements of a model that has `stacked` into parts, which keep what no variable moves."""
+        """The model in parts of `TOGETHER` measurements, each with its own precomputed constants; needs `stacked`."""
         return [select_rows(self, slice(k, k + TOGETHER)) for k in range(0, len(self.time), TOGETHER)]
 
     if TYPE_CHECKING:
@@ -117,7 +117,7 @@ class Model:
         return self
 
     def at_noise(self, _: Array) -> Model:
-        """Return the model for noise of 1 / weights (n, m) of that used for whitening, where residuals depend on it."""
+        """Return the model for noise 1 / weights (n, m) times that of its whitening; itself if independent of it."""
         return self
 
     def on(
@@ -167,7 +167,7 @@ class WrappedModel(Model):
         return tuple(self.model.blocks)
 
     def at_noise(self, weights: Array) -> Model:
-        """Return the wrapper of the wrapped model at the noise."""
+        """Return the model with the wrapped one for noise 1 / weights (n, m) times that of its whitening."""
         model = self.model.at_noise(weights)
         return self if model is self.model else replace(self, model=model)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, interpolated
 from alidade.factors.preintegration import GyroPath, Increments
 from alidade.pipelines.estimation.robust import fitted
 
@@ -92,7 +92,7 @@ def turns_near(gyro: GyroPath, start: Array, stop: Array) -> Callable[[Array, Ar
     A stream longer than what is kept of it is integrated anew for every look.
     """
     turns = gyro.increments(start, stop)
-    rates = [np.stack([np.interp(t, gyro.t, each) for each in gyro.read.T], axis=1) for t in (start, stop)]
+    rates = [interpolated(t, gyro.t, gyro.read) for t in (start, stop)]
 
     def near(*ends: Array) -> Increments:
         moves = zip(rates, ends, (start, stop), strict=True)

@@ -78,7 +78,7 @@ class RotationPrior(Model):
 
     def __call__(self, rotation: Array) -> Residuals:
         """Evaluate the residuals R Log(mean^-1 x), (n, 3)."""
-        error = so3.log(so3.multiply(so3.inverse(self.mean), rotation))
+        error = so3.local(self.mean, rotation)
         return (
             np.einsum("nij,nj->ni", self.sqrt_information, error),
             lambda: (self.sqrt_information @ so3.right_jacobian_inverse(error),),

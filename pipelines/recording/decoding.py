@@ -151,7 +151,7 @@ class ColumnTable:
         return {name: rows for name, rows in found.items() if rows.any()}
 
     def drop_unstamped(self) -> int:
-        """Drop the filled rows without a stamp where they are few; returns their number."""
+        """Drop filled rows whose messages have no stamp, if most others have one; return how many."""
         rows = np.flatnonzero(self.filled)
         few = rows[few_unstamped(self._t_ns[rows], self._log_ns[rows])]
         self.filled[few] = False

@@ -182,7 +182,7 @@ class Group:
     def within(self, begin: int, end: int) -> Group | None:
         """Select the measurements whose place is in `begin` ... `end` - 1; None if there is none."""
         some = np.flatnonzero((self.place >= begin) & (self.place < end))
-        return self.of(some) if len(some) else None
+        return None if not len(some) else self if len(some) == len(self.place) else self.of(some)
 
     def divided(self) -> Iterator[Group]:
         """Yield the group in parts whose rows fit a processor's cache."""
@@ -191,12 +191,10 @@ class Group:
             yield self
             return
         for number, part in enumerate(self.model.in_parts):
-            yield self.of(np.arange(number * TOGETHER, min((number + 1) * TOGETHER, n)), part)
+            yield self.of(slice(number * TOGETHER, (number + 1) * TOGETHER), part)
 
-    def of(self, some: Index, model: Model | None = None) -> Group:
+    def of(self, some: Index | slice, model: Model | None = None) -> Group:
         """Select some of the group's measurements, whose model may be known."""
-        if len(some) == len(self.place):
-            return self
 
         def own(each: Any) -> Any:
             return each if each is None or len(each) == 1 else each[some]

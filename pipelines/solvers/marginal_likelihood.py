@@ -846,8 +846,9 @@ def levels_settled(
         before: levels of the solution before.
         since: time of that one, s.
     """
-    chain, variances = _at(compiled, levels, solution)
-    found, widening = chain.solved(variances), unwidened(solution.engine.inliers(solution.values))
+    chain = LinearChain.of(compiled.engine, solution.values)
+    widening = unwidened(solution.engine.inliers(solution.values))
+    found = chain.solved(chain.variances(levels, widening, NO_SAY))
     if found is None:
         return False
     for rows in chain.rows:

@@ -63,7 +63,8 @@ def solve_robust(
     start = min(values, found.values, key=truncated.cost) if np.isfinite(found.cost) else values
     start, more = _graduated(engine, start, loss, config)
     # Inside the gate the truncated loss is no other than plain least squares.
-    same = start is found.values and truncated.cost(start) == plain.cost(start)
+    unweighted = truncated.unweighted(start)
+    same = start is found.values and truncated.cost_of(unweighted) == plain.cost_of(unweighted)
     final = solve_truncated(engine, start, loss, config, (found.system, found.cost) if same else None)
     iterations += more + final.iterations
     for softness in _SOFTNESS:

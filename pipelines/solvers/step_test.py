@@ -376,7 +376,7 @@ def _solved_again(
         return None
     layout, c = engine.layout, engine.layout.sizes[3]
     first, second = (layout.root_columns(key)[:, c:] for key in (parameter.key, late))
-    turn = so3.log(so3.multiply(so3.inverse(layout.of_key(fit.values, parameter.key)), layout.of_key(fit.values, late)))
+    turn = so3.local(layout.of_key(fit.values, parameter.key), layout.of_key(fit.values, late))
     # Log(A^-1 B) with A Exp(a), B Exp(b).
     D = so3.right_jacobian_inverse(turn) @ (second - so3.matrix(so3.exp(-turn)) @ first)
     C, moved = joined.covariance(D), alone.covariance(D)

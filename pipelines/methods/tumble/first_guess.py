@@ -127,7 +127,7 @@ class Ring:
 
 
 def ring(raw: Array) -> Ring | None:
-    """Fit the ring of readings (n, 3) in time order; None if they are not planar or no ellipse fits."""
+    """Fit an ellipse to readings (n, 3) of a triad turned about one axis, in time order; None where none fits."""
     middle = raw.mean(axis=0)
     sizes, axes = np.linalg.svd(raw - middle, full_matrices=False)[1:]
     if sizes[2] > _FLAT * sizes[1]:
