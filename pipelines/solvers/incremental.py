@@ -77,13 +77,13 @@ _LEAST_VARIANCE = 1e-24
 _FREED = 10
 # Time from the first step to the first batch solution, s; ratio of the times of successive ones; and the time after
 # which the initialisation phase ends in any case, s: the cost of a batch solution grows with it.
-FIRST_SOLVE, _SOLVE_GROWTH, _MAX_INITIALISATION = 1.0, 1.15, 600.0
+FIRST_SOLVE, SOLVE_GROWTH, _MAX_INITIALISATION = 1.0, 1.15, 600.0
 # Steps before which that phase does not end: few large ones cost little to solve again.
 MIN_STEPS = 100
 # Largest share of a variance that is of second order with which it ends.
 _MAX_CURVATURE = 0.15
 # Time between marginalisations afterwards, s.
-_MARGINALIZE_EVERY = 20.0
+MARGINALIZE_EVERY = 20.0
 # Largest number of estimates kept per second; time between moments of the joint history, as a share of the time since
 # the first.
 _HISTORY_RATE, _MOMENT_SPACING = 5.0, 0.02
@@ -184,9 +184,9 @@ class IncrementalSolver:
             self._advance(self._smoother, step)
         since = step.time - (self.steps_since[0].time if self.state.marginal is None else self.state.marginal.time)
         if self.initialising:
-            if since >= max(FIRST_SOLVE, _SOLVE_GROWTH * self._of[1]):
+            if since >= max(FIRST_SOLVE, SOLVE_GROWTH * self._of[1]):
                 self._solve_batch()
-        elif since >= _MARGINALIZE_EVERY and isinstance(self._smoother, FixedLagSmoother):
+        elif since >= MARGINALIZE_EVERY and isinstance(self._smoother, FixedLagSmoother):
             graph, values = self._smoother.active_variables()
             marginal = MarginalState.of(step.time, graph, values, list(graph.keyVector()), self._stamps)
             self._continue_from(marginal)

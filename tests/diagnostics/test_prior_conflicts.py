@@ -100,9 +100,9 @@ def test_a_gyro_scale_far_beyond_its_data_sheet_is_inconsistent_and_named_first(
     assert wrong.findings[0].kind == "prior_conflict"
     assert wrong.findings[0].evidence["parameter"] == "gyro_scale_x"
     bad_sheet = alidade.Config.model_validate({"sensors": {"gyro": {"scale": 0.06, "skew": 0.02}}})
-    told = alidade.open({**vars(data), "head_gyro": gyro}, method="head", config=bad_sheet).calibrate(report=False)
-    assert told.status != "inconsistent"
-    scale = told.parameters["gyro_scale_x"]
+    right = alidade.open({**vars(data), "head_gyro": gyro}, method="head", config=bad_sheet).calibrate(report=False)
+    assert right.status != "inconsistent"
+    scale = right.parameters["gyro_scale_x"]
     assert abs(scale.value - 0.06) < 4.0 * scale.sigma
 
 

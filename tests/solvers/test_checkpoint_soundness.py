@@ -14,15 +14,11 @@ from alidade.factors.bridge import BoundModel
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Factor, Problem, Step
-from alidade.pipelines.solvers import incremental
 from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.support.chain import PARAMETER, Walk, state
 
-
-@pytest.fixture(autouse=True)
-def early_smoother(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chain has 60 steps; the initialisation phase, in which all is batch, has 100."""
-    monkeypatch.setattr(incremental, "MIN_STEPS", 20)
+# A chain has 60 steps.
+pytestmark = pytest.mark.usefixtures("early_smoother")
 
 
 def _with(problem: Problem, at: int, change: Callable[[Step], Step]) -> Problem:

@@ -7,7 +7,6 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from alidade.pipelines.solvers import incremental
 from alidade.pipelines.solvers.gating import InnovationGate, RowBuffer, binomial_tail
 from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.support.chain import Walk
@@ -47,8 +46,8 @@ def test_correlation_lengths_are_those_of_the_innovations() -> None:
     assert lengths["first"] == pytest.approx(9.0, rel=0.25)  # (1 + 0.8) / (1 - 0.8)
 
 
-def test_one_white_family_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(incremental, "MIN_STEPS", 20)  # of 60
+@pytest.mark.usefixtures("early_smoother")
+def test_one_white_family_is_left_as_it_is() -> None:
     walk, _ = Walk.random(5)
     estimate = solve_incremental(walk.problem())
     assert not estimate.colours

@@ -18,7 +18,6 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Factor, Parameter, Problem, Quantity, Step
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.solvers import incremental as online
 from alidade.pipelines.solvers import levenberg
 from alidade.pipelines.solvers.batch import minimum, solve_batch
 from alidade.pipelines.solvers.chain import IndeterminateError
@@ -34,10 +33,8 @@ from tests.support.judged import judge
 WARMING = (1.5e-4, -2e-4, 2.5e-4)
 
 
-@pytest.fixture(autouse=True)
-def early_smoother(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chain has 60 steps; the initialisation phase, in which all is batch, has 100."""
-    monkeypatch.setattr(online, "MIN_STEPS", 20)
+# A chain has 60 steps.
+pytestmark = pytest.mark.usefixtures("early_smoother")
 
 
 @cache

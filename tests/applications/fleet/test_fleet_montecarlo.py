@@ -129,9 +129,9 @@ def test_study_goes_on_and_sums_up(
     assert "3 of 3 runs, 2 from an earlier run" in said
     assert "batch has a mean NEES of" in said
     assert alidade(monkeypatch, *common, "--runs", 3, "--out", out, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.montecarlo/1", 3, False)
-    assert {run["seed"] for run in told["runs"]} == set(range(3))
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["schema"], printed["wanted"], printed["interrupted"]) == ("alidade.montecarlo/1", 3, False)
+    assert {run["seed"] for run in printed["runs"]} == set(range(3))
     page = (out / "montecarlo.html").read_text()
     fits(page, tmp_path)
     assert "default-src 'none'" in page

@@ -111,12 +111,14 @@ def test_the_table_as_json(
 ) -> None:
     common = ("fleet", recordings / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
     assert alidade(monkeypatch, *common, "--json") == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.fleet/1", 27, False)
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["schema"], printed["wanted"], printed["interrupted"]) == ("alidade.fleet/1", 27, False)
     rows = {row["recording"]: row for row in rows_of(calibrated / "fleet.csv")}
-    assert [unit["name"] for unit in told["attention"]] == ["U18", "U07", "U14", "U12"]
-    assert {row["recording"]: row["status"] for row in told["recordings"]} == {k: v["status"] for k, v in rows.items()}
-    assert any(change["unit"] == "U18" for change in told["changes"])
+    assert [unit["name"] for unit in printed["attention"]] == ["U18", "U07", "U14", "U12"]
+    assert {row["recording"]: row["status"] for row in printed["recordings"]} == {
+        k: v["status"] for k, v in rows.items()
+    }
+    assert any(change["unit"] == "U18" for change in printed["changes"])
 
 
 def test_the_table_is_complete(calibrated: Path) -> None:

@@ -47,7 +47,7 @@ SCENARIO = LosScenario(
 )
 # The initialisation phase has fewer solutions and may end with fewer steps; the past is marginalised out more often
 # than every 20 s.
-EARLY = {"MIN_STEPS": 15, "_MARGINALIZE_EVERY": 3.0, "_SOLVE_GROWTH": 1.6}
+EARLY = {"MIN_STEPS": 15, "MARGINALIZE_EVERY": 3.0, "SOLVE_GROWTH": 1.6}
 COMMAND = f"""
 from alidade.pipelines.applications.cli import main
 from alidade.pipelines.solvers import incremental

@@ -224,7 +224,7 @@ def test_a_look_reads_the_end_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(GrowingFiles, "refresh", noted)
     # The initialisation phase may end with fewer steps, and the past is marginalised out more often than every 20 s.
     monkeypatch.setattr(incremental, "MIN_STEPS", 20)
-    monkeypatch.setattr(incremental, "_MARGINALIZE_EVERY", 4.0)
+    monkeypatch.setattr(incremental, "MARGINALIZE_EVERY", 4.0)
     spent = follow_grown(tmp_path, 30.0, 4.0)
     assert spent[-1, 0] > 29.0
     late = np.array(read[-2:])

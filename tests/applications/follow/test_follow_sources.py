@@ -53,7 +53,7 @@ SCENARIO = LosScenario(
 def _few_batch_solutions() -> Iterator[None]:
     """In the initialisation phase: they are most of what is computed, and no source's."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(incremental, "_SOLVE_GROWTH", 1.6)
+        patch.setattr(incremental, "SOLVE_GROWTH", 1.6)
         yield
 
 

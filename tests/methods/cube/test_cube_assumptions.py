@@ -117,9 +117,9 @@ def test_a_gyro_that_feels_force_far_beyond_its_data_sheet_is_named_first() -> N
     assert wrong.status == "inconsistent"
     assert _conflicts(wrong)[0] == "gyro_g_xz"
     stated = Config.model_validate({"sensors": {"gyro": {"g_sensitivity": 1.2e-3}}})
-    told = alidade.open(simulated, config=stated).calibrate(report=False)
-    assert told.status == "calibrated"
-    gyro_g = told.parameters["gyro_g_xz"]
+    right = alidade.open(simulated, config=stated).calibrate(report=False)
+    assert right.status == "calibrated"
+    gyro_g = right.parameters["gyro_g_xz"]
     assert abs(gyro_g.value - 1.2e-3) < 4.0 * gyro_g.sigma
     assert gyro_g.group == "assumption"
 
@@ -150,11 +150,11 @@ def test_a_field_far_from_its_model_is_named_and_has_room_where_stated() -> None
     assert wrong.status == "inconsistent"
     assert _conflicts(wrong)[0] == "field_e"
     stated = Config.model_validate({"sensors": {"field": {"model_error": 5e-6}}})
-    told = alidade.open(simulated, config=stated).calibrate(report=False)
-    assert told.status == "weak"
-    assert "mag_scale" in told.headline
-    assert told.parameters["mag_k11"].sigma > 0.05
-    errors = {n: abs(p.value - simulated.truth[n]) / p.sigma for n, p in told.parameters.items() if p.sigma > 0.0}
+    right = alidade.open(simulated, config=stated).calibrate(report=False)
+    assert right.status == "weak"
+    assert "mag_scale" in right.headline
+    assert right.parameters["mag_k11"].sigma > 0.05
+    errors = {n: abs(p.value - simulated.truth[n]) / p.sigma for n, p in right.parameters.items() if p.sigma > 0.0}
     assert max(errors.values()) < 4.0
 
 
