@@ -153,7 +153,7 @@ class ColumnTable:
     def drop_unstamped(self) -> int:
         """Drop filled rows whose messages have no stamp, if most others have one; return how many."""
         rows = np.flatnonzero(self.filled)
-        few = rows[few_unstamped(self._t_ns[rows], self._log_ns[rows])]
+        few = rows[~one_clock(self._t_ns[rows], self._log_ns[rows])[0]]
         self.filled[few] = False
         return len(few)
 
@@ -339,17 +339,19 @@ def is_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
     return np.asarray((stamps == 0) & (log_ns != 0))
 
 
-def few_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
-    """Mask (N,) of messages without a stamp if these are at most MAX_UNSTAMPED_SHARE of all; otherwise all False."""
+def one_clock(stamps: Stamps, log_ns: Stamps) -> tuple[NDArray[np.bool_], int]:
+    """Mask (N,) of the messages that are kept, and how many of these have no stamp: with any, all get log times."""
     without = is_unstamped(stamps, log_ns)
-    return without & (np.count_nonzero(without) <= MAX_UNSTAMPED_SHARE * len(without))
+    count = int(np.count_nonzero(without))
+    return (~without, 0) if count <= MAX_UNSTAMPED_SHARE * len(without) else (np.ones_like(without), count)
 
 
 def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
     """Return stamps and log times; few messages without a stamp are left out, with many all get their log times."""
-    kept: Any = ~few if (few := few_unstamped(stamps, log_ns)).any() else slice(None)
-    stamps, log_ns = stamps[kept], log_ns[kept]
-    return (log_ns if is_unstamped(stamps, log_ns).any() else stamps), log_ns
+    kept, absent = one_clock(stamps, log_ns)
+    if not kept.all():
+        stamps, log_ns = stamps[kept], log_ns[kept]
+    return (log_ns if absent else stamps), log_ns
 
 
 def header_stamps(has_header: bool, block: MessageBlock, wire: Wire) -> Stamps:

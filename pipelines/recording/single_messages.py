@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from alidade.pipelines.recording import images, series
-from alidade.pipelines.recording.decoding import DecodedMessage, few_unstamped, is_unstamped, with_log_times
+from alidade.pipelines.recording.decoding import DecodedMessage, one_clock
 from alidade.pipelines.recording.messages import MessageError
 
 
@@ -88,8 +88,7 @@ def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], seri
 def _poses(rows: list[tuple[int, int, Any]]) -> series.PoseSeries:
     """Make a series of poses from rows of stamp (0: none), log time, and x, y, z, qx, qy, qz, qw."""
     stamps, log_ns = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2).T
-    kept = ~few_unstamped(stamps, log_ns)
+    kept, absent = one_clock(stamps, log_ns)
     numbers = np.array([row[2] for row in rows]).reshape(-1, 7)[kept]
-    from_log = int(kept.sum()) if is_unstamped(stamps, log_ns)[kept].any() else 0
-    t_ns, _ = with_log_times(stamps, log_ns)
+    t_ns, from_log = (log_ns, len(rows)) if absent else (stamps[kept], 0)
     return series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=from_log)
