@@ -336,7 +336,11 @@ class LinearChain:
         F, c, Q = self.transitions(variances, by_shared)
         seen = [k for k, rows in enumerate(self.rows) if rows.is_measurement and len(rows.states) == 1]
         queues = {k: _queue(self.rows[k].states[0][0], n) for k in seen}
-        found = {k: (np.zeros(len(self.rows[k].time)), np.zeros((*self.rows[k].residuals.shape, q))) for k in seen}
+        eyes = {k: np.eye(self.rows[k].residuals.shape[1]) for k in seen}
+        squares = {k: np.zeros(len(self.rows[k].time)) for k in seen}
+        right = {k: self.rows[k].right(by_shared=by_shared) for k in seen}
+        innovation = {k: np.zeros_like(each) for k, each in right.items()}
+        covariances = {k: np.tile(eyes[k], (len(squares[k]), 1, 1)) for k in seen}
         starts = np.arange(0, n, _PIECE)
         begin = np.maximum(starts - _WARM_UP, 0)
         x, P = np.zeros((len(begin), d, q)), np.tile(np.eye(d) / _DIFFUSE, (len(begin), 1, 1))
@@ -347,25 +351,26 @@ class LinearChain:
                 x[live] = F[k] @ x[live] + c[k]
                 P[live] = F[k] @ P[live] @ np.swapaxes(F[k], 1, 2) + Q[k]
             for kind in seen:
-                rows, (order, begins, counts) = self.rows[kind], queues[kind]
+                order, begins, counts = queues[kind]
                 for again in range(int(counts[k].max(initial=0))):
                     some = np.flatnonzero(counts[k] > again)
                     own, row = live[some], order[begins[k[some]] + again]
-                    J, v = rows.states[0][1][row], variances[kind][row][:, None, None] * np.eye(rows.residuals.shape[1])
-                    y = rows.right(row, by_shared)
-                    y = y + J @ x[own]
-                    Jt = np.swapaxes(J, 1, 2)
-                    S = J @ P[own] @ Jt + v
-                    square = _square(S, y[..., 0])
-                    widened = np.maximum(square / limits[kind], 1.0)[:, None, None]
-                    S = J @ P[own] @ Jt + widened * v
-                    squares, whitened = found[kind]
-                    squares[row] = square
-                    whitened[row] = np.linalg.solve(np.linalg.cholesky(S), y)
-                    K = P[own] @ Jt @ np.linalg.inv(S)
-                    x[own] -= K @ y
-                    P[own] -= K @ J @ P[own]
-        return {kind: Innovations(*each) for kind, each in found.items()}
+                    J, v = self.rows[kind].states[0][1][row], variances[kind][row][:, None, None] * eyes[kind]
+                    y = right[kind][row] + J @ x[own]
+                    JP = J @ P[own]
+                    S = JP @ np.swapaxes(J, 1, 2)
+                    inverse = np.linalg.inv(S + v)
+                    square = np.einsum("ni,nij,nj->n", y[..., 0], inverse, y[..., 0])
+                    wide = square > limits[kind]
+                    if wide.any():
+                        v[wide] *= (square[wide] / limits[kind])[:, None, None]
+                        inverse[wide] = np.linalg.inv(S[wide] + v[wide])
+                    squares[kind][row], innovation[kind][row], covariances[kind][row] = square, y, S + v
+                    gain = np.swapaxes(JP, 1, 2) @ inverse
+                    x[own] -= gain @ y
+                    P[own] -= gain @ JP
+        roots = {kind: np.linalg.cholesky(S) for kind, S in covariances.items()}
+        return {k: Innovations(squares[k], np.linalg.solve(roots[k], innovation[k])) for k in seen}
 
     def transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
         """Transitions x_k = F_k x_k-1 + c_k with covariance Q_k; diffuse where no factor joins two states.
@@ -633,11 +638,6 @@ def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = 
         middle += sums.T @ sums
     C = np.asarray(np.linalg.pinv(information, hermitian=True))
     return C, C @ middle @ C, blocks
-
-
-def _square(S: Array, y: Array) -> Array:
-    """Quadratic form y' S^-1 y, (n,)."""
-    return np.asarray(np.einsum("ni,ni->n", y, np.linalg.solve(S, y[..., None])[..., 0]))
 
 
 def _shares(chain: LinearChain, levels: Sequence[Level], which: Sequence[int]) -> list[list[Array]]:
