@@ -236,20 +236,21 @@ def temperature_text(names: Sequence[str], known: Collection[str]) -> str:
 
 
 def gyro_rate(
-    known: Collection[str], s: Sequence[str], g: Sequence[str], c: Sequence[str] = ()
+    known: Collection[str], s: Sequence[str], g: Sequence[str], c: Sequence[str] = (), force: str = "accel"
 ) -> tuple[str, tuple[str, ...]]:
     """Expression of the rate w, from a gyro reading (I + S) w + G f + c (temperature - first_temperature) + gyro_bias.
 
     Args:
         known: parameters that are applied.
         s, g, c: names of the numbers of S, xx yy zz xy xz yz, of those of G by rows, and of c.
+        force: name of f: the accelerometer's reading, or an earlier formula's result from it.
 
     Returns:
         Expression and inputs.
     """
     scaled, feels, drifts = (any(name in known for name in names) for names in (s, g, c))
-    force = f" - {matrix_text([g[:3], g[3:6], g[6:]], known)} * accel" if feels else ""
-    text = f"gyro{force}{f' - {temperature_text(c, known)}' if drifts else ''} - gyro_bias"
+    felt = f" - {matrix_text([g[:3], g[3:6], g[6:]], known)} * {force}" if feels else ""
+    text = f"gyro{felt}{f' - {temperature_text(c, known)}' if drifts else ''} - gyro_bias"
     return (
         f"inverse({symmetric_text(s, known)}) * ({text})" if scaled else text,
         ("gyro", *(["accel"] if feels else []), *(["temperature"] if drifts else [])),

@@ -86,7 +86,7 @@ def _level(sensor: Sensor, guess: FieldGuess) -> Level:
 
 def _seen(sensor: Sensor, whole: Array | None) -> Seen:
     assert whole is not None
-    return Seen(sensor.time, sensor.directions, sensor.nominal(whole), not sensor.rested)
+    return Seen(sensor.time, sensor.directions, sensor.nominal(whole), sensor.strength, not sensor.rested)
 
 
 def _steps(graph: _Graph, chunk: int) -> Iterator[Step]:

@@ -23,6 +23,7 @@ from alidade.pipelines.methods.formula import Formula, gyro_rate, temperature_te
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE, FIRST, GYRO_SLOPE
 from alidade.pipelines.methods.triads import (
     CORRECTIONS,
+    RESULTS,
     gain_names,
     parts_row,
     parts_with_sigmas,
@@ -53,12 +54,11 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
         found.append(triad_formula("mag", parameters, "mag", ("mag",), "body's", unit))
     if BIAS[0] in parameters:
         names = tuple(name for each in SCALE for name in each.names)
+        force = RESULTS["accel"]
+        rate, inputs = gyro_rate(parameters, names, SENSITIVITY.names, GYRO_SLOPE.names, force)
+        of_force = [name for each in found if each.name == force and "accel" in inputs for name in each.inputs]
         found.append(
-            Formula(
-                "rate, rad/s along the body's axes",
-                "w_b",
-                *gyro_rate(parameters, names, SENSITIVITY.names, GYRO_SLOPE.names),
-            )
+            Formula("rate, rad/s along the body's axes", "w_b", rate, tuple(dict.fromkeys([*inputs, *of_force])))
         )
     return found
 

@@ -77,12 +77,13 @@ _GAIN = 0.2
 class Seen:
     """Measured directions of a sensor: time (n,) s, unit direction (n, 3) in b, and all samples `whole` (m, 3), SI.
 
-    swung: whether it is used while it moves.
+    strength: of what it measures. swung: whether it is used while it moves.
     """
 
     time: Array
     direction: Array
     whole: Array
+    strength: float
     swung: bool
 
 
@@ -221,8 +222,7 @@ def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple
         if turned.sum() < _FEWEST:
             return None
         R, before, after = so3.matrix(dR.wxyz[turned]), x[first[turned]], x[last[turned]]
-        independent = 3.0 * turned.sum() * min(1.0, float(np.median(np.diff(time))) / span)
-        K, b, assumed, determined = _homogeneous(R, before, after, 1.0 + _CHANCE * np.sqrt(2.0 / independent))
+        K, b, assumed, determined = _homogeneous(R, before, after, _alike(time, int(turned.sum()), span))
         at_first, at_last = before @ K.T + b, after @ K.T + b
         left = at_first - np.einsum("nij,nj->ni", R, at_last)
         by_bias = -R @ so3.hat(at_last) @ dR.bias_jacobian[turned]
@@ -243,22 +243,32 @@ def _pairs(time: Array, span: float, gyro: Array) -> tuple[Index, Index]:
     return first[near], last[near]
 
 
-def _homogeneous(R: Array, before: Array, after: Array, alike: float) -> tuple[Array, Array, bool, float]:
-    """Solve K before + b = R (K after + b) for K (3, 3) of unit norm and b (3,).
+def _alike(time: Array, pairs: int, span: float) -> float:
+    """Ratio of misfits up to which solutions from so many pairs of readings `span` s apart fit equally well."""
+    independent = 3.0 * pairs * min(1.0, float(np.median(np.diff(time))) / span)
+    return float(1.0 + _CHANCE * np.sqrt(2.0 / independent))
 
-    Of several K whose misfits are less than `alike` times the smallest it is that of a magnetometer mounted straight.
+
+def _homogeneous(
+    R: Array, before: Array, after: Array, alike: float, beside: Array | None = None
+) -> tuple[Array, Array, bool, float]:
+    """Solve K before + b = R (K after + b) + beside a for K (3, 3) of unit norm and b (3,), whatever a is.
+
+    Of several K whose misfits are less than `alike` times the smallest it is that of a sensor mounted straight.
 
     Also returns whether there are several, and by what factor the next one fits worse, over what counts as alike.
     """
     gains = np.einsum("ac,nb->nacb", np.eye(3), before) - np.einsum("nac,nb->nacb", R, after)
     gains, offsets = gains.reshape(-1, 9), (np.eye(3) - R).reshape(-1, 3)
+    if beside is not None:
+        offsets = np.column_stack([offsets, -beside.reshape(len(offsets), -1)])
     by_gain = np.linalg.lstsq(offsets, gains)[0]
     left = gains - offsets @ by_gain
     squares, axes = np.linalg.eigh(left.T @ left)
     sizes = np.sqrt(np.maximum(squares, np.finfo(float).tiny))
     count = int(np.searchsorted(sizes, alike * sizes[0]))
     K = axes[:, 0] if count == 1 else _mounted_straight(axes[:, :count])
-    return K.reshape(3, 3), -by_gain @ K, count > 1, float(sizes[min(count, 8)] / (alike * sizes[0]))
+    return K.reshape(3, 3), -(by_gain @ K)[:3], count > 1, float(sizes[min(count, 8)] / (alike * sizes[0]))
 
 
 def _mounted_straight(axes: Array) -> Array:
@@ -275,6 +285,30 @@ def _right_angles() -> Array:
     """Rotations (24, 3, 3) that permute the axes, the identity first."""
     signed = (np.eye(3)[list(order)] * np.array(signs) for order in permutations(range(3)) for signs in _SIGNS)
     return np.array([each for each in signed if np.linalg.det(each) > 0.0])
+
+
+def _force(time: Array, accel: Seen, path: GyroPath) -> Array:
+    """Specific force (m, 3), m/s^2, in b by the samples (m,) s of an accelerometer that is swung, roughly calibrated.
+
+    Without its lever arm's part it is constant in space: K and b as of the magnetometer, from samples far enough apart
+    that motion is small beside what gravity changes. An offset b left in it would be G b in the gyro's bias.
+
+    Args:
+        time: of all samples.
+        accel: what they are as recorded.
+        path: of the gyro.
+    """
+    first, last = _pairs(time, _SPANS[-2], path.t)
+    if len(first) < _FEWEST:
+        return accel.whole
+    dR = so3.matrix(path.increments(time[first], time[last]).wxyz)
+    rate, change = so3.hat(path.rate(time)), so3.hat(path.acceleration(time)[0])
+    by_arm = change + rate @ rate
+    x = accel.whole / accel.strength
+    alike = _alike(time, len(first), _SPANS[-2])
+    K, b, *_ = _homogeneous(dR, x[first], x[last], alike, by_arm[first] - dR @ by_arm[last])
+    force = np.sign(np.trace(K)) * (x @ K.T + b)
+    return np.asarray(force * accel.strength / np.linalg.norm(force, axis=1).mean())
 
 
 def turning(
@@ -296,7 +330,9 @@ def turning(
     walk = walking(config)
     drivers: dict[ParameterSpec, Array] = {}
     if accel is not None and data.accel_t is not None:
-        drivers[SENSITIVITY] = interpolated(data.gyro_t, data.accel_t, accel.whole)
+        path = GyroPath(data.gyro_t, data.gyro, guess.bias)
+        force = _force(data.accel_t, accel, path) if accel.swung else accel.whole
+        drivers[SENSITIVITY] = interpolated(data.gyro_t, data.accel_t, force)
     if data.temperature is not None:
         drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)
     half_width, beyond = dead_band(data.gyro_t, data.gyro)

@@ -39,6 +39,7 @@ from alidade.pipelines.methods.tumble.scenario import (
     TumbledMagnetometer,
     TumbleScenario,
 )
+from alidade.pipelines.methods.tumble.turning import BIAS, SENSITIVITY
 from alidade.pipelines.methods.tumble.unturned import unturned
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
@@ -213,6 +214,19 @@ def _turned(hz: float, beside: bool) -> TumbleScenario:
 def test_gyro_of_any_rate_is_consistent(hz: float, beside: bool) -> None:
     """Sensors rotated relative to each other, a late magnetometer, a gyro that is off and feels force."""
     _assert_consistent(_turned(hz, beside), range(2, 4))
+
+
+def test_the_gyro_bias_holds_no_offset_of_the_accelerometer() -> None:
+    """The gyro feels force, of which the accelerometer reads 0.3 m/s^2 too much: NEES of the bias was 62 and 3."""
+    total, seeds = 0.0, (0, 2)
+    for seed in seeds:
+        simulated = _simulated(TURNING.model_copy(update={"attitudes": 12, "turn_rad_s": 0.5}), seed)
+        estimate = _solved(simulated)
+        some = [estimate.names.index(name) for name in BIAS]
+        error = estimate.values[some] - [simulated.truth[name] for name in BIAS]
+        total += float(error @ np.linalg.solve(estimate.covariance[np.ix_(some, some)], error))
+    dof = 3 * len(seeds)
+    assert quantile(0.005, dof) < total < quantile(0.995, dof), f"NEES {total:.1f} for {dof}"
 
 
 @pytest.mark.slow
@@ -955,6 +969,14 @@ def test_an_accelerometer_that_reads_a_square_term_beside_what_it_feels(magnetom
         assert calibration.status == "calibrated"
         for name, each in calibration.parameters.items():
             assert abs(each.value - simulated.truth[name]) <= 4.0 * each.sigma + 1e-12, name
+
+
+def test_the_formula_of_the_rate_takes_off_what_the_calibrated_force_does() -> None:
+    given = {f"accel_k{i}{j}": float(i == j) for i in "123" for j in "123"} | {f"accel_b{i}": 0.1 for i in "123"}
+    given |= dict.fromkeys([*SENSITIVITY.names, *BIAS], 0.0) | {"gyro_g_xy": 1e-3, "gyro_bias_x": 0.02}
+    force, rate = np.array([[1.0, 9.0, -3.0]]), np.array([[0.1, 0.2, 0.3]])
+    inputs = {"accel": force - 0.1, "gyro": rate + [1e-3 * 9.0 + 0.02, 0.0, 0.0]}
+    np.testing.assert_allclose(apply(formulas(given), given, inputs)["w_b"], rate, atol=1e-12)
 
 
 def test_the_formula_takes_the_square_term_off() -> None:
