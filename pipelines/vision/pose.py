@@ -159,7 +159,8 @@ _SAME = 1e-4
 _FORWARD = 0.05
 # Tags with a corner less certain than this (sigma, px) only count when there are no better ones.
 _POOR_PX = 0.25
-# A tag is wrong when the fit is this many sigmas off with it, and this many times better without it.
+# A tag is wrong when the fit is this many sigmas, of corners and places, off with it, and this many times better
+# without it.
 _WRONG_SIGMAS, _WRONG_GAIN = 5.0, 4.0
 
 
@@ -173,6 +174,7 @@ class TagBody:
         bRt: (n, 4) attitude of each tag's frame (x right, y up, z out of the face, as seen facing it) in b.
         position: (n, 3) centre of each tag in b, m.
         family: tag family.
+        accuracy: of the positions, one sigma, m.
     """
 
     ids: NDArray[np.int64]
@@ -180,6 +182,7 @@ class TagBody:
     bRt: Array
     position: Array
     family: str = "36h11"
+    accuracy: float = 0.0
 
     @classmethod
     def from_board(cls, board: Board) -> TagBody:
@@ -269,7 +272,9 @@ def estimate_pose(
         return None
     sigma, is_raised = (float(np.sqrt(variance)), True) if sigma_px is None else (sigma_px, False)
     solution = _solve(camera, tags, pixels, sigma, is_raised, expected)
-    if solution is None or len(use) < 3 or solution.rms_px < _WRONG_SIGMAS * sigma:
+    edges = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
+    expected_px = np.hypot(sigma, body.accuracy * float((edges / tags.size).mean()))
+    if solution is None or len(use) < 3 or solution.rms_px < _WRONG_SIGMAS * expected_px:
         return solution
     # One wrong tag spoils the fit of all: it is the one without which the others agree.
     rests = [np.arange(len(tags.ids)) != k for k in range(len(tags.ids))]
@@ -295,7 +300,9 @@ def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequenc
 
 def part(body: TagBody, keep: NDArray[Any]) -> TagBody:
     """Return the body with selected tags only."""
-    return TagBody(body.ids[keep], body.size[keep], body.bRt[keep], body.position[keep], body.family)
+    return replace(
+        body, ids=body.ids[keep], size=body.size[keep], bRt=body.bRt[keep], position=body.position[keep]
+    )
 
 
 def _solve(

@@ -12,7 +12,9 @@ from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.parameters import stated
 from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.methods.cube.parameters import PLACE
 from alidade.pipelines.methods.cube.recording import (
     CubeConfig,
     CubeData,
@@ -150,7 +152,8 @@ def _seen_tags(
     from alidade.pipelines.vision.pose import TagBody
 
     assert data.sightings is not None
-    body, sigma = TagBody.from_board(config.section(CubeConfig)), _corner_sigma(data.sightings, span, config)
+    body = replace(TagBody.from_board(config.section(CubeConfig)), accuracy=stated(config, PLACE))
+    sigma = _corner_sigma(data.sightings, span, config)
     # The rates' median over the static intervals is the bias, near enough for what a pose is expected to be.
     path = GyroPath(data.imu_t, nominal(data.gyro, config.section(CubeConfig).raw.gyro), np.median(gyro, axis=0))
     found: list[SeenTags | None] = []
