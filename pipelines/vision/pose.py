@@ -300,9 +300,7 @@ def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequenc
 
 def part(body: TagBody, keep: NDArray[Any]) -> TagBody:
     """Return the body with selected tags only."""
-    return replace(
-        body, ids=body.ids[keep], size=body.size[keep], bRt=body.bRt[keep], position=body.position[keep]
-    )
+    return replace(body, ids=body.ids[keep], size=body.size[keep], bRt=body.bRt[keep], position=body.position[keep])
 
 
 def _solve(

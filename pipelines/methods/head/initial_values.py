@@ -1,4 +1,4 @@
-"""First guesses for the head method's graph: gyro bias, the helmet's mount and the pictures' clock."""
+"""First guesses for the head method's graph: gyro bias, both mounts and the pictures' clock."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ from alidade.pipelines.recording.pairing import BELONGS, pair
 # Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
 _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
-# Pairs of pictures from which the clock is estimated.
-_CLOCK_PAIRS = 1000
+# Pairs of pictures from which the camera's mount, and from which the clock is estimated.
+_CAMERA_PAIRS, _CLOCK_PAIRS = 3000, 1000
+# Sigmas of chance by which a camera's mount has to explain the rates better than none.
+_CHANCE = 3.0
 # What is estimated with the clock: a correction of the mount, rad, the gyro bias, rad/s; offset, s, and skew, s/s.
 _MOUNT, _BIAS, _CLOCK = slice(0, 3), slice(3, 6), slice(6, 8)
 
@@ -59,6 +61,41 @@ def guess(gyro: GyroPath, vision_t: Array, iRh: Array, sigma: float) -> tuple[Ar
     return np.median(rate - so3.rotate(vRh, seen), axis=0), vRh
 
 
+def guess_camera(gyro: GyroPath, platform: GyroPath, vision_t: Array, cRh: Array, sigma: float) -> Array:
+    """Initial camera mount cRb (4,), however large, from mean rates over short windows.
+
+    The helmet's rate w, less its bias b, is as large as u + C p, with u what vision sees turn, in the camera's axes, p
+    the platform's rate and C the mount: |w|^2 - |u|^2 - |p|^2 = 2 u'C p + 2 b'w + constant, linear in C and b. It is
+    the identity unless the rates agree clearly better with that mount.
+
+    Args:
+        gyro, platform: integrated without any bias taken off.
+        vision_t: (n,) when the pictures were taken, s.
+        cRh: (n, 4) what they show.
+        sigma: of one, rad.
+    """
+    i, j = _pairs(vision_t, _CAMERA_PAIRS)
+    if len(i) < _FEWEST_FRAMES:
+        return so3.identity()
+    start, stop = vision_t[i], vision_t[j]
+    span = (stop - start)[:, None]
+    w, p = (so3.log(each.increments(start, stop).wxyz) / span for each in (gyro, platform))
+    seen = so3.local(cRh[i], cRh[j])
+    u = so3.rotate(so3.multiply(cRh[i], so3.exp(0.5 * seen)), seen / span)
+    products = 2.0 * np.einsum("ni,nj->nij", u, p).reshape(-1, 9)
+    squares = (w**2).sum(axis=1) - (u**2).sum(axis=1) - (p**2).sum(axis=1)
+    x = np.linalg.lstsq(np.column_stack([products, 2.0 * w, np.ones(len(w))]), squares)[0]
+
+    def misfit(cRb: Array) -> float:
+        iRh = so3.compose(platform.attitude(vision_t), so3.inverse(cRb), cRh)
+        bias, vRh = guess(gyro, vision_t, iRh, sigma)
+        return float(np.median(np.linalg.norm(w - bias - so3.rotate(vRh, so3.local(iRh[i], iRh[j]) / span), axis=1)))
+
+    mount = so3.align(x[:9].reshape(3, 3).T, np.eye(3))
+    clearly = 1.0 - _CHANCE / np.sqrt(len(w))
+    return mount if misfit(mount) < clearly * misfit(so3.identity()) else so3.identity()
+
+
 def guess_picture_clock(
     gyro: GyroPath,
     platform: GyroPath | None,
@@ -76,7 +113,7 @@ def guess_picture_clock(
         gyro, platform: of helmet and platform, integrated without any bias taken off; None: the platform is at rest.
         elapsed: (n,) stamps of the pictures since the recording's first, s.
         begun: that one, s.
-        measured: (n, 4) cRh.
+        measured: (n, 4) bRh.
         parameters: the helmet's mount, bias, and the pictures' errors, with their priors.
         sigma: of one picture, rad.
     """

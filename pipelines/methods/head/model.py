@@ -33,7 +33,7 @@ from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.formula import clock_constants
-from alidade.pipelines.methods.head.initial_values import guess, guess_picture_clock
+from alidade.pipelines.methods.head.initial_values import guess, guess_camera, guess_picture_clock
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, VISION_MAP, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import at_gyro_rate
@@ -80,6 +80,7 @@ class _Model:
     loss: TruncatedLoss
     parameters: HeadParameters
     helmet_guess: Array  # vRh
+    camera_guess: Array  # cRb
     reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
     noises: dict[str, Level]  # by name
     dead_band: bool  # of the helmet's gyro
@@ -239,16 +240,21 @@ def _prepare(
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     if before is None:
         gyro = GyroPath(data.head_t, data.head_gyro)
+        cRb = so3.identity()
+        if platform is not None and all(q.prior_sigma != 0.0 for q in parameters.camera.quantities):
+            cRb = guess_camera(gyro, platform, taken, measured, sigma)
+        bRh = so3.multiply(so3.inverse(cRb), measured)
         if parameters.has_picture_errors and clock is None:
             by = parameters.helmet, parameters.bias, parameters.picture
-            guessed = guess_picture_clock(gyro, platform, stamps - begun, begun, measured, by, sigma)
+            guessed = guess_picture_clock(gyro, platform, stamps - begun, begun, bRh, by, sigma)
             if np.abs(guessed.late(stamps - begun)).max() > _NEAR:
                 return _prepare(data, config, clock=guessed, noises=noises)
         iRb = so3.identity(len(taken)) if platform is None else platform.attitude(taken)
-        bias_hat, vRh = guess(gyro, taken, so3.multiply(iRb, measured), sigma)
+        bias_hat, vRh = guess(gyro, taken, so3.multiply(iRb, bRh), sigma)
         first, origins = data.vision_wxyz[0], (begun, taken[0], _shared(data, noises))
     else:
-        bias_hat, vRh, first, origins = before.chain.gyro.bias_hat, before.helmet_guess, before.first, before.origins
+        bias_hat, vRh, cRb = before.chain.gyro.bias_hat, before.helmet_guess, before.camera_guess
+        first, origins = before.first, before.origins
         if trunk is ROOT:
             origins = origins[0], taken[0], origins[2]
     time, pictures = shared_keyframes(taken, *origins[1:], _LONGEST_INCREMENT)
@@ -261,7 +267,7 @@ def _prepare(
     chain = GyroChain.over(
         time,
         np.arange(len(time)) == 0,
-        _between(gyro, platform, taken, so3.multiply(measured, so3.inverse(vRh)), time),
+        _between(gyro, platform, taken, so3.compose(so3.inverse(cRb), measured, so3.inverse(vRh)), time),
         gyro,
         density=density,
         other_density=platform_density,
@@ -286,6 +292,7 @@ def _prepare(
         loss=TruncatedLoss(gate(3)),
         parameters=parameters,
         helmet_guess=vRh,
+        camera_guess=cRb,
         reference=reference,
         noises=noises,
         dead_band=half_width > 0.0,
@@ -370,7 +377,7 @@ def _begin(model: _Model, step: Step) -> None:
     """Add the calibration variables and their priors to the first step."""
     p = model.parameters
     step.initial.insert(p.helmet.key, so3.to_gtsam(model.helmet_guess))
-    step.initial.insert(p.camera.key, so3.to_gtsam(so3.identity()))
+    step.initial.insert(p.camera.key, so3.to_gtsam(model.camera_guess))
     step.factors.extend([vector_prior(p.bias, np.zeros(3)), rotation_prior(p.helmet), rotation_prior(p.camera)])
     for vector in (p.picture, p.gyro, p.platform):
         if vector is not None:
