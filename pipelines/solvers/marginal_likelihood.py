@@ -336,11 +336,9 @@ class LinearChain:
         F, c, Q = self.transitions(variances, by_shared)
         seen = [k for k, rows in enumerate(self.rows) if rows.is_measurement and len(rows.states) == 1]
         queues = {k: _queue(self.rows[k].states[0][0], n) for k in seen}
-        eyes = {k: np.eye(self.rows[k].residuals.shape[1]) for k in seen}
         squares = {k: np.zeros(len(self.rows[k].time)) for k in seen}
         right = {k: self.rows[k].right(by_shared=by_shared) for k in seen}
-        innovation = {k: np.zeros_like(each) for k, each in right.items()}
-        covariances = {k: np.tile(eyes[k], (len(squares[k]), 1, 1)) for k in seen}
+        whitened = {k: np.zeros_like(each) for k, each in right.items()}
         starts = np.arange(0, n, _PIECE)
         begin = np.maximum(starts - _WARM_UP, 0)
         x, P = np.zeros((len(begin), d, q)), np.tile(np.eye(d) / _DIFFUSE, (len(begin), 1, 1))
@@ -355,22 +353,21 @@ class LinearChain:
                 for again in range(int(counts[k].max(initial=0))):
                     some = np.flatnonzero(counts[k] > again)
                     own, row = live[some], order[begins[k[some]] + again]
-                    J, v = self.rows[kind].states[0][1][row], variances[kind][row][:, None, None] * eyes[kind]
-                    y = right[kind][row] + J @ x[own]
+                    J, y = self.rows[kind].states[0][1][row], right[kind][row]
                     JP = J @ P[own]
-                    S = JP @ np.swapaxes(J, 1, 2)
-                    inverse = np.linalg.inv(S + v)
-                    square = np.einsum("ni,nij,nj->n", y[..., 0], inverse, y[..., 0])
+                    S, v = JP @ np.swapaxes(J, 1, 2), variances[kind][row][:, None, None] * np.eye(y.shape[1])
+                    both = np.concatenate([y + J @ x[own], JP], axis=2)
+                    z = np.linalg.solve(np.linalg.cholesky(S + v), both)
+                    square = np.square(z[..., 0]).sum(axis=1)
                     wide = square > limits[kind]
                     if wide.any():
                         v[wide] *= (square[wide] / limits[kind])[:, None, None]
-                        inverse[wide] = np.linalg.inv(S[wide] + v[wide])
-                    squares[kind][row], innovation[kind][row], covariances[kind][row] = square, y, S + v
-                    gain = np.swapaxes(JP, 1, 2) @ inverse
-                    x[own] -= gain @ y
-                    P[own] -= gain @ JP
-        roots = {kind: np.linalg.cholesky(S) for kind, S in covariances.items()}
-        return {k: Innovations(squares[k], np.linalg.solve(roots[k], innovation[k])) for k in seen}
+                        z[wide] = np.linalg.solve(np.linalg.cholesky(S[wide] + v[wide]), both[wide])
+                    squares[kind][row], whitened[kind][row] = square, z[..., :q]
+                    gain = np.swapaxes(z[..., q:], 1, 2)
+                    x[own] -= gain @ z[..., :q]
+                    P[own] -= gain @ z[..., q:]
+        return {kind: Innovations(squares[kind], whitened[kind]) for kind in seen}
 
     def transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
         """Transitions x_k = F_k x_k-1 + c_k with covariance Q_k; diffuse where no factor joins two states.
