@@ -18,6 +18,10 @@ from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.scenario import Positive, ScenarioPart
 
+# Hz, at which gyros sense at least, however slowly they report: over 25 ms the rotation vector per second differs from
+# the mean rate by h^2/12 w x w', 1e-4 rad/s, and a loop that steps its rates is not what encoders can follow.
+SENSED_HZ = 200.0
+
 
 class Swing(ScenarioPart):
     """One part of an angle: an oscillation and a turn at constant rate, between `start_s` and `end_s`.
@@ -65,6 +69,17 @@ def sample_times(duration_s: float, rate_hz: float, phase: float = 0.0) -> Array
     """Stamps (k + phase) / rate in [0, duration), s, on whole nanoseconds as message stamps are."""
     t = (np.arange(np.ceil(duration_s * rate_hz)) + phase) / rate_hz
     return np.asarray(np.round(t[t < duration_s] * 1e9) / 1e9)
+
+
+def averaged_samples(rate_hz: float) -> int:
+    """Number of samples, `SENSED_HZ` or more a second, whose mean a gyro reports at a rate."""
+    return int(np.ceil(SENSED_HZ / rate_hz))
+
+
+def means(samples: Array, count: int) -> Array:
+    """Means (n, ...) of `count` consecutive samples each; those left over at the end are dropped."""
+    whole = len(samples) // count * count
+    return np.asarray(samples[:whole].reshape(-1, count, *samples.shape[1:]).mean(axis=1))
 
 
 def exposures(stamps: Array, offset: float, skew: float) -> Array:

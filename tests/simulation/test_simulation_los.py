@@ -164,3 +164,11 @@ def test_long_recordings_are_simulated_block_by_block(
         for name in ("gyro", "force", "gimbal", "error"):
             np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=0.0, atol=rounding)
         assert its_truth == pytest.approx(truth, rel=1e-12)
+
+
+def test_a_slow_gyro_is_the_mean_of_a_loop_at_200_hz() -> None:
+    """Its rates are those of the fast one, averaged, and the gimbal turns without the kinks of a loop at 25 Hz."""
+    slow, fast = (simulate_los(LosScenario(**IDEAL, gyro_rate_hz=hz, gimbal_rate_hz=200), 1)[0] for hz in (25, 200))
+    np.testing.assert_allclose(slow.gyro_t, fast.gyro_t[: 8 * len(slow.gyro_t)].reshape(-1, 8).mean(axis=1))
+    np.testing.assert_allclose(slow.gyro, fast.gyro[: 8 * len(slow.gyro_t)].reshape(-1, 8, 3).mean(axis=1))
+    np.testing.assert_allclose(slow.gimbal, fast.gimbal)

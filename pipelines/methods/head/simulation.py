@@ -31,9 +31,11 @@ from alidade.pipelines.simulation.sensors import (
     EulerMotion,
     Swing,
     Warming,
+    averaged_samples,
     by_axis,
     drift,
     exposures,
+    means,
     measured,
     read_by,
     recording_config,
@@ -254,13 +256,14 @@ def _platform_attitude(scenario: HeadScenario, t: Array) -> Array:
 
 
 def _gyro(scenario: HeadScenario, rate_hz: float, phase: float, helmet: bool) -> tuple[Array, Array]:
-    """Stamps, s, and error-free rates, rad/s, of the helmet's gyro (in v) or the platform's (in b)."""
+    """Stamps, s, and error-free mean rates, rad/s, of the helmet's gyro (in v) or the platform's (in b)."""
     t = sample_times(scenario.duration_s, rate_hz, phase)
-    edges: Array = (np.arange(len(t) + 1, dtype=float) + (phase - 0.5)) / rate_hz
+    parts = averaged_samples(rate_hz)
+    edges: Array = (np.arange(len(t) * parts + 1) / parts + (phase - 0.5)) / rate_hz
     attitude = _platform_attitude(scenario, edges)
     if helmet:
         attitude = so3.multiply(attitude, scenario.head.attitude(edges))
-    return t, so3.local(attitude[:-1], attitude[1:]) * rate_hz
+    return t, means(so3.local(attitude[:-1], attitude[1:]) * (parts * rate_hz), parts)
 
 
 def _specific_force(scenario: HeadScenario, t: Array) -> Array:

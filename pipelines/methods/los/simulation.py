@@ -3,10 +3,10 @@
 Frames as in docs/methods/los.md: b carrier, m gyro on it, c camera (x right, y along the line of sight, z up), n level
 East-North-Up, i which does not turn and is n at t = 0. The carrier's attitude is a closed-form function of time. A gyro
 sample is Log of the exact rotation over its interval, centred on its stamp, divided by the interval. The stabilisation
-loop runs at the gyro's rate, or at the least multiple of it above `_LOOP_HZ`, where the recording has means of several
+loop runs at the gyro's rate, or at its least multiple from `SENSED_HZ` on, where the recording has means of several
 samples: it turns every sample, noise and bias included, into the two gimbal rates that would hold the line of sight
-still if the gyro and the camera were mounted straight, and the gimbal turns at these rates until the next sample. Gimbal
-angles are therefore known exactly at any time. Sensors may have errors: the loop holds on to what
+still if the gyro and the camera were mounted straight, and the gimbal turns at these rates until the next sample.
+Gimbal angles are therefore known exactly at any time. Sensors may have errors: the loop holds on to what
 its gyro reads, errors included.
 """
 
@@ -36,9 +36,11 @@ from alidade.pipelines.simulation.sensors import (
     EulerMotion,
     Swing,
     Warming,
+    averaged_samples,
     by_axis,
     drift,
     exposures,
+    means,
     measured,
     read_by,
     recording_config,
@@ -49,8 +51,6 @@ from alidade.pipelines.simulation.sensors import (
 
 # Gyro samples that are simulated at once.
 _BLOCK = 100_000
-# Least rate of a stabilisation loop, Hz: at 30 Hz its steps of rate are kinks of the gimbal between encoder readings.
-_LOOP_HZ = 200.0
 
 Span = tuple[float, float]
 
@@ -181,10 +181,10 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     effects = true_values(NUISANCE, scenario, rng_of_sensors)
-    averaged = int(np.ceil(_LOOP_HZ / scenario.gyro_rate_hz))
+    averaged = averaged_samples(scenario.gyro_rate_hz)
     loop = scenario.model_copy(update={"gyro_rate_hz": averaged * scenario.gyro_rate_hz})
     motion = simulate_motion(loop, effects, rng)
-    gyro_t, gyro, force = (_means(each, averaged) for each in (motion.gyro_t, motion.gyro, motion.force))
+    gyro_t, gyro, force = (means(each, averaged) for each in (motion.gyro_t, motion.gyro, motion.force))
     image_t, cRt = targets(scenario, motion, rng)
     noise = scenario.noise
     gimbal_t, gimbal = _encoders(scenario, motion, rng)
@@ -239,12 +239,6 @@ def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np
     _shake(gyro, scenario.noise.gyro_density * np.sqrt(rate_hz), rng)
     gimbal = _stabilise(scenario, gyro_t, gyro)
     return LosMotion(edges, gimbal, gyro_t, gyro, bias, force, effects)
-
-
-def _means(samples: Array, count: int) -> Array:
-    """Means of `count` consecutive samples each, as a gyro has them that is recorded more slowly than it is used."""
-    whole = len(samples) // count * count
-    return np.asarray(samples[:whole].reshape(-1, count, *samples.shape[1:]).mean(axis=1))
 
 
 def _blocks(count: int) -> Iterator[slice]:
