@@ -18,9 +18,10 @@ from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.scenario import Positive, ScenarioPart
 
-# Hz, at which gyros sense at least, however slowly they report: over 25 ms the rotation vector per second differs from
-# the mean rate by h^2/12 w x w', 1e-4 rad/s, and a loop that steps its rates is not what encoders can follow.
-SENSED_HZ = 200.0
+# Least internal sample rate, Hz, of a gyro however slowly it reports: over h = 25 ms the rotation vector per second
+# differs from the mean rate by h^2 |w x w'| / 12, 1e-4 rad/s at 2 rad^2/s^3, and a stabilisation loop whose rates step
+# that slowly has kinks between encoder readings.
+INTERNAL_RATE_HZ = 200.0
 
 
 class Swing(ScenarioPart):
@@ -72,8 +73,8 @@ def sample_times(duration_s: float, rate_hz: float, phase: float = 0.0) -> Array
 
 
 def averaged_samples(rate_hz: float) -> int:
-    """Number of samples, `SENSED_HZ` or more a second, whose mean a gyro reports at a rate."""
-    return int(np.ceil(SENSED_HZ / rate_hz))
+    """Number of samples, `INTERNAL_RATE_HZ` or more a second, whose mean a gyro reports at a rate."""
+    return int(np.ceil(INTERNAL_RATE_HZ / rate_hz))
 
 
 def means(samples: Array, count: int) -> Array:

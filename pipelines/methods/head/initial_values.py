@@ -23,7 +23,7 @@ _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
 # Pairs of pictures from which the camera's mount, and from which the clock is estimated.
 _CAMERA_PAIRS, _CLOCK_PAIRS = 3000, 1000
-# Sigmas of chance by which a camera's mount has to explain the rates better than none.
+# Sigmas of the median misfit, a share of about 1 / sqrt(n) of it, by which a camera's mount has to fit better than none.
 _CHANCE = 3.0
 # What is estimated with the clock: a correction of the mount, rad, the gyro bias, rad/s; offset, s, and skew, s/s.
 _MOUNT, _BIAS, _CLOCK = slice(0, 3), slice(3, 6), slice(6, 8)
@@ -64,9 +64,10 @@ def guess(gyro: GyroPath, vision_t: Array, iRh: Array, sigma: float) -> tuple[Ar
 def guess_camera(gyro: GyroPath, platform: GyroPath, vision_t: Array, cRh: Array, sigma: float) -> Array:
     """Initial camera mount cRb (4,), however large, from mean rates over short windows.
 
-    The helmet's rate w, less its bias b, is as large as u + C p, with u what vision sees turn, in the camera's axes, p
-    the platform's rate and C the mount: |w|^2 - |u|^2 - |p|^2 = 2 u'C p + 2 b'w + constant, linear in C and b. It is
-    the identity unless the rates agree clearly better with that mount.
+    With u the rate of h relative to c, in c, p the platform's rate and C the mount, the rate w of the helmet's gyro
+    with its bias b has |w - b| = |u + C p|: |w|^2 - |u|^2 - |p|^2 = 2 u'C p + 2 b'w + constant, linear in C and b, with
+    the platform gyro's bias neglected. C is nearest to the identity where the motion leaves it open. The mount is the
+    identity unless the rates agree better with C by `_CHANCE` sigmas of the median misfit.
 
     Args:
         gyro, platform: integrated without any bias taken off.
@@ -80,10 +81,9 @@ def guess_camera(gyro: GyroPath, platform: GyroPath, vision_t: Array, cRh: Array
     start, stop = vision_t[i], vision_t[j]
     span = (stop - start)[:, None]
     w, p = (so3.log(each.increments(start, stop).wxyz) / span for each in (gyro, platform))
-    seen = so3.local(cRh[i], cRh[j])
-    u = so3.rotate(so3.multiply(cRh[i], so3.exp(0.5 * seen)), seen / span)
+    u = so3.rotate(cRh[i], so3.local(cRh[i], cRh[j]) / span)
     products = 2.0 * np.einsum("ni,nj->nij", u, p).reshape(-1, 9)
-    squares = (w**2).sum(axis=1) - (u**2).sum(axis=1) - (p**2).sum(axis=1)
+    squares = (w**2).sum(axis=1) - ((u + p) ** 2).sum(axis=1)
     x = np.linalg.lstsq(np.column_stack([products, 2.0 * w, np.ones(len(w))]), squares)[0]
 
     def misfit(cRb: Array) -> float:
@@ -91,9 +91,9 @@ def guess_camera(gyro: GyroPath, platform: GyroPath, vision_t: Array, cRh: Array
         bias, vRh = guess(gyro, vision_t, iRh, sigma)
         return float(np.median(np.linalg.norm(w - bias - so3.rotate(vRh, so3.local(iRh[i], iRh[j]) / span), axis=1)))
 
-    mount = so3.align(x[:9].reshape(3, 3).T, np.eye(3))
-    clearly = 1.0 - _CHANCE / np.sqrt(len(w))
-    return mount if misfit(mount) < clearly * misfit(so3.identity()) else so3.identity()
+    mount = so3.align(np.eye(3) + x[:9].reshape(3, 3).T, np.eye(3))
+    better = misfit(mount) < (1.0 - _CHANCE / np.sqrt(len(w))) * misfit(so3.identity())
+    return mount if better else so3.identity()
 
 
 def guess_picture_clock(

@@ -3,11 +3,11 @@
 Frames as in docs/methods/los.md: b carrier, m gyro on it, c camera (x right, y along the line of sight, z up), n level
 East-North-Up, i which does not turn and is n at t = 0. The carrier's attitude is a closed-form function of time. A gyro
 sample is Log of the exact rotation over its interval, centred on its stamp, divided by the interval. The stabilisation
-loop runs at the gyro's rate, or at its least multiple from `SENSED_HZ` on, where the recording has means of several
-samples: it turns every sample, noise and bias included, into the two gimbal rates that would hold the line of sight
-still if the gyro and the camera were mounted straight, and the gimbal turns at these rates until the next sample.
-Gimbal angles are therefore known exactly at any time. Sensors may have errors: the loop holds on to what
-its gyro reads, errors included.
+loop runs at the gyro's rate or, below `INTERNAL_RATE_HZ`, at its least multiple from there on, and what is recorded is
+the mean of so many samples of the loop: it turns every sample, noise and bias included, into the two gimbal rates that
+would hold the line of sight still if the gyro and the camera were mounted straight, and the gimbal turns at these rates
+until the next sample. Gimbal angles are therefore known exactly at any time. Sensors may have errors: the loop holds on
+to what its gyro reads, errors included.
 """
 
 from __future__ import annotations
@@ -178,12 +178,9 @@ class LosMotion:
 
 def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, float]]:
     """Simulate a session; return it with the true parameters (rad, rad/s, s; a walking bias as its mean)."""
-    # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
-    rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-    effects = true_values(NUISANCE, scenario, rng_of_sensors)
+    rng_of_sensors = np.random.default_rng([seed, 1])
+    motion, rng = _drawn(scenario, seed, rng_of_sensors)
     averaged = averaged_samples(scenario.gyro_rate_hz)
-    loop = scenario.model_copy(update={"gyro_rate_hz": averaged * scenario.gyro_rate_hz})
-    motion = simulate_motion(loop, effects, rng)
     gyro_t, gyro, force = (means(each, averaged) for each in (motion.gyro_t, motion.gyro, motion.force))
     image_t, cRt = targets(scenario, motion, rng)
     noise = scenario.noise
@@ -212,6 +209,18 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
         temperature=measured(scenario.temperature, scenario.duration_s),
     )
     return data, _truth(scenario, motion)
+
+
+def _drawn(
+    scenario: LosScenario, seed: int, rng_of_sensors: np.random.Generator
+) -> tuple[LosMotion, np.random.Generator]:
+    """Simulate the motion at the loop's rate; return it with the generator of the noise that follows.
+
+    What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
+    """
+    rng, rate_hz = np.random.default_rng(seed), averaged_samples(scenario.gyro_rate_hz) * scenario.gyro_rate_hz
+    effects = true_values(NUISANCE, scenario, rng_of_sensors)
+    return simulate_motion(scenario.model_copy(update={"gyro_rate_hz": rate_hz}), effects, rng), rng
 
 
 def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np.random.Generator) -> LosMotion:
@@ -305,10 +314,7 @@ def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulat
 
 def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
     """Render the pictures of `simulate_los` with the same seed, one by one."""
-    rng = np.random.default_rng(seed)
-    rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(NUISANCE, scenario, rng_of_sensors)
-    motion = simulate_motion(scenario, effects, rng)
+    motion, rng = _drawn(scenario, seed, np.random.default_rng([seed, 1]))
     stamps, cRt = targets(scenario, motion, rng)
     if scenario.losses:
         raise InputError("losses: pictures are simulated of a single target; leave out --images")

@@ -69,6 +69,8 @@ _ROUNDS = 3
 # soft iron of .1, and a mount off by 10 deg.
 _AS_NEAR = 0.1
 _SIGNS = tuple(product((1.0, -1.0), repeat=3))
+# Pairs of an accelerometer's samples from which it is calibrated roughly.
+_FORCE_PAIRS = 5000
 # What part of the field's direction the first guess of attitudes takes at each keyframe.
 _GAIN = 0.2
 
@@ -77,7 +79,7 @@ _GAIN = 0.2
 class Seen:
     """Measured directions of a sensor: time (n,) s, unit direction (n, 3) in b, and all samples `whole` (m, 3), SI.
 
-    strength: of what it measures. swung: whether it is used while it moves.
+    strength: of what it measures; swung: whether it is used while it moves.
     """
 
     time: Array
@@ -234,12 +236,16 @@ def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple
     return determined, FieldGuess(K / (size * radius), (b - K @ centre / radius) / size, bias, sigma, assumed)
 
 
-def _pairs(time: Array, span: float, gyro: Array) -> tuple[Index, Index]:
-    """Indices of reading pairs about `span` s apart, within the gyro's record and without gaps between."""
+def _pairs(time: Array, span: float, gyro: Array, most: int | None = None) -> tuple[Index, Index]:
+    """Indices of reading pairs about `span` s apart, within the gyro's record and without gaps between.
+
+    `most`: about how many at most; None: all.
+    """
     inside, interval = _inside(time, gyro), float(np.median(np.diff(time)))
     stride = max(1, round(span / max(interval, 1e-3)))
     first, last = inside[:-stride], inside[stride:]
-    near = time[last] - time[first] < 2.0 * max(span, interval)
+    near = np.flatnonzero(time[last] - time[first] < 2.0 * max(span, interval))
+    near = near[:: 1 if most is None else -(-len(near) // most) or 1]
     return first[near], last[near]
 
 
@@ -287,28 +293,35 @@ def _right_angles() -> Array:
     return np.array([each for each in signed if np.linalg.det(each) > 0.0])
 
 
-def _force(time: Array, accel: Seen, path: GyroPath) -> Array:
+def calibrated_force(time: Array, accel: Seen, path: GyroPath) -> Array:
     """Specific force (m, 3), m/s^2, in b by the samples (m,) s of an accelerometer that is swung, roughly calibrated.
 
-    Without its lever arm's part it is constant in space: K and b as of the magnetometer, from samples far enough apart
-    that motion is small beside what gravity changes. An offset b left in it would be G b in the gyro's bias.
+    Without its lever arm's part it is constant in space: K and b as of the magnetometer, from samples so far apart that
+    motion is small beside what gravity changes. An offset b left in it would be G b in the gyro's bias. It stays as it
+    is where the motion leaves several K, or none whose force is more even in size.
 
     Args:
         time: of all samples.
-        accel: what they are as recorded.
+        accel: with all samples at the first guess, nearly along the axes of b.
         path: of the gyro.
     """
-    first, last = _pairs(time, _SPANS[-2], path.t)
+    span, size = _SPANS[-2], accel.strength
+    first, last = _pairs(time, span, path.t, _FORCE_PAIRS)
     if len(first) < _FEWEST:
         return accel.whole
-    dR = so3.matrix(path.increments(time[first], time[last]).wxyz)
-    rate, change = so3.hat(path.rate(time)), so3.hat(path.acceleration(time)[0])
-    by_arm = change + rate @ rate
-    x = accel.whole / accel.strength
-    alike = _alike(time, len(first), _SPANS[-2])
-    K, b, *_ = _homogeneous(dR, x[first], x[last], alike, by_arm[first] - dR @ by_arm[last])
+    dR, x = so3.matrix(path.increments(time[first], time[last]).wxyz), accel.whole / size
+
+    def by_arm(t: Array) -> Array:
+        rate = so3.hat(path.rate(t))
+        return so3.hat(path.acceleration(t)[0]) + rate @ rate
+
+    arm = by_arm(time[first]) - dR @ by_arm(time[last])
+    K, b, several, _ = _homogeneous(dR, x[first], x[last], _alike(time, len(first), span), arm)
     force = np.sign(np.trace(K)) * (x @ K.T + b)
-    return np.asarray(force * accel.strength / np.linalg.norm(force, axis=1).mean())
+    lengths, before = (np.linalg.norm(each, axis=1) for each in (force, x))
+    if several or lengths.std() / lengths.mean() > before.std() / before.mean():
+        return accel.whole
+    return np.asarray(force * size / lengths.mean())
 
 
 def turning(
@@ -331,7 +344,7 @@ def turning(
     drivers: dict[ParameterSpec, Array] = {}
     if accel is not None and data.accel_t is not None:
         path = GyroPath(data.gyro_t, data.gyro, guess.bias)
-        force = _force(data.accel_t, accel, path) if accel.swung else accel.whole
+        force = calibrated_force(data.accel_t, accel, path) if accel.swung else accel.whole
         drivers[SENSITIVITY] = interpolated(data.gyro_t, data.accel_t, force)
     if data.temperature is not None:
         drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)

@@ -179,13 +179,27 @@ def test_too_few_frames_is_one_clear_line() -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("mount_deg", [(5.0, 103.0, 115.0), (-101.0, 17.0, -22.0), (0.0, 0.0, 0.0)])
+def _guessed(mount_deg: tuple[float, float, float], **changes: object) -> np.ndarray:
+    """First guess of the camera's mount, rotation vector, deg."""
+    data, _ = made(helmet_mount_deg=(-46.0, 128.0, 29.0), camera_mount_deg=mount_deg, **changes)
+    guessed = problem(data, Config()).graph()[1].atRot3(gtsam.symbol("C", 0))
+    return np.rad2deg(so3.log(so3.from_gtsam([guessed])[0]))
+
+
+@pytest.mark.parametrize("mount_deg", [(5.0, 103.0, 115.0), (-101.0, 17.0, -22.0)])
 def test_the_first_guess_finds_a_camera_at_any_angle(mount_deg: tuple[float, float, float]) -> None:
     """As far as 12 s of noisy rates allow, where from zero the solution was missed by 154 deg."""
-    data, _ = made(helmet_mount_deg=(-46.0, 128.0, 29.0), camera_mount_deg=mount_deg)
-    guessed = problem(data, Config()).graph()[1].atRot3(gtsam.symbol("C", 0))
-    off = so3.local(so3.exp(np.deg2rad(mount_deg)), so3.from_gtsam([guessed])[0])
+    off = so3.local(*so3.exp(np.deg2rad([mount_deg, _guessed(mount_deg)])))
     assert np.linalg.norm(off) < np.deg2rad(25.0)
+
+
+def test_the_first_guess_turns_no_camera_by_what_the_platform_leaves_open() -> None:
+    """A platform that only yaws does not show how far its camera is turned about the vertical."""
+    platform = scenario().platform
+    assert platform is not None
+    yawing = platform.model_copy(update={"pitch": [], "roll": []}).model_dump()
+    for seed_mount in ((20.0, -15.0, 10.0), (0.0, 0.0, 60.0)):
+        assert np.linalg.norm(_guessed(seed_mount, platform=yawing)) < 45.0
 
 
 def test_a_camera_at_any_angle_is_calibrated() -> None:
