@@ -23,7 +23,7 @@ _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
 # Pairs of pictures from which the camera's mount, and from which the clock is estimated.
 _CAMERA_PAIRS, _CLOCK_PAIRS = 3000, 1000
-# Sigmas of the median misfit, a share of about 1 / sqrt(n) of it, by which a camera's mount has to fit better than none.
+# Sigmas of the median misfit, each 1 / sqrt(n) of it, by which a camera's mount has to fit better than none.
 _CHANCE = 3.0
 # What is estimated with the clock: a correction of the mount, rad, the gyro bias, rad/s; offset, s, and skew, s/s.
 _MOUNT, _BIAS, _CLOCK = slice(0, 3), slice(3, 6), slice(6, 8)

@@ -189,7 +189,7 @@ def _guessed(mount_deg: tuple[float, float, float], **changes: object) -> np.nda
 @pytest.mark.parametrize("mount_deg", [(5.0, 103.0, 115.0), (-101.0, 17.0, -22.0)])
 def test_the_first_guess_finds_a_camera_at_any_angle(mount_deg: tuple[float, float, float]) -> None:
     """As far as 12 s of noisy rates allow, where from zero the solution was missed by 154 deg."""
-    off = so3.local(*so3.exp(np.deg2rad([mount_deg, _guessed(mount_deg)])))
+    off = so3.local(so3.exp(np.deg2rad(mount_deg)), so3.exp(np.deg2rad(_guessed(mount_deg))))
     assert np.linalg.norm(off) < np.deg2rad(25.0)
 
 
