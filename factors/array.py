@@ -1,4 +1,4 @@
-"""Types of arrays, by what they hold: numbers, indexes, yes or no; and linear interpolation of their rows."""
+"""Array types (numbers, indices, masks), and linear interpolation between the rows of an array."""
 
 from __future__ import annotations
 

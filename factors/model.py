@@ -117,7 +117,7 @@ class Model:
         return self
 
     def at_noise(self, _: Array) -> Model:
-        """Return the model for noise 1 / weights (n, m) times that of its whitening; itself if independent of it."""
+        """Return the model where noise sigmas are 1 / weights (n, m) times those stated; itself if it needs none."""
         return self
 
     def on(
@@ -167,7 +167,7 @@ class WrappedModel(Model):
         return tuple(self.model.blocks)
 
     def at_noise(self, weights: Array) -> Model:
-        """Return the model with the wrapped one for noise 1 / weights (n, m) times that of its whitening."""
+        """Return the wrapper around its model where noise sigmas are 1 / weights (n, m) times those stated."""
         model = self.model.at_noise(weights)
         return self if model is self.model else replace(self, model=model)
 

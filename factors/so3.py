@@ -189,7 +189,7 @@ def log(q: ArrayLike) -> Array:
 
 
 def local(p: ArrayLike, q: ArrayLike) -> Array:
-    """Rotation vectors v (..., 3), rad, from p to q in p's axes: q = p Exp(v), as gtsam's localCoordinates."""
+    """Rotation vectors v (..., 3), rad, from attitudes p to q (..., 4), in the axes of p: q = p Exp(v)."""
     return log(multiply(inverse(p), q))
 
 

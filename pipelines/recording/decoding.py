@@ -340,7 +340,7 @@ def is_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
 
 
 def one_clock(stamps: Stamps, log_ns: Stamps) -> tuple[NDArray[np.bool_], int]:
-    """Mask (N,) of the messages that are kept, and how many of these have no stamp: with any, all get log times."""
+    """Choose a topic's clock: mask (N,) of messages kept, and how many of these lack a stamp; if any: log time."""
     without = is_unstamped(stamps, log_ns)
     count = int(np.count_nonzero(without))
     return (~without, 0) if count <= MAX_UNSTAMPED_SHARE * len(without) else (np.ones_like(without), count)

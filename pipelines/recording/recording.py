@@ -207,7 +207,7 @@ class Recording:
         self._times.clear()
 
     def stamps(self, block: MessageBlock) -> NDArray[np.int64]:
-        """Return the stamps of a block's messages, Unix ns; log times of a topic whose samples have these."""
+        """Return the stamps (N,) of a block's messages, Unix ns; log times where the topic is read by log time."""
         stamps = self._formats[block.channel].stamps(block)
         return block.log_ns if self.container.channels[block.channel].topic in self._by_log else stamps
 

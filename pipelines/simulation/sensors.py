@@ -73,12 +73,12 @@ def sample_times(duration_s: float, rate_hz: float, phase: float = 0.0) -> Array
 
 
 def averaged_samples(rate_hz: float) -> int:
-    """Number of samples, `INTERNAL_RATE_HZ` or more a second, whose mean a gyro reports at a rate."""
+    """Number of internal samples, at `INTERNAL_RATE_HZ` or more, that a gyro averages into a reading at `rate_hz`."""
     return int(np.ceil(INTERNAL_RATE_HZ / rate_hz))
 
 
 def means(samples: Array, count: int) -> Array:
-    """Means (n, ...) of `count` consecutive samples each; those left over at the end are dropped."""
+    """Average samples (N, ...) in groups of `count` consecutive ones, (n, ...); an incomplete last group is dropped."""
     whole = len(samples) // count * count
     return np.asarray(samples[:whole].reshape(-1, count, *samples.shape[1:]).mean(axis=1))
 

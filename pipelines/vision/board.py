@@ -13,7 +13,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose
-from alidade.pipelines.vision.tags import UNREADABLE, Detections, detections
+from alidade.pipelines.vision.tags import UNREADABLE, Detections, detections, edge_lengths
 
 # A picture's own attitude settles the flips of the pictures up to this much later.
 _FRESH_NS = 200_000_000
@@ -81,7 +81,7 @@ def _problem(pose: BodyPose | None, found: Detections, sigma_px: float | None) -
     if pose is None:
         return UNSEEN
     corners = found.corners[np.isin(found.ids, pose.ids)]
-    side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+    side = float(edge_lengths(corners).mean())
     if pose.rms_px > max(_MISFIT_SIGMAS * (sigma_px or 0.0), _MISFIT_PX, _MISFIT_SHARE * side):
         return MISFIT
     return AMBIGUOUS if pose.ambiguous else None

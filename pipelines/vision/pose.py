@@ -15,7 +15,7 @@ from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.tags import Detections
+from alidade.pipelines.vision.tags import Detections, edge_lengths
 
 if TYPE_CHECKING:
     from alidade.pipelines.settings import Board
@@ -272,8 +272,7 @@ def estimate_pose(
         return None
     sigma, is_raised = (float(np.sqrt(variance)), True) if sigma_px is None else (sigma_px, False)
     solution = _solve(camera, tags, pixels, sigma, is_raised, expected)
-    edges = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).mean(axis=1)
-    expected_px = np.hypot(sigma, body.accuracy * float((edges / tags.size).mean()))
+    expected_px = np.hypot(sigma, body.accuracy * float((edge_lengths(pixels) / tags.size).mean()))
     if solution is None or len(use) < 3 or solution.rms_px < _WRONG_SIGMAS * expected_px:
         return solution
     # One wrong tag spoils the fit of all: it is the one without which the others agree.

@@ -72,6 +72,11 @@ class Detections:
         return len(self.ids)
 
 
+def edge_lengths(corners: Array) -> Array:
+    """Mean length (n,) of the four edges of each tag, px, from its corners (n, 4, 2)."""
+    return np.asarray(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1))
+
+
 def detect(picture: Picture, family: str = "36h11", camera: Camera | None = None) -> Detections:
     """Find the tags of a family in a grey picture (height, width) and measure their corners.
 

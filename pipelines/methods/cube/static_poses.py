@@ -246,6 +246,7 @@ def _seen_in(
 ) -> SeenTags | None:
     """Tags that fit the pose; misfits are counted in `wrong`."""
     from alidade.pipelines.vision.pose import estimate_pose
+    from alidade.pipelines.vision.tags import edge_lengths
 
     assert data.camera is not None
     if not len(tags.ids):
@@ -255,7 +256,7 @@ def _seen_in(
     if pose is None or pose.ambiguous:
         count(dropped, "static pose with its tags' planar flip unresolved" if pose else "static pose not solved", 1)
         return None
-    side = np.linalg.norm(tags.corners - np.roll(tags.corners, 1, axis=1), axis=2).mean()
+    side = edge_lengths(tags.corners).mean()
     misfit = bool((pose.tag_rms_px > _MISFIT_SHARE * side).any())
     # Of two tags that disagree either may be the wrong one.
     for tag in [*pose.rejected, *(pose.ids.tolist() if misfit else [])]:

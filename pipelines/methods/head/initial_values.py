@@ -62,7 +62,7 @@ def guess(gyro: GyroPath, vision_t: Array, iRh: Array, sigma: float) -> tuple[Ar
 
 
 def guess_camera(gyro: GyroPath, platform: GyroPath, vision_t: Array, cRh: Array, sigma: float) -> Array:
-    """Initial camera mount cRb (4,), however large, from mean rates over short windows.
+    """Estimate a first camera mount cRb (4,), however large, from mean rates of gyros and vision over short windows.
 
     With u the rate of h relative to c, in c, p the platform's rate and C the mount, the rate w of the helmet's gyro
     with its bias b has |w - b| = |u + C p|: |w|^2 - |u|^2 - |p|^2 = 2 u'C p + 2 b'w + constant, linear in C and b, with

@@ -214,7 +214,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
 def _drawn(
     scenario: LosScenario, seed: int, rng_of_sensors: np.random.Generator
 ) -> tuple[LosMotion, np.random.Generator]:
-    """Simulate the motion at the loop's rate; return it with the generator of the noise that follows.
+    """Simulate carrier and gimbal at the stabilisation loop's rate; also return the generator for the sensors' noise.
 
     What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     """

@@ -250,7 +250,7 @@ def _pairs(time: Array, span: float, gyro: Array, most: int | None = None) -> tu
 
 
 def _alike(time: Array, pairs: int, span: float) -> float:
-    """Ratio of misfits up to which solutions from so many pairs of readings `span` s apart fit equally well."""
+    """Ratio of RMS misfits up to which two solutions fit equally well, from `pairs` of readings (n,) `span` s apart."""
     independent = 3.0 * pairs * min(1.0, float(np.median(np.diff(time))) / span)
     return float(1.0 + _CHANCE * np.sqrt(2.0 / independent))
 
@@ -258,7 +258,7 @@ def _alike(time: Array, pairs: int, span: float) -> float:
 def _homogeneous(
     R: Array, before: Array, after: Array, alike: float, beside: Array | None = None
 ) -> tuple[Array, Array, bool, float]:
-    """Solve K before + b = R (K after + b) + beside a for K (3, 3) of unit norm and b (3,), whatever a is.
+    """Solve K before + b = R (K after + b) + beside a for K (3, 3) of unit norm, b (3,) and any a.
 
     Of several K whose misfits are less than `alike` times the smallest it is that of a sensor mounted straight.
 
@@ -294,14 +294,14 @@ def _right_angles() -> Array:
 
 
 def calibrated_force(time: Array, accel: Seen, path: GyroPath) -> Array:
-    """Specific force (m, 3), m/s^2, in b by the samples (m,) s of an accelerometer that is swung, roughly calibrated.
+    """Calibrate the samples of a moving accelerometer roughly: specific force (m, 3), m/s^2, in the body's axes b.
 
     Without its lever arm's part it is constant in space: K and b as of the magnetometer, from samples so far apart that
     motion is small beside what gravity changes. An offset b left in it would be G b in the gyro's bias. It stays as it
     is where the motion leaves several K, or none whose force is more even in size.
 
     Args:
-        time: of all samples.
+        time: (m,) s, of all samples.
         accel: with all samples at the first guess, nearly along the axes of b.
         path: of the gyro.
     """
@@ -343,8 +343,9 @@ def turning(
     walk = walking(config)
     drivers: dict[ParameterSpec, Array] = {}
     if accel is not None and data.accel_t is not None:
-        path = GyroPath(data.gyro_t, data.gyro, guess.bias)
-        force = calibrated_force(data.accel_t, accel, path) if accel.swung else accel.whole
+        force = accel.whole
+        if accel.swung:
+            force = calibrated_force(data.accel_t, accel, GyroPath(data.gyro_t, data.gyro, guess.bias))
         drivers[SENSITIVITY] = interpolated(data.gyro_t, data.accel_t, force)
     if data.temperature is not None:
         drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)
