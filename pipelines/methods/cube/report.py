@@ -1,4 +1,4 @@
-"""Results of the cube method: formulas, tables, figures, validation.
+"""Results of the cube method: formulas, tables, figures, uses, validation.
 
 Frames: b cube's body, B reference, C camera, n level. Methods page, section 4.
 """
@@ -17,6 +17,7 @@ from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
+from alidade.pipelines.diagnostics.use import Truth, Use
 from alidade.pipelines.display.figure import BEFORE, COLORS, GRID, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, sphere_map, widest_gap
 from alidade.pipelines.display.table import Table
@@ -36,7 +37,6 @@ from alidade.pipelines.methods.cube.recording import (
     recorded,
 )
 from alidade.pipelines.methods.cube.static_poses import StaticPoses, static_poses
-from alidade.pipelines.methods.cube.uses import uses
 from alidade.pipelines.methods.formula import Formula, apply, matrix_text, temperature_text, vector_text
 from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.methods.temperature import FIRST
@@ -49,6 +49,7 @@ from alidade.pipelines.methods.triads import (
     triad_formula,
     triad_names,
 )
+from alidade.pipelines.methods.uses import along, raw_of, triad_uses
 from alidade.pipelines.recording.topics import IMU, MAG
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
@@ -595,6 +596,27 @@ def _static_poses(calibration: Calibration) -> Table:
         ("pose", "from, s", "to, s", "up", "not used"),
         tuple(rows),
     )
+
+
+def uses(true: Truth, config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
+    """Uses of a cube calibration: heading, rate and specific force."""
+    raw = config.section(CubeConfig).raw
+
+    def readings(true: Truth, ideal: Mapping[str, Array]) -> dict[str, Array]:
+        found = {}
+        if "mag" in ideal:
+            found["mag"] = raw_of(true, "mag", ideal["mag"])
+        if "accel" in ideal and "accel_k11" in true:
+            u = nominal(raw_of(true, "accel", ideal["accel"]), raw.accel)
+            square, cube = (true.vector(*each.names)[..., None, :] for each in (SQUARE, CUBE))
+            found["accel"] = recorded(u * (1.0 + u * (square + u * cube)), raw.accel)
+        if "gyro" in ideal:
+            sensitivity = true.matrix([[f"gyro_g_{i}{j}" for j in "xyz"] for i in "xyz"])
+            u = nominal(raw_of(true, "gyro", ideal["gyro"]), raw.gyro) + along(sensitivity, ideal["accel"])
+            found["gyro"] = recorded(u, raw.gyro)
+        return found
+
+    return triad_uses(true, readings)
 
 
 CARDS = {

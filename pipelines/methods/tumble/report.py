@@ -1,4 +1,4 @@
-"""Results of the tumble method: formulas, iron in plain words, directions covered, figures, validation.
+"""Results of the tumble method: formulas, iron in plain words, directions covered, figures, uses, validation.
 
 Frame b: the axes in which the first of these is symmetric that there is: the gyro's errors, the K of the accelerometer,
 the magnetometer's.
@@ -6,13 +6,14 @@ the magnetometer's.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.cross_validation import Validation
+from alidade.pipelines.diagnostics.use import Truth, Use
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, share_near, sphere_map, widest_gap
 from alidade.pipelines.display.table import Column, Table
@@ -35,7 +36,7 @@ from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.parameters import STRENGTHS
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData
 from alidade.pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
-from alidade.pipelines.methods.tumble.uses import uses
+from alidade.pipelines.methods.uses import G, gyro_reading, raw_of, triad_uses
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -285,6 +286,23 @@ def validate(data: TumbleData, config: Config, values: Mapping[str, float]) -> l
         found.append(Validation(_STRENGTH_OF[sensor.name], sensor.unit, sensor.time, before[:, None], after[:, None]))
     if not found:
         raise InputError("the calibration is of none of the sensors in the recording")
+    return found
+
+
+def uses(true: Truth, _config: Config, _noise: Mapping[str, float]) -> Sequence[Use]:
+    """Uses of a tumble calibration: heading, rate and specific force."""
+    return triad_uses(true, _readings)
+
+
+def _readings(true: Truth, nominal: Mapping[str, Array]) -> dict[str, Array]:
+    found = {}
+    if "mag" in nominal:
+        found["mag"] = raw_of(true, "mag", nominal["mag"])
+    if "accel" in nominal and "accel_k11" in true:
+        f = nominal["accel"]
+        found["accel"] = raw_of(true, "accel", f + true.vector(*ACCEL_SQUARE.names)[..., None, :] * f**2)
+    if "gyro" in nominal:
+        found["gyro"] = gyro_reading(true, nominal["gyro"], nominal.get("accel", np.array([0.0, 0.0, G])))
     return found
 
 
