@@ -25,7 +25,7 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.published import ellipsoid
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 from alidade.pipelines.methods.tumble.turning import SCALE
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch

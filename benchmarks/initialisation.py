@@ -29,12 +29,12 @@ from alidade.factors.indexer import mounting_angles
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.estimation.problem import Estimate, Problem, Step, rotation_vector_coordinates
-from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.cube.simulation import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario
 from alidade.pipelines.methods.triads import triad_names
-from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch

@@ -738,8 +738,7 @@ def cube_layout(
     """
     from alidade.pipelines.config import configured
     from alidade.pipelines.methods.cube.layout import cube_layout as estimate
-    from alidade.pipelines.methods.cube.layout import layout_yaml
-    from alidade.pipelines.methods.cube.layout_page import layout_json, layout_report
+    from alidade.pipelines.methods.cube.layout import layout_json, layout_report, layout_yaml
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.whole import write_file

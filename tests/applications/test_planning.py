@@ -15,9 +15,8 @@ from alidade.pipelines.applications.planning import Prediction, predict, require
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.cube.faces import Resting, Side
 from alidade.pipelines.methods.cube.guidance import next_poses
-from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.cube.simulation import CubeScenario, Resting, Side
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.html import render_html

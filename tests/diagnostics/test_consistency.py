@@ -27,8 +27,7 @@ from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Estimate, Problem, Residuals, Step
 from alidade.pipelines.methods import Method, method
 from alidade.pipelines.methods.cube.recording import CubeConfig
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.methods.head.guidance import FAULTS
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from alidade.pipelines.applications.planning import Prediction, predict
-from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.cube.simulation import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position
 from alidade.pipelines.methods.los.simulation import LosScenario

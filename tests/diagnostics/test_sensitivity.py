@@ -17,7 +17,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.fault_models import ExactInput
 from alidade.pipelines.estimation.problem import Estimate, Factor, Step
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.cube.simulation import CubeScenario
 from alidade.pipelines.methods.indexer.guidance import FAULTS
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.result import Calibration

@@ -10,7 +10,7 @@ import pytest
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
-from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 
 Array = np.ndarray
 TUMBLE = method("tumble")

@@ -14,7 +14,7 @@ from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.tumble.recording import tumble_topics
-from alidade.pipelines.methods.tumble.scenario import (
+from alidade.pipelines.methods.tumble.simulation import (
     TumbledAccelerometer,
     TumbledGyro,
     TumbledMagnetometer,

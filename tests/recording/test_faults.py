@@ -22,7 +22,7 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, head_config,
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.recording import read_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledGyro
+from alidade.pipelines.methods.tumble.simulation import TumbledAccelerometer, TumbledGyro
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config

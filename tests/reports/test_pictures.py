@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.display.drawing import along, covered, swaying
-from alidade.pipelines.methods.cube.faces import SIDES, Side
 from alidade.pipelines.methods.cube.guidance import rested
+from alidade.pipelines.methods.cube.simulation import SIDES, Side
 from alidade.pipelines.methods.indexer.guidance import turning
 
 

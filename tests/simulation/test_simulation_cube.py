@@ -12,18 +12,18 @@ from alidade.factors.earth import earth_rate, gravity, magnetic_field
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.methods.cube.faces import Resting
 from alidade.pipelines.methods.cube.recording import CubeConfig, read_cube
-from alidade.pipelines.methods.cube.scenario import (
+from alidade.pipelines.methods.cube.simulation import (
     CubeCamera,
     CubeNoise,
     CubeScenario,
     Errors,
     FieldErrors,
     ReferenceAttitude,
+    Resting,
     cube_config,
+    simulate_cube,
 )
-from alidade.pipelines.methods.cube.simulation import simulate_cube
 from alidade.pipelines.methods.cube.static_poses import static_intervals, static_poses
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import YEAR, load_scenario

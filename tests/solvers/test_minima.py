@@ -12,7 +12,7 @@ import pytest
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.estimation.problem import Problem, Step
-from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
+from alidade.pipelines.methods.tumble.simulation import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
 from alidade.pipelines.solvers.batch import CLOSE, solve_batch
 from alidade.pipelines.solvers.engines import ALL, Compiled
 

@@ -15,8 +15,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube import model as cube
-from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube, simulated
+from alidade.pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube, simulated
 from alidade.pipelines.methods.indexer import model as indexer
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los import model as los

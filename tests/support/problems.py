@@ -8,11 +8,11 @@ from typing import Any
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.cube.simulation import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario
 from alidade.pipelines.methods.los.simulation import LosScenario
-from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 from tests.support.short_problems import COARSE, HEAD, LOS
 
 _WALK = {"gyro_density": 1e-5, "gyro_bias_walk": 1e-6}

@@ -17,10 +17,8 @@ from alidade.pipelines.display.drawing import covered, resting, swaying
 from alidade.pipelines.display.figure import AXES
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.methods import Guidance, Scenario
-from alidade.pipelines.methods.cube.faces import SIDES, Resting, Side
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData
-from alidade.pipelines.methods.cube.scenario import CubeScenario
-from alidade.pipelines.methods.cube.simulation import attitudes
+from alidade.pipelines.methods.cube.simulation import SIDES, CubeScenario, Resting, Side, attitudes
 from alidade.pipelines.methods.cube.static_poses import static_poses
 from alidade.pipelines.methods.place import STRENGTH_ADVICE
 from alidade.pipelines.settings import Config

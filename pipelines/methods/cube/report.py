@@ -23,6 +23,7 @@ from alidade.pipelines.display.sphere_map import described, sphere_map, widest_g
 from alidade.pipelines.display.table import Table
 from alidade.pipelines.display.units import rounded
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.parameters import SENSOR_NAMES
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods import Report, temperature
 from alidade.pipelines.methods.cube.model import noises
@@ -366,7 +367,7 @@ def _before_and_after(name: str, time: Array, before: Array, after: Array) -> Pl
     what = "Rotation over each turn, against the attitudes found" if name == "gyro" else "Mean of each static pose"
     against = "" if name == "gyro" else " against what it should say at the attitude found"
     return Plot(
-        f"{NAMES[name].capitalize()} before and after",
+        f"{SENSOR_NAMES[name].capitalize()} before and after",
         f"{what}{against}: {rounded(rms[0], 3)} {unit} RMS as recorded, {rounded(rms[1], 3)} {unit} calibrated.",
         out,
     )
@@ -410,7 +411,7 @@ def _sphere(
     lengths.levels(0.0, GRID, "solid")
     rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
     return Plot(
-        f"Sphere of the {NAMES[name]}",
+        f"Sphere of the {SENSOR_NAMES[name]}",
         f"Means of the static poses over the strength they should have, seen along z and along y, and below how far "
         f"their lengths are off: {rounded(rms[0])} % RMS as recorded, {rounded(rms[1])} % calibrated.",
         views[0],
@@ -529,7 +530,6 @@ def coverage(calibration: Calibration) -> Plot | None:
     )
 
 
-NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 _NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg(60.0)), "mag": ("nT/√Hz", 1e9)}
 
 
@@ -553,7 +553,9 @@ def _noise_table(calibration: Calibration) -> Table:
     for row in rows_of(calibration, "noise"):
         unit, factor = _NOISE[row["sensor"]]
         axes = (f"{factor * density:.3g}" for density in row["density"])
-        rows.append((NAMES[row["sensor"]], *axes, f"{factor * row['stated']:.3g}", unit, f"{row['rate_hz']:.5g}"))
+        rows.append(
+            (SENSOR_NAMES[row["sensor"]], *axes, f"{factor * row['stated']:.3g}", unit, f"{row['rate_hz']:.5g}")
+        )
     return Table(
         "White noise at rest",
         "With K applied, from the Allan deviation over a quarter of a second in the static poses; stated is what "

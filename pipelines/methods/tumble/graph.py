@@ -9,22 +9,29 @@ chains the attitudes (`chained`): each sample of the field then gives three resi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, product
 
 import gtsam
 import numpy as np
 
+from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.factors.chi_square import gate
 from alidade.factors.ellipsoid import DipFactor, StrengthFactor, entries
 from alidade.factors.loss import TruncatedLoss
+from alidade.factors.turned import FieldFactor, UpFactor
+from alidade.pipelines.display.drawing import swaying
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.gyro_chain import LAYOUT
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import ChainLayout, Factor, Problem, Step
+from alidade.pipelines.estimation.parameters import SENSOR_NAMES
+from alidade.pipelines.estimation.priors import rotation_about, vector_prior
+from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
-from alidade.pipelines.methods.tumble.chained import FAMILIES, advice, chained
+from alidade.pipelines.methods.place import STRENGTH_ADVICE
 from alidade.pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
 from alidade.pipelines.methods.tumble.parameters import (
     DIP_KEY,
@@ -35,6 +42,7 @@ from alidade.pipelines.methods.tumble.parameters import (
     variables,
 )
 from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.methods.tumble.turning import DELAY_KEY, FILTER_KEY, FieldGuess, Rows, Seen, Turning, turning
 from alidade.pipelines.methods.tumble.unturned import check_turned, unturned
 from alidade.pipelines.settings import Config
 
@@ -141,7 +149,7 @@ def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]
         sensor.time[rows], sensor.scaled[rows], sensor.sigma[rows], sensor.excess[rows], sensor.symmetric, drivers
     )
     keys = TRIAD_KEYS[sensor.name], STRENGTH_KEYS[sensor.name], *([] if drivers is None else [SLOPE_KEY])
-    return [Factor.of(FAMILIES[sensor.name], factor.on(*keys, loss=loss))]
+    return [Factor.of(SENSOR_NAMES[sensor.name], factor.on(*keys, loss=loss))]
 
 
 def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: TruncatedLoss) -> list[Factor]:
@@ -154,3 +162,177 @@ def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: Tru
     )
     keys = TRIAD_KEYS["accel"], TRIAD_KEYS["mag"], DIP_KEY, *([] if drivers is None else [SLOPE_KEY])
     return [Factor.of("dip", factor.on(*keys, loss=loss))]
+
+
+# -- with a gyro, whose attitudes at keyframes are states
+
+# Prior sigma of the first attitude, rad: as good as none. A magnetometer alone leaves its rotation about the field,
+# which is y then, undetermined: it is fixed to this, and the earth's rate is in the axes that follow.
+_ANY_ATTITUDE, _FIXED = np.pi, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """Common inputs of all steps: sensors by name, chain, shared variables, robust loss."""
+
+    sensors: Mapping[str, Sensor]
+    turning: Turning
+    shared: tuple[Variable, ...]
+    loss: TruncatedLoss
+
+
+def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variable, ...]) -> Problem:
+    """Build the graph of a recording with a gyro, whose mounting the model's first guess gives."""
+    assert model.guess is not None
+    assert model.dip is not None
+    sensors = {sensor.name: sensor for sensor in model.sensors}
+    accel = sensors.get("accel")
+    turned = turning(
+        data,
+        config,
+        model.guess,
+        _seen(sensors["mag"], data.mag),
+        None if accel is None else _seen(accel, data.accel),
+        model.declination,
+        model.dip.start,
+    )
+    graph = _Graph(sensors, turned, shared, TruncatedLoss(gate(3)))
+    return Problem(
+        method="tumble",
+        parameters=(*(each.parameter for each in shared), *turned.parameters),
+        steps=partial(_keyframe_steps, graph),
+        loss=graph.loss,
+        attitudes=partial(_trajectory, graph),
+        advice=advice,
+        dropped=model.dropped,
+        premises=model.premises,
+        noises=(*(_level(sensor, model.guess) for sensor in model.sensors), *turned.levels),
+        constants=temperature.constants(temperature.reference(data.temperature)),
+        layout=LAYOUT,
+    )
+
+
+def _level(sensor: Sensor, guess: FieldGuess) -> Level:
+    """Initial noise level of a sensor; without stated noise, a magnetometer's is that of the gyro's first guess."""
+    if sensor.name != "mag":
+        return Level(sensor.noise, sensor.initial_level)
+    if sensor.noise.source != "default" or sensor.noise.known == 0.0:
+        return Level(sensor.noise)
+    return Level(sensor.noise, max(1.0, guess.sigma / float(np.median(sensor.sigma))))
+
+
+def _seen(sensor: Sensor, whole: Array | None) -> Seen:
+    assert whole is not None
+    return Seen(sensor.time, sensor.directions, sensor.nominal(whole), sensor.strength, not sensor.rested)
+
+
+def _keyframe_steps(graph: _Graph, chunk: int) -> Iterator[Step]:
+    """Yield the first keyframe with all shared variables and their priors, then `chunk` keyframes at a time."""
+    count = len(graph.turning.chain.time)
+    yield _step(graph, range(1))
+    for begin in range(1, count, chunk):
+        yield _step(graph, range(begin, min(begin + chunk, count)))
+
+
+def _step(graph: _Graph, keyframes: range) -> Step:
+    chain = graph.turning.chain
+    step = Step(
+        time=float(chain.time[keyframes[-1]]),
+        predict=partial(chain.predict, keyframes, lambda k, _: chain.initial[k]),
+        keyframes=chain.numbers(keyframes),
+    )
+    if keyframes.start == 0:
+        _begin(graph, step)
+    chain.add(step, keyframes)
+    step.factors.extend([*_field(graph, keyframes), *_up(graph, keyframes)])
+    return step
+
+
+def _begin(graph: _Graph, step: Step) -> None:
+    for variable in graph.shared:
+        step.initial.insert(variable.parameter.key, variable.start)
+        step.factors.append(variable.prior)
+    turned = graph.turning
+    step.factors.append(vector_prior(turned.bias, np.zeros(3)))
+    for parameter in turned.parameters[1:]:
+        zeros = np.zeros(len(parameter.quantities))
+        step.initial.insert(parameter.key, zeros)
+        step.factors.append(vector_prior(parameter, zeros))
+    chain = turned.chain
+    about_field = _ANY_ATTITUDE if "accel" in graph.sensors else _FIXED
+    sigmas = np.array([_ANY_ATTITUDE, about_field, _ANY_ATTITUDE])
+    R = so3.matrix(chain.initial[0]) / sigmas[:, None]
+    step.factors.append(rotation_about(chain.state(0), chain.initial[0], R))
+
+
+def _field(graph: _Graph, keyframes: range) -> list[Factor]:
+    turned, chain = graph.turning, graph.turning.chain
+    seen, sensor = turned.mag.of(keyframes), graph.sensors["mag"]
+    if not len(seen.row):
+        return []
+    factor = FieldFactor(*_measured(turned, sensor, seen), chain.gyro, turned.errors, turned.earth)
+    keys = (
+        FILTER_KEY,
+        TRIAD_KEYS["mag"],
+        STRENGTH_KEYS["mag"],
+        DIP_KEY,
+        DELAY_KEY,
+        *chain.error_keys,
+        *_earth_key(turned),
+    )
+    states = [chain.state(int(k)) for k in seen.keyframe]
+    return [Factor.of(SENSOR_NAMES["mag"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
+
+
+def _up(graph: _Graph, keyframes: range) -> list[Factor]:
+    turned, chain = graph.turning, graph.turning.chain
+    seen = turned.accel.of(keyframes)
+    if not len(seen.row):
+        return []
+    sensor = graph.sensors["accel"]
+    measured = _measured(turned, sensor, seen)
+    drivers = None if sensor.drivers is None else sensor.drivers[seen.row]
+    unit = None if turned.arm is None else sensor.strength
+    factor = UpFactor(*measured, chain.gyro, turned.errors, turned.earth, unit, drivers)
+    arm = [] if turned.arm is None else [turned.arm.key]
+    slope = [] if drivers is None else [SLOPE_KEY]
+    keys = FILTER_KEY, TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope, *_earth_key(turned)
+    states = [chain.state(int(k)) for k in seen.keyframe]
+    return [Factor.of(SENSOR_NAMES["accel"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
+
+
+def _earth_key(turned: Turning) -> list[int]:
+    return [] if turned.earth_rate is None else [turned.earth_rate.key]
+
+
+def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array, Array, Array, Array]:
+    """Stamps, s, keyframe times, s, normalised readings and sigmas, and s since the first keyframe."""
+    time = sensor.time[seen.row]
+    return (
+        time,
+        turned.chain.time[seen.keyframe],
+        sensor.scaled[seen.row],
+        sensor.sigma[seen.row],
+        turned.elapsed(time),
+    )
+
+
+def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
+    """Attitudes nRb at keyframes; n is level, with y along the horizontal field."""
+    chain, rows = graph.turning.chain, list(keyframes)
+    aRb = so3.from_gtsam([values.atRot3(chain.state(k)) for k in rows])
+    time = chain.time[rows]
+    return Attitudes(time, so3.multiply(so3.inverse(graph.turning.aRn(time, values)), aRb))
+
+
+def advice(weights: Mapping[str, float]) -> Motion:
+    """Motion that would make a weak direction observable."""
+    if "mag_scale" in weights:
+        return STRENGTH_ADVICE
+    strong = [name for name, weight in weights.items() if abs(weight) > 0.3] or list(weights)
+    if any(name.startswith("accel") for name in strong):
+        return Motion("rest the device for a second or two in each of twenty and more attitudes, every side up")
+    return Motion(
+        "turn the device through more attitudes, each end of each axis up, down, north and south, away from iron",
+        swaying("xyz", "device"),
+    )

@@ -563,7 +563,7 @@ def _scatter_at_rest(t: Array, raw: Array, rests: Array, centre: Array) -> float
 
 def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float, at_rest: float) -> Noise:
     """Noise as stated, in the recorded unit; if unstated, that at rest or, for counts, the first guess's scatter."""
-    family = {"accel": "accelerometer", "mag": "magnetometer"}[name]
+    family = SENSOR_NAMES[name]
     if is_si:
         noise = stated(f"{name}_density", config, message, (family,))
         return replace(noise, stated=at_rest) if at_rest and noise.source == "default" and noise.estimated else noise

@@ -18,6 +18,7 @@ from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot, thin
 from alidade.pipelines.display.sphere_map import described, share_near, sphere_map, widest_gap
 from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.parameters import SENSOR_NAMES
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods import Report
 from alidade.pipelines.methods.formula import Formula, gyro_rate, temperature_text, vector_text
@@ -81,7 +82,6 @@ def _less_drift(formula: Formula, parameters: Collection[str]) -> Formula:
     )
 
 
-NAMES = {"accel": "accelerometer", "mag": "magnetometer"}
 # Unit of a strength -> the one that people read, and what to multiply by.
 _UNITS = {"T": ("µT", 1e6), "m/s^2": ("mg", 1e3 / 9.80665), "1": ("% of the field's strength", 100.0)}
 # Gaps up to this, rad, are none.
@@ -203,7 +203,7 @@ def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:
 
 def _words(calibration: Calibration) -> Table:
     kinds = ("offsets", "stretches", "coverage")
-    rows = [(NAMES[str(row["sensor"])], str(row["says"])) for kind in kinds for row in calibration.tables[kind]]
+    rows = [(SENSOR_NAMES[str(row["sensor"])], str(row["says"])) for kind in kinds for row in calibration.tables[kind]]
     columns = ("sensor", Column("what was found", "prose"))
     return Table("In plain words", "Directions are those of the device's axes.", columns, tuple(rows))
 
@@ -219,7 +219,7 @@ def _lengths(sensor: Sensor, values: Mapping[str, float]) -> Plot:
         out.points(sensor.time[some], miss[some], words, color, 4)
     rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
     return Plot(
-        f"Length of what the {NAMES[sensor.name]} reads",
+        f"Length of what the {SENSOR_NAMES[sensor.name]} reads",
         f"It should be the same in every attitude: {rms[0]:.2g} % RMS off its mean as recorded, {rms[1]:.2g} % off "
         "calibrated.",
         out,
@@ -238,7 +238,7 @@ def _sphere(sensor: Sensor, values: Mapping[str, float]) -> Plot:
             out.points(cloud[some, i], cloud[some, j], name, color, 3)
         views.append(out)
     return Plot(
-        f"Readings of the {NAMES[sensor.name]}",
+        f"Readings of the {SENSOR_NAMES[sensor.name]}",
         "Seen along z and along y, in units of what is measured: an ellipsoid about the offset as recorded, the unit "
         "sphere about zero calibrated.",
         views[0],
@@ -252,7 +252,7 @@ def _covered(sensor: Sensor, values: Mapping[str, float]) -> Plot:
     names = [described(direction) for direction in reached]
     what = "the field" if sensor.name == "mag" else "up"
     return Plot(
-        f"Directions covered by the {NAMES[sensor.name]}",
+        f"Directions covered by the {SENSOR_NAMES[sensor.name]}",
         f"Where {what} was, in the device's axes, on an equal-area map of all directions.",
         sphere_map(reached, names, "reading"),
     )

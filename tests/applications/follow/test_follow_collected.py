@@ -18,8 +18,7 @@ from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.guidance import next_pose
-from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, simulate_indexer
 from alidade.pipelines.methods.los.simulation import LosScenario, simulate_los

@@ -17,8 +17,7 @@ from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.recording import CubeData
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch

@@ -18,8 +18,7 @@ from alidade.factors import so3
 from alidade.pipelines.applications import cli
 from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.cube.recording import CubeData, Sightings
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.vision.camera import Camera
 
 SCENARIO = CubeScenario(poses=8, static_s=1.5, turn_rad_s=1.5, camera=CubeCamera(rate_hz=5.0))

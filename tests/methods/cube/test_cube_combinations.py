@@ -23,7 +23,7 @@ from alidade.pipelines.methods.cube.parameters import (
     TILT,
     of_tag,
 )
-from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.cube.simulation import CubeScenario
 from alidade.pipelines.reports.result import Calibration
 
 KINDS: dict[str, tuple[ParameterSpec, ...]] = {

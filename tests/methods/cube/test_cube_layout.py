@@ -15,8 +15,14 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.layout import cube_layout, layout_yaml
 from alidade.pipelines.methods.cube.recording import CubeConfig
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import (
+    CubeCamera,
+    CubeScenario,
+    Errors,
+    TagCube,
+    cube_config,
+    simulate_cube,
+)
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.layout import Layout
 from tests.support.browser import fits

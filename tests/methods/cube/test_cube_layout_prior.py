@@ -18,8 +18,14 @@ from alidade.pipelines.files import dump_yaml, load_yaml
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, LayoutCovariance
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import (
+    CubeCamera,
+    CubeScenario,
+    Errors,
+    TagCube,
+    cube_config,
+    simulate_cube,
+)
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config, Sensors, TagsSheet
 from alidade.pipelines.simulation.scenario import Simulated

@@ -22,7 +22,7 @@ from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.published import published_estimate
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, Raw, RawConversion, read_cube
 from alidade.pipelines.methods.cube.report import findings, validate
-from alidade.pipelines.methods.cube.scenario import (
+from alidade.pipelines.methods.cube.simulation import (
     CubeCamera,
     CubeScenario,
     Errors,
@@ -30,8 +30,8 @@ from alidade.pipelines.methods.cube.scenario import (
     Magnetometer,
     ReferenceAttitude,
     TagCube,
+    simulated,
 )
-from alidade.pipelines.methods.cube.simulation import simulated
 from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.recording.recording import open_recording

@@ -15,8 +15,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, Sightings, local_field, read_cube
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.methods.cube.static_poses import static_intervals, static_poses
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config

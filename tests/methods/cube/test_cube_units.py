@@ -13,8 +13,7 @@ from ruamel.yaml import YAML
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.recording import CubeData, RawConversion
-from alidade.pipelines.methods.cube.scenario import CubeScenario
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import CubeScenario, simulate_cube
 from alidade.pipelines.methods.cube.units import Readings, check_units
 from datasets import imu_tk_xsens
 

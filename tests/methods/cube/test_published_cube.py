@@ -14,8 +14,14 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
 from alidade.pipelines.methods.cube.recording import CubeData, local_field
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube, simulated
+from alidade.pipelines.methods.cube.simulation import (
+    CubeCamera,
+    CubeScenario,
+    Errors,
+    cube_config,
+    simulate_cube,
+    simulated,
+)
 
 RNG = np.random.default_rng(1)
 K = np.eye(3) + 0.05 * RNG.normal(size=(3, 3))

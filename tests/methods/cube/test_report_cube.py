@@ -16,8 +16,7 @@ from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.recording import CubeData
 from alidade.pipelines.methods.cube.report import cube_plots, findings, white_noise
-from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.methods.triads import parts_of
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config

@@ -15,7 +15,7 @@ from alidade.pipelines.diagnostics.diagnose import disturbances
 from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.estimation.problem import Estimate, Residuals
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 from alidade.pipelines.simulation.scenario import Simulated
 from tests.support.command import Command
 

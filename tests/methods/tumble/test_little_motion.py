@@ -16,7 +16,7 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.first_guess import first_guess, ring
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 from alidade.pipelines.simulation.scenario import EPOCH_NS, Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command

@@ -33,7 +33,7 @@ from alidade.pipelines.methods.triads import triad_names, triad_of
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData, read_tumble, tumble_topics
 from alidade.pipelines.methods.tumble.report import formulas
-from alidade.pipelines.methods.tumble.scenario import (
+from alidade.pipelines.methods.tumble.simulation import (
     TumbledAccelerometer,
     TumbledGyro,
     TumbledMagnetometer,
