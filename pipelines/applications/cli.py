@@ -19,6 +19,7 @@ from typer.core import TyperGroup
 from alidade.pipelines import deadline, parallel, progress
 from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.errors import InputError, nearest_three, printable
+from alidade.pipelines.files import require_room, write_file, write_whole
 from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
@@ -206,7 +207,6 @@ def calibrate(
     from alidade.pipelines.applications.joint import calibrate_together
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.recording.opening import describe_recordings, group_recordings, naming_parts
-    from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
     how = {"auto_topics": auto_topics, "auto_columns": auto_columns, "prior": prior}
@@ -270,7 +270,6 @@ def compare(
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.reports.comparison_report import comparison_report
     from alidade.pipelines.reports.result_json import results_json
-    from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
     kept = parse_window(window)
@@ -329,7 +328,6 @@ def follow(
     """
     from alidade.pipelines.applications.follow.follow import follow as run
     from alidade.pipelines.applications.follow.follower import Settings
-    from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import write_results
 
     if (source is None) == (replay is None):
@@ -369,7 +367,6 @@ def validate(
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import validation_json
     from alidade.pipelines.reports.validation_report import validation_report
-    from alidade.pipelines.reports.whole import require_room, write_whole
 
     folder = out or _default_folder(session, "validation")
     require_room(folder)
@@ -461,7 +458,6 @@ def plan(
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import plan_json
     from alidade.pipelines.reports.plan_report import plan_report
-    from alidade.pipelines.reports.whole import write_file
 
     with progress.shown(quiet or as_json):
         planned = planned_motion(method, scenario, config=config, require=requirements(require or []))
@@ -527,7 +523,6 @@ def noise(
     from alidade.pipelines.applications.noise import noise as measured
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.noise_report import noise_json, noise_report
-    from alidade.pipelines.reports.whole import write_whole
 
     with progress.shown(quiet), deadline.within(time_limit):
         study = measured(session, config=config, strict=strict, auto_columns=auto_columns)
@@ -550,7 +545,6 @@ def demo(
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.methods import simulate as simulated
     from alidade.pipelines.reports.comparison_report import comparison_report
-    from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import write_results
 
     require_room(out)
@@ -655,7 +649,6 @@ def export(
     from alidade.pipelines.reports.calibration import load_calibration
     from alidade.pipelines.reports.export_formats import export as exported
     from alidade.pipelines.reports.plain_json import plain_json
-    from alidade.pipelines.reports.whole import write_file
 
     saved = load_calibration(calibration)
     text = exported(saved, form)
@@ -741,7 +734,6 @@ def cube_layout(
     from alidade.pipelines.methods.cube.layout import layout_json, layout_report, layout_yaml
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports.html import render_html
-    from alidade.pipelines.reports.whole import write_file
 
     page = out.with_suffix(".html")
     if page == out:

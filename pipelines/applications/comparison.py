@@ -77,9 +77,9 @@ class Comparison:
 
     def write(self, folder: str | Path) -> Path:
         """Write compare.html; returns its path. Raises InputError when it cannot be written."""
+        from alidade.pipelines.files import write_whole
         from alidade.pipelines.reports.comparison_report import comparison_report
         from alidade.pipelines.reports.html import render_html
-        from alidade.pipelines.reports.whole import write_whole
 
         (path,) = write_whole(Path(folder), {"compare.html": render_html(comparison_report(self))})
         return path

@@ -22,14 +22,13 @@ from alidade.factors.chi_square import student
 from alidade.pipelines.display.table import Cell, Column, Table
 from alidade.pipelines.display.units import minute, shown_unit, to_digits_of
 from alidade.pipelines.errors import InputError, nearest
-from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.files import MAX_YAML_BYTES, Content, load_yaml, read_bytes, write_whole
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.calibration import load_known
 from alidade.pipelines.reports.dcc import digital_certificate
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
 from alidade.pipelines.reports.result_json import Result, read_result
-from alidade.pipelines.reports.whole import Content, write_whole
 from alidade.pipelines.settings import first_error
 from alidade.pipelines.solvers.joint import RECORDING
 

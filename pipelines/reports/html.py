@@ -22,12 +22,13 @@ import numpy as np
 
 from alidade.factors.array import Array
 from alidade.pipelines.display.figure import PALETTE, Figure, Mark, Plot
-from alidade.pipelines.display.svg import interval_bar, svg
-from alidade.pipelines.display.table import Cell, Column, Table
+from alidade.pipelines.display.table import Cell, Column, Interval, Table
+from alidade.pipelines.files import write_file
 from alidade.pipelines.reports.report import Report, plots_of
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
 
 _CODE = re.compile(r"`([^`]+)`")
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -60,8 +61,6 @@ class Page:
 
     def write(self, path: str | Path) -> Path:
         """Write the page to a file. Raises InputError when the file cannot be written."""
-        from alidade.pipelines.reports.whole import write_file
-
         write_file(Path(path), self.html)
         return Path(path)
 
@@ -146,3 +145,123 @@ def _bokeh() -> str:
 
 def _compressed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
+
+
+_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 470.0, 56.0, 20.0, 20.0, 40.0
+_DASHES = {"solid": "", "dashed": "7 3", "dotdash": "9 3 2 3", "dotted": "2 3"}
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+_ANGLES = (15.0, 30.0, 45.0, 90.0)
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure with axes as SVG; the y axis begins at 0 unless values are below."""
+    return _Drawing(figure).markup()
+
+
+class _Drawing:
+    def __init__(self, figure: Figure) -> None:
+        self._figure, self._height = figure, float(figure.height)
+        x = np.concatenate([mark.x for mark in figure.marks if "x" in mark.columns])
+        self._x = figure.x_range or (float(x.min()), float(x.max()))
+        self._y = figure.y_range or self._reach()
+
+    def markup(self) -> str:
+        f, (left, right), middle = self._figure, self._edges, 0.5 * (self._edges[0] + self._edges[1])
+        title = f'<text class="title" x="6" y="12">{escape(f.y_title)}</text>'
+        below = (
+            f'<text class="title" x="{middle:.0f}" y="{self._height - 4:.0f}" text-anchor="middle">{escape(f.x_title)}'
+        )
+        axes = "".join([self._across(), self._upwards(left, right)])
+        marks = "".join(self._band(m) for m in f.marks if m.kind == "band")
+        marks += "".join(self._line(m) for m in f.marks if m.kind == "line")
+        names = f"{f.y_title} over {f.x_title}: {', '.join(dict.fromkeys(m.name for m in f.marks if m.name))}"
+        return (
+            f'<svg class="curve" viewBox="0 0 {_WIDTH:.0f} {self._height:.0f}" role="img" aria-label="{escape(names)}">'
+            f"{axes}{marks}{title}{below}</text></svg>"
+        )
+
+    @property
+    def _edges(self) -> tuple[float, float]:
+        return _LEFT, _WIDTH - _RIGHT
+
+    def _reach(self) -> tuple[float, float]:
+        ends = [mark.columns[key] for mark in self._figure.marks for key in ("y", "low", "high") if key in mark.columns]
+        y = np.concatenate(ends)
+        low, high = min(0.0, float(np.nanmin(y))), max(0.0, float(np.nanmax(y)))
+        return (1.06 * low, 1.06 * high) if high > low else (-1.0, 1.0)
+
+    def _at(self, x: float, y: float) -> tuple[float, float]:
+        (x0, x1), (y0, y1), (left, right) = self._x, self._y, self._edges
+        across, up = (x - x0) / (x1 - x0), (y - y0) / (y1 - y0)
+        return left + across * (right - left), self._height - _BOTTOM - up * (self._height - _BOTTOM - _TOP)
+
+    def _across(self) -> str:
+        parts = []
+        for value, text in ticks(*self._x, 6, "deg" in self._figure.x_title):
+            x, bottom = self._at(value, self._y[0])
+            parts.append(f'<path class="grid" d="M{x:.1f} {_TOP:.0f}V{bottom:.1f}"/>')
+            parts.append(f'<text x="{x:.1f}" y="{bottom + 15:.1f}" text-anchor="middle">{text}</text>')
+        return "".join(parts)
+
+    def _upwards(self, left: float, right: float) -> str:
+        parts = []
+        for value, text in ticks(*self._y, 4):
+            y = self._at(self._x[0], value)[1]
+            kind = "grid zero" if value == 0.0 else "grid"
+            parts.append(f'<path class="{kind}" d="M{left:.0f} {y:.1f}H{right:.0f}"/>')
+            parts.append(f'<text x="{left - 5:.0f}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
+        return "".join(parts)
+
+    def _line(self, mark: Mark) -> str:
+        pieces, pen = [], "M"
+        for x, y in zip(mark.x.tolist(), mark.y.tolist(), strict=True):
+            if y != y:
+                pen = "M"
+                continue
+            pieces.append("{}{:.1f} {:.1f}".format(pen, *self._at(x, y)))
+            pen = "L"
+        dash = f' stroke-dasharray="{_DASHES[mark.dash]}"' if mark.dash != "solid" else ""
+        style = f"stroke:var(--{mark.color});stroke-width:{mark.size:g}"
+        return f'<path class="line" style="{style}"{dash} d="{"".join(pieces)}"/>'
+
+    def _band(self, mark: Mark) -> str:
+        columns = (mark.x.tolist(), mark.columns["low"].tolist(), mark.columns["high"].tolist())
+        there = [self._at(x, high) for x, _, high in zip(*columns, strict=True)]
+        back = [self._at(x, low) for x, low, _ in zip(*columns, strict=True)]
+        outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in [*there, *back[::-1]])
+        return f'<polygon style="fill:var(--{mark.color});fill-opacity:{mark.alpha:g}" points="{outline}"/>'
+
+
+def ticks(low: float, high: float, count: int, angles: bool = False) -> list[tuple[float, str]]:
+    """Return at most `count` round values between two limits, with their texts; of angles multiples of 15 deg."""
+    steps = _ANGLES if angles and high - low > _ANGLES[0] * 2 else ()
+    base = 10.0 ** np.floor(np.log10((high - low) / count))
+    step = float(next(s for s in (*steps, *(m * base for m in _STEPS)) if (high - low) / s <= count))
+    places = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step
+    digits = next((n for n in range(6) if abs(round(step, n) - step) < 1e-9 * step), 6)
+    return [
+        (float(v), f"{v:.{digits}f}".replace("-", "\N{MINUS SIGN}") if abs(v) > 1e-9 * step else "0") for v in places
+    ]
+
+
+def interval_bar(interval: Interval) -> str:
+    """Return an SVG bar of +-2 sigma over one of +-2 required, 84 x 14 px; a triangle marks the truth."""
+    if not interval.sigma > 0.0:
+        return ""
+    width, half = 84.0, 36.0
+    scale = half / (2.0 * interval.require if interval.require else 3.0 * interval.sigma)
+    reach = min(max(2.0 * interval.sigma * scale, 1.2), width / 2.0)
+    track = (
+        f'<rect class="track" x="{width / 2 - half:.1f}" y="5" width="{2 * half:.1f}" height="7" rx="2"/>'
+        if interval.require
+        else f'<path class="none" d="M2 8.5H{width - 2:.0f}"/>'
+    )
+    middle = width / 2 + min(max(interval.offset * scale, -half), half)
+    bar = f'<rect class="bar" x="{middle - reach:.1f}" y="4" width="{2 * reach:.1f}" height="9" rx="1"/>'
+    over = f'<path class="over" d="M3 8.5l4-3v6zM{width - 3:.0f} 8.5l-4-3v6z"/>' if reach > width / 2 - 1 else ""
+    truth = ""
+    if interval.error is not None:
+        at = width / 2 - min(max(interval.error * scale, 3.0 - width / 2), width / 2 - 3.0)
+        truth = f'<path class="truth" d="M{at:.1f} 4.5l-3-4.5h6z"/>'
+    size = 'viewBox="0 0 84 14" width="84" height="14" aria-hidden="true"'
+    return f'<svg class="interval" {size}>{track}{bar}{over}{truth}</svg>'

@@ -113,8 +113,7 @@ def plan_json(plan: Plan) -> str:
 
 def fleet_json(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
     """JSON of `fleet`: rows of fleet.csv and changes.csv, components of every parameter, who needs attention."""
-    from alidade.pipelines.applications.fleet.analysis import table
-    from alidade.pipelines.applications.fleet.attention import units_of_interest
+    from alidade.pipelines.applications.fleet.analysis import table, units_of_interest
     from alidade.pipelines.applications.fleet.histories import change_table
 
     return plain_json(

@@ -10,12 +10,12 @@ import numpy as np
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes
+from alidade.pipelines.files import Content, write_whole
 from alidade.pipelines.reports.calibration import calibration_yaml
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.estimates_mcap import foxglove_layout, write_estimates
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import result_json
-from alidade.pipelines.reports.whole import Content, write_whole
 
 # Folder of the recordings of a joint calibration.
 PARTS = "recordings"

@@ -17,8 +17,7 @@ from alidade.pipelines.diagnostics.use import Applied, Line, Posterior, Truth, U
 from alidade.pipelines.methods.formula import input_kind, results
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.uses import deviation_coefficients
-from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.reports.uses import AppliedFormulas, posterior_of
+from alidade.pipelines.reports.result import AppliedFormulas, Calibration, posterior_of
 
 SCENARIOS: dict[str, object] = {
     "tumble": None,

@@ -14,12 +14,12 @@ import pytest
 
 import alidade
 from alidade.pipelines.display.figure import Figure
-from alidade.pipelines.display.svg import interval_bar, svg, ticks
 from alidade.pipelines.display.table import Interval
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.methods import Report, method, names
 from alidade.pipelines.methods.triads import parts_of, sensor_model
 from alidade.pipelines.reports.calibration_report import calibration_report, report_html
+from alidade.pipelines.reports.html import interval_bar, svg, ticks
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.results_table import result_cards
 from alidade.pipelines.reports.terminal import console, print_report

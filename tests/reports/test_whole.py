@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import write_file, write_whole
 from alidade.pipelines.reports import whole
-from alidade.pipelines.reports.whole import write_file, write_whole
 
 NAMES = ("a", "b", "c", "result")
 # Writes rounds of files that all hold the same, one file after the other and slowly.
 WRITER = """
 import sys, time
 from pathlib import Path
-from alidade.pipelines.reports.whole import require_room, write_whole
+from alidade.pipelines.files import require_room, write_whole
 who, folder, rounds = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
 require_room(folder)
 print("begun", flush=True)

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.array import Array
 from alidade.pipelines.applications.fleet import statistics
-from alidade.pipelines.applications.fleet.analysis import Population, iso
-from alidade.pipelines.applications.fleet.attention import Unit, sentence, units_of_interest
+from alidade.pipelines.applications.fleet.analysis import Population, Unit, iso, sentence, units_of_interest
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component
 from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot, Shape, milliseconds, thin

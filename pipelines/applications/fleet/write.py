@@ -7,16 +7,22 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from alidade.pipelines.applications.fleet.analysis import Population, counting, populations, table
-from alidade.pipelines.applications.fleet.attention import sentence, units_of_interest
+from alidade.pipelines.applications.fleet.analysis import (
+    Population,
+    counting,
+    populations,
+    sentence,
+    table,
+    units_of_interest,
+)
 from alidade.pipelines.applications.fleet.fleet import Outcome, Settings, calibrate_fleet
 from alidade.pipelines.applications.fleet.histories import History, change_table, histories
 from alidade.pipelines.applications.fleet.montecarlo import Study, run_table, summary_table
 from alidade.pipelines.applications.fleet.pages import fleet_report, study_report
 from alidade.pipelines.applications.fleet.recordings import find
 from alidade.pipelines.applications.fleet.tables import csv_text, write_parquet
+from alidade.pipelines.files import write_whole
 from alidade.pipelines.reports.html import render_html
-from alidade.pipelines.reports.whole import write_whole
 
 
 @dataclass(frozen=True, repr=False)

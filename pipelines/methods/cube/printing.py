@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import write_file
 from alidade.pipelines.methods.cube.simulation import FACES, SIDES
-from alidade.pipelines.reports.whole import write_file
 
 _POINTS_PER_M = 72.0 / 0.0254
 _PAGE = (0.210, 0.297)  # A4, m

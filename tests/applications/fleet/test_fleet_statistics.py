@@ -7,8 +7,7 @@ import pytest
 from scipy import stats
 
 from alidade.pipelines.applications.fleet import statistics
-from alidade.pipelines.applications.fleet.analysis import Population, counting, populations
-from alidade.pipelines.applications.fleet.attention import units_of_interest
+from alidade.pipelines.applications.fleet.analysis import Population, counting, populations, units_of_interest
 from alidade.pipelines.applications.fleet.histories import History, change_table, histories, packed
 from alidade.pipelines.applications.fleet.pages import population_plot
 from alidade.pipelines.applications.fleet.store import ParameterNumbers, UnitResult
