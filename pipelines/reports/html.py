@@ -154,7 +154,10 @@ _ANGLES = (15.0, 30.0, 45.0, 90.0)
 
 
 def svg(figure: Figure) -> str:
-    """Return a figure with axes as SVG; the y axis begins at 0 unless values are below."""
+    """Return a small figure of lines, bands and levels as SVG, without a script.
+
+    Colours are the page's CSS variables; the y axis begins at 0 unless values are below.
+    """
     return _Drawing(figure).markup()
 
 

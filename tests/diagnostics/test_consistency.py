@@ -20,8 +20,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics import hypothesis_tests, trial_fit
 from alidade.pipelines.diagnostics.cross_validation import split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose
-from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
-from alidade.pipelines.diagnostics.trial_cases import TrialCase, trial_cases
+from alidade.pipelines.diagnostics.hypothesis_tests import TrialCase, find_hypotheses, misstatements, trial_cases
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals, solve_trial
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Estimate, Problem, Residuals, Step

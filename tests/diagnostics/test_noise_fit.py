@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from alidade.pipelines.diagnostics.allan import NOISES, allan_curve, allan_variance, confidence
-from alidade.pipelines.diagnostics.noise_spectrum import Coefficient, axis_noise, fit_noise
-from alidade.pipelines.diagnostics.spectral_lines import find_lines
+from alidade.pipelines.diagnostics.noise_spectrum import Coefficient, axis_noise, find_lines, fit_noise
 from tests.support import noises
 
 Array = NDArray[np.float64]

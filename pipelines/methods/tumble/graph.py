@@ -164,7 +164,7 @@ def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: Tru
     return [Factor.of("dip", factor.on(*keys, loss=loss))]
 
 
-# -- with a gyro, whose attitudes at keyframes are states
+# -- with a gyro: attitudes at keyframes, at which field and gravity are what they are
 
 # Prior sigma of the first attitude, rad: as good as none. A magnetometer alone leaves its rotation about the field,
 # which is y then, undetermined: it is fixed to this, and the earth's rate is in the axes that follow.

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from alidade.pipelines.applications.follow.bridge import Bridge
+from alidade.pipelines.applications.follow.bridge import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, Bridge, websockets
 from alidade.pipelines.applications.follow.gate import (
     MAX_ATTEMPTS,
     MAX_CONNECTIONS,
@@ -33,9 +33,8 @@ from alidade.pipelines.applications.follow.gate import (
 )
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.page import LivePage
-from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import MAX_SUBSCRIPTIONS, LiveServer
-from alidade.pipelines.applications.follow.spool import Spool
+from alidade.pipelines.applications.follow.sources import Spool
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.recording.recording import open_recording
 
@@ -463,7 +462,7 @@ def test_what_finds_no_room_waits_and_stands_in_order_at_the_end(
         return count
 
     monkeypatch.setattr(os, "pwrite", limited)
-    monkeypatch.setattr("alidade.pipelines.applications.follow.spool.RETRY_PERIOD_S", 0.0)
+    monkeypatch.setattr("alidade.pipelines.applications.follow.sources.RETRY_PERIOD_S", 0.0)
     said: list[str] = []
     spool = Spool(tmp_path / "x", said.append)
     spool.write(b"abcdef")
