@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade.pipelines import files
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import write_file, write_whole
-from alidade.pipelines.reports import whole
 
 NAMES = ("a", "b", "c", "result")
 # Writes rounds of files that all hold the same, one file after the other and slowly.
@@ -89,7 +89,7 @@ def test_a_process_that_is_killed_leaves_results_whole_or_absent(rounds: int, tm
 
 
 def test_who_does_not_get_the_folder_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole, "_PATIENCE_S", 0.1)
+    monkeypatch.setattr(files, "_PATIENCE_S", 0.1)
     held = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(held, fcntl.LOCK_EX)
     try:
