@@ -15,8 +15,7 @@ from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Applied, Line, Posterior, Truth, Use, coverage, use_bands
 from alidade.pipelines.methods.formula import input_kind, results
-from alidade.pipelines.methods.triads import triad_of
-from alidade.pipelines.methods.uses import deviation_coefficients
+from alidade.pipelines.methods.triads import deviation_coefficients, triad_of
 from alidade.pipelines.reports.result import AppliedFormulas, Calibration, posterior_of
 
 SCENARIOS: dict[str, object] = {

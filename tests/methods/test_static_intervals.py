@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alidade.pipelines.diagnostics.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 
 Array = np.ndarray

@@ -45,12 +45,14 @@ from alidade.pipelines.methods.triads import (
     CORRECTIONS,
     RESULTS,
     TRIADS,
+    along,
     parts_row,
     parts_with_sigmas,
+    raw_of,
     triad_formula,
     triad_names,
+    triad_uses,
 )
-from alidade.pipelines.methods.uses import along, raw_of, triad_uses
 from alidade.pipelines.recording.topics import IMU, MAG
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config

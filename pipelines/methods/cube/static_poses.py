@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.diagnostics.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import stated
 from alidade.pipelines.estimation.robust import robust_sigma
@@ -23,7 +24,6 @@ from alidade.pipelines.methods.cube.recording import (
     noise_densities,
     nominal,
 )
-from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.recording.checks import count
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 

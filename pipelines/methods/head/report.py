@@ -42,7 +42,7 @@ from alidade.pipelines.methods.head.parameters import (
 )
 from alidade.pipelines.methods.head.recording import HEAD_IMU, PLATFORM_IMU, HeadData
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
-from alidade.pipelines.methods.uses import G, gyro_reading
+from alidade.pipelines.methods.triads import G, gyro_reading
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 

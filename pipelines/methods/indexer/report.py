@@ -36,7 +36,7 @@ from alidade.pipelines.methods.indexer.published import half_differences
 from alidade.pipelines.methods.indexer.recording import IndexerConfig, IndexerData
 from alidade.pipelines.methods.indexer.windows import AxisMotion, Group, axis_motion, groups_of
 from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
-from alidade.pipelines.methods.uses import gyro_reading
+from alidade.pipelines.methods.triads import gyro_reading
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config

@@ -42,7 +42,7 @@ from alidade.pipelines.methods.los.initial_values import (
 from alidade.pipelines.methods.los.parameters import ANGLES, DELAY, ONCE_PER_TURN, SCALE, SENSITIVITY, TIME_OFFSET
 from alidade.pipelines.methods.los.recording import JOINTS, LosData
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
-from alidade.pipelines.methods.uses import G, gyro_reading
+from alidade.pipelines.methods.triads import G, gyro_reading
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given

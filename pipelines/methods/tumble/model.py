@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from alidade.factors.array import Array, interpolated
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
+from alidade.pipelines.diagnostics.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.display.sphere_map import described
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import ROUGHLY, Noise
@@ -23,7 +24,6 @@ from alidade.pipelines.estimation.parameters import stated as sheet
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import sampled, stated
 from alidade.pipelines.methods.place import FIELD, field_at, known_strength
-from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess, ring

@@ -26,18 +26,21 @@ from alidade.pipelines.methods.temperature import ACCEL_SLOPE, FIRST, GYRO_SLOPE
 from alidade.pipelines.methods.triads import (
     CORRECTIONS,
     RESULTS,
+    G,
     gain_names,
+    gyro_reading,
     parts_row,
     parts_with_sigmas,
+    raw_of,
     triad_formula,
     triad_names,
     triad_of,
+    triad_uses,
 )
 from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.parameters import STRENGTHS
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData
 from alidade.pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
-from alidade.pipelines.methods.uses import G, gyro_reading, raw_of, triad_uses
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 

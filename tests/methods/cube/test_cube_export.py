@@ -19,8 +19,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.printing import print_cube, tag_size
 from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.reports.calibration import SavedCalibration
-from alidade.pipelines.reports.export_formats import MOUNT_FORMATS, export
-from alidade.pipelines.reports.triad_export import FORMATS
+from alidade.pipelines.reports.export_formats import MOUNT_FORMATS, TRIAD_FORMATS, export
 
 RNG = np.random.default_rng(1)
 BIAS = {"accel": 0.3, "gyro": 0.02, "mag": 2e-5}
@@ -305,7 +304,7 @@ def test_wrong_format_and_method() -> None:
 def test_command_python_and_page_name_every_format() -> None:
     page = (Path(__file__).parents[3] / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
     shown = CliRunner().invoke(app, ["export", "-h"], env={"COLUMNS": "200"}).output
-    for form in (*FORMATS, *MOUNT_FORMATS):
+    for form in (*TRIAD_FORMATS, *MOUNT_FORMATS):
         assert form in shown
         assert form in str(alidade.export.__doc__)
         assert f"\n| `{form}`" in page

@@ -15,6 +15,7 @@ from alidade.factors import so3
 from alidade.factors.turns import GyroRotationFactor
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import rms
+from alidade.pipelines.diagnostics.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import simulate
@@ -33,7 +34,6 @@ from alidade.pipelines.methods.cube.simulation import (
     simulated,
 )
 from alidade.pipelines.methods.cube.static_poses import static_intervals
-from alidade.pipelines.methods.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.sensors import Warming

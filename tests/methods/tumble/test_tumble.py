@@ -30,6 +30,7 @@ from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.methods.triads import triad_names, triad_of
+from alidade.pipelines.methods.tumble.graph import unturned
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData, read_tumble, tumble_topics
 from alidade.pipelines.methods.tumble.report import formulas
@@ -40,7 +41,6 @@ from alidade.pipelines.methods.tumble.simulation import (
     TumbleScenario,
 )
 from alidade.pipelines.methods.tumble.turning import BIAS, SENSITIVITY, Seen, calibrated_force
-from alidade.pipelines.methods.tumble.unturned import unturned
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.mcap_writer import write_session
