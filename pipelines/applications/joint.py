@@ -11,7 +11,6 @@ from __future__ import annotations
 import datetime
 import hashlib
 import pickle
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -38,6 +37,7 @@ from alidade.pipelines.estimation.prior_replacement import with_priors
 from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Parameter, Problem, Quantity, SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.container import total
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.reports.joint_report import recording_blocks
 from alidade.pipelines.reports.result import Calibration
@@ -307,7 +307,7 @@ def _calibration(
         converged=converged,
         message=f"{len(alone)} recordings; the joint estimate moved last by {step:.1g} sigmas",
         chi_square=_sum([each.calibration.estimate.chi_square for each in alone]),
-        rejected=_counts([each.calibration.estimate.rejected for each in alone]),
+        rejected=total([each.calibration.estimate.rejected for each in alone]),
         levels=_combined_levels([each.calibration.estimate.levels for each in alone]),
         inflation=inflation,
         budget={name: _with_extra(shares[name], names.index(name), covariance, extra) for name in shares},
@@ -443,13 +443,6 @@ def _sum(found: Sequence[ChiSquare | None]) -> ChiSquare:
     return ChiSquare(sum(c.value for c in each), sum(c.dof for c in each), families)
 
 
-def _counts(each: Sequence[Mapping[str, int]]) -> dict[str, int]:
-    total: Counter[str] = Counter()
-    for counts in each:
-        total.update(counts)
-    return dict(total)
-
-
 def _named(names: Sequence[str]) -> str:
     """Return the names of recordings as a short phrase."""
     return ", ".join(names) if len(names) <= _MOST_NAMED else f"{names[0]} to {names[-1]}, {len(names)} recordings"
@@ -458,7 +451,7 @@ def _named(names: Sequence[str]) -> str:
 def _facts(facts: Sequence[SessionFacts]) -> SessionFacts:
     """Combine the facts of all recordings; the start is that of the last, whose date the result has."""
     last = facts[-1]
-    lost = _counts([each.lost for each in facts])
+    lost = total([each.lost for each in facts])
     notes = tuple(dict.fromkeys(note for each in facts for note in each.notes))
     if any(0 < b.epoch_ns - a.epoch_ns < 1e9 * a.duration_s for a, b in pairwise(facts)):
         notes = (*notes, _OVERLAP)

@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -84,6 +84,14 @@ class Value:
         return cls(_CONSTANTS[array.ndim], array)
 
 
+class _HasArray(Protocol):
+    @property
+    def array(self) -> Array | None: ...
+
+
+Part = TypeVar("Part", bound=_HasArray)
+
+
 def input_kind(name: str) -> Kind:
     """Kind of a formula's input by its name: rotation, vector or scalar."""
     return "rotation" if _ROTATION.fullmatch(name) else "vector" if _VECTOR.fullmatch(name) else "scalar"
@@ -140,19 +148,36 @@ def results(formulas: Sequence[Formula], values: Mapping[str, float], measured: 
 
 def evaluate(tree: ast.expr, names: Mapping[str, Value]) -> Value:
     """Evaluate a parsed expression; names without a value are 0. Raises ValueError for unsupported syntax."""
+    return walk(tree, lambda name: names.get(name) or Value.constant(np.array(0.0)), lambda x: x, operate)
+
+
+def walk(
+    tree: ast.expr, of_name: Callable[[str], Part], of_value: Callable[[Value], Part], operation: Callable[..., Part]
+) -> Part:
+    """Build what an expression stands for from its leaves. Raises ValueError for unsupported syntax.
+
+    Args:
+        tree: parsed.
+        of_name, of_value: leaves: a name, a number or a matrix.
+        operation: of a name that `operate` knows, and of its parts.
+    """
+    part = partial(walk, of_name=of_name, of_value=of_value, operation=operation)
     match tree:
         case ast.Constant(value=int() | float() as number):
-            return Value("scalar", np.array(float(number)))
+            return of_value(Value.constant(np.array(float(number))))
         case ast.Name(id=name):
-            return names.get(name) or Value("scalar", np.array(0.0))
-        case ast.List(elts=rows):
-            return Value.constant(np.array([evaluate(row, names).array for row in rows]))
+            return of_name(name)
+        case ast.List(elts=elements):
+            rows: list[Array | None] = [part(element).array for element in elements]
+            if any(row is None for row in rows):
+                raise ValueError("a matrix with something measured in it")
+            return of_value(Value.constant(np.array(rows)))
         case ast.UnaryOp(op=ast.USub(), operand=operand):
-            return operate("minus", evaluate(operand, names))
+            return operation("minus", part(operand))
         case ast.BinOp(left=left, op=op, right=right):
-            return operate(OPERATORS[type(op)], evaluate(left, names), evaluate(right, names))
+            return operation(OPERATORS[type(op)], part(left), part(right))
         case ast.Call(func=ast.Name(id=name), args=[argument]):
-            return operate(name, evaluate(argument, names))
+            return operation(name, part(argument))
     raise ValueError(f"not an expression of a formula: {ast.unparse(tree)}")
 
 

@@ -18,13 +18,13 @@ from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.methods.formula import (
     AXES,
-    OPERATORS,
     Formula,
     Kind,
     Value,
     input_kind,
     operate,
     result_kind,
+    walk,
     with_vectors,
 )
 
@@ -63,25 +63,9 @@ class _Reader:
 
     def read(self, formula: Formula) -> _Node:
         self._inputs = formula.inputs
-        node = self._node(formula.tree)
+        node = walk(formula.tree, self.name, _constant, _operation)
         self._earlier[formula.name] = node, formula.inputs
         return node
-
-    def _node(self, tree: ast.expr) -> _Node:
-        match tree:
-            case ast.Constant(value=int() | float() as number):
-                return _constant(Value("scalar", np.array(float(number))))
-            case ast.Name(id=name):
-                return self.name(name)
-            case ast.List(elts=rows):
-                return _constant(Value.constant(np.array([_value(self._node(row)).array for row in rows])))
-            case ast.UnaryOp(op=ast.USub(), operand=operand):
-                return _operation("minus", self._node(operand))
-            case ast.BinOp(left=left, op=op, right=right):
-                return _operation(OPERATORS[type(op)], self._node(left), self._node(right))
-            case ast.Call(func=ast.Name(id=name), args=[argument]):
-                return _operation(name, self._node(argument))
-        raise ValueError(f"not an expression of a formula: {ast.unparse(tree)}")
 
     def name(self, name: str) -> _Node:
         """Return the node of a name: an earlier formula, an input or a parameter."""
@@ -102,12 +86,6 @@ def _constant(value: Value) -> _Node:
     return _Node(_kind_in_code(value.kind), value)
 
 
-def _value(node: _Node) -> Value:
-    if node.value is None:
-        raise ValueError("a matrix with something measured in it")
-    return node.value
-
-
 def _operation(op: str, *parts: _Node) -> _Node:
     """Make an operation: computed if its parts are constants, simplified if one of them is 0."""
     kind = _kind_in_code(result_kind(op, [part.kind for part in parts]))
@@ -120,8 +98,9 @@ def _operation(op: str, *parts: _Node) -> _Node:
             return a
         if op == "add" and zero_a and _RANKS.index(a.kind) <= _RANKS.index(b.kind):
             return b
-    if all(part.value is not None for part in parts):
-        return _constant(operate(op, *map(_value, parts)))
+    values = [part.value for part in parts if part.value is not None]
+    if len(values) == len(parts):
+        return _constant(operate(op, *values))
     return _Node(kind, None, op, parts)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -61,14 +61,14 @@ def next_pose(up: Array, mag: Array | None) -> Motion:
     What a pose with nominal vector n adds to what a triad's twelve numbers are known by is x'N^-1x, x = (n, 1), N the
     sum of xx' over the poses there are.
     """
-    known, field = _FisherInformation(_information(up), None, _REGULARISER * np.eye(3), None), None
+    known, field = [_information(up)], None
     if mag is not None and (seen := np.isfinite(mag).all(axis=1)).any():
         measured = mag[seen] / np.linalg.norm(mag[seen], axis=1, keepdims=True)
         dip = float(np.median((measured * up[seen]).sum(axis=1)))  # sine of the field's angle above the horizon
         field = np.array([0.0, np.sqrt(max(1.0 - dip**2, 0.0)), dip])
-        known = replace(known, mag=_information(measured))
+        known.append(_information(measured))
     choices = _choices((0.0,))
-    gains = np.expm1(_gains(known, choices, field)).sum(axis=1)
+    gains = np.expm1(_gains(known, choices, field, None)).sum(axis=1)
     best = choices[int(np.argmax(gains > gains.max() * (1.0 - 1e-9)))]
     north = None if field is None else best.north
     ahead = "" if north is None else f" and {north} to the north"
@@ -177,16 +177,6 @@ _LEANS = (0.0, 45.0)
 _REGULARISER = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class _FisherInformation:
-    """Fisher information of accelerometer, magnetometer (if any) and turns, and the last attitude at rest."""
-
-    accel: Array
-    mag: Array | None
-    turns: Array
-    last: Array | None
-
-
 def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[Resting], list[Resting]]:
     """Most informative single poses, for one sensor or all, and the best sequence of a given number of poses."""
     field = None
@@ -194,18 +184,17 @@ def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[R
         place = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
         field = magnetic_field(float(place[0]), float(place[1]), scenario.place.height, YEAR)
         field = field / np.linalg.norm(field)
-    known = _FisherInformation(
-        _REGULARISER * np.eye(4), None if field is None else _REGULARISER * np.eye(4), _REGULARISER * np.eye(3), None
-    )
+    # Of accelerometer, magnetometer, if any, and turns.
+    known, last = [_REGULARISER * np.eye(n) for n in ((4, 3) if field is None else (4, 4, 3))], None
     for nRb in attitudes(scenario, seed):
-        known = _after(known, nRb, field)
+        known, last = _after(known, nRb, field, last), nRb
     choices = _choices(_LEANS)
-    gains = _gains(known, choices, field)
+    gains = _gains(known, choices, field, last)
     single = [choices[int(np.argmax(column))] for column in [gains.sum(axis=1), *gains.T]]
     series: list[Resting] = []
     for _ in range(together):
-        series.append(choices[int(np.argmax(_gains(known, choices, field).sum(axis=1)))])
-        known = _after(known, series[-1].nRb, field)
+        series.append(choices[int(np.argmax(_gains(known, choices, field, last).sum(axis=1)))])
+        known, last = _after(known, series[-1].nRb, field, last), series[-1].nRb
     return list(dict.fromkeys(single)), series
 
 
@@ -215,26 +204,27 @@ def _choices(leans: Sequence[float]) -> list[Resting]:
     return [Resting(up=up, north=north, lean_deg=lean) for up, north in sides for lean in leans]
 
 
-def _rows(known: _FisherInformation, nRb: Array, field: Array | None) -> list[tuple[Array, Array]]:
-    """Information of each sensor so far, with the row that a next rest in nRb adds."""
+def _rows(nRb: Array, field: Array | None, last: Array | None) -> list[Array]:
+    """Rows that a rest in nRb adds to what is known of each sensor and, by the turn from the last one, of turns."""
     bRn = so3.inverse(nRb)
-    found = [(known.accel, np.append(so3.rotate(bRn, [0.0, 0.0, 1.0]), 1.0))]
-    if field is not None and known.mag is not None:
-        found.append((known.mag, np.append(so3.rotate(bRn, field), 1.0)))
-    turned = np.zeros(3) if known.last is None else so3.local(known.last, nRb)
-    return [*found, (known.turns, turned)]
+    vectors = [np.array([0.0, 0.0, 1.0]), *([] if field is None else [field])]
+    turned = np.zeros(3) if last is None else so3.local(last, nRb)
+    return [*(np.append(so3.rotate(bRn, vector), 1.0) for vector in vectors), turned]
 
 
-def _after(known: _FisherInformation, nRb: Array, field: Array | None) -> _FisherInformation:
-    sums = [information + np.outer(row, row) for information, row in _rows(known, nRb, field)]
-    return _FisherInformation(sums[0], sums[1] if len(sums) > 2 else None, sums[-1], nRb)
+def _after(known: Sequence[Array], nRb: Array, field: Array | None, last: Array | None) -> list[Array]:
+    """Fisher information after a rest in nRb."""
+    return [information + np.outer(row, row) for information, row in zip(known, _rows(nRb, field, last), strict=True)]
 
 
-def _gains(known: _FisherInformation, choices: Sequence[Resting], field: Array | None) -> Array:
-    """Information gain of each choice for each sensor, (choices, sensors)."""
+def _gains(known: Sequence[Array], choices: Sequence[Resting], field: Array | None, last: Array | None) -> Array:
+    """Information gain of each choice for each of what is known, (choices, known)."""
     return np.array(
         [
-            [np.log1p(row @ np.linalg.solve(information, row)) for information, row in _rows(known, each.nRb, field)]
+            [
+                np.log1p(row @ np.linalg.solve(information, row))
+                for information, row in zip(known, _rows(each.nRb, field, last), strict=False)
+            ]
             for each in choices
         ]
     )
