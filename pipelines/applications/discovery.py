@@ -15,12 +15,11 @@ from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.info import lacking
 from alidade.pipelines.recording.pairing import BELONGS, INTERVAL, MAX_MOUNT, Pairing, pair
 from alidade.pipelines.recording.plausibility import is_there
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
-from alidade.pipelines.recording.topics import Setting, Topic, TopicSource, wanted
+from alidade.pipelines.recording.topics import Setting, Topic, TopicSource, lacking, wanted
 from alidade.pipelines.settings import Config
 
 # Correlations are compared up to this one.

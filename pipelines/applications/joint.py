@@ -38,7 +38,7 @@ from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Parameter,
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.container import total
-from alidade.pipelines.recording.info import SessionFacts
+from alidade.pipelines.recording.topics import SessionFacts
 from alidade.pipelines.reports.joint_report import recording_blocks
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import PartParameter, PartResult

@@ -54,11 +54,10 @@ from alidade.pipelines.estimation.problem import (
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
 from alidade.pipelines.recording.decoding import ENCODING
-from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.plausibility import HELD
 from alidade.pipelines.recording.recording import Recording, open_recording
-from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, SessionFacts, facts_of, lacking, wanted
 from alidade.pipelines.reports.calibration import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import TRUTH, Config

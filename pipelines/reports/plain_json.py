@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.applications.planning import Plan
     from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.applications.validate import Validated
-    from alidade.pipelines.recording.info import SessionFacts
+    from alidade.pipelines.recording.topics import SessionFacts
 
 
 def plain_json(kind: str, content: Mapping[str, Any]) -> str:

@@ -43,7 +43,7 @@ from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods.formula import Formula, results
 from alidade.pipelines.recording.faults import CLIPPED
-from alidade.pipelines.recording.info import SessionFacts
+from alidade.pipelines.recording.topics import SessionFacts
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.reports.result_json import NoiseResult, ParameterResult, PartResult, SensitivityResult
 from alidade.pipelines.reports.values import Application, SensorValues

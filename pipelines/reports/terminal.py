@@ -21,7 +21,7 @@ from alidade.pipelines.reports.report import Block, Bullets, Card, Code, Details
 if TYPE_CHECKING:
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.table_discovery import Columns
-    from alidade.pipelines.recording.info import SessionFacts
+    from alidade.pipelines.recording.topics import SessionFacts
 
 # A narrower terminal breaks the lines itself: columns would be left out, and at a width of 0 everything.
 _MIN_WIDTH = 72

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from alidade.pipelines import files
-from alidade.pipelines.applications.fleet.store import RecordingResult, Store
-from alidade.pipelines.applications.fleet.tables import csv_text
+from alidade.pipelines.applications.fleet.store import RecordingResult, Store, csv_text
 from alidade.pipelines.applications.follow.sources import source_of
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError

@@ -23,7 +23,7 @@ from alidade.pipelines.estimation.problem import (
     rotation_vector_coordinates,
 )
 from alidade.pipelines.methods import method
-from alidade.pipelines.recording.info import SessionFacts, TopicFacts
+from alidade.pipelines.recording.topics import SessionFacts, TopicFacts
 from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.settings import Config
 

@@ -20,8 +20,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component, Spread, Trend
-from alidade.pipelines.applications.fleet.store import RecordingResult, UnitResult
-from alidade.pipelines.applications.fleet.tables import Cell, Row
+from alidade.pipelines.applications.fleet.store import Cell, RecordingResult, Row, UnitResult
 from alidade.pipelines.applications.sharing import DAY_S
 from alidade.pipelines.diagnostics.device_changes import Change
 from alidade.pipelines.display.units import shown_unit, to_digits_of

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alidade.pipelines.applications.fleet import statistics
-from alidade.pipelines.applications.fleet.store import UnitResult
-from alidade.pipelines.applications.fleet.tables import Row
+from alidade.pipelines.applications.fleet.store import Row, UnitResult
 from alidade.pipelines.applications.sharing import DAY_S
 from alidade.pipelines.diagnostics.device_changes import Change, Changes, changes
 from alidade.pipelines.estimation.problem import SqrtInformation

@@ -23,14 +23,15 @@ from alidade.pipelines import methods
 from alidade.pipelines.applications.fleet import require_extra, statistics
 from alidade.pipelines.applications.fleet.engine import Killed, source_version, work_off
 from alidade.pipelines.applications.fleet.store import (
+    Cell,
     ParameterError,
+    Row,
     RunResult,
     Store,
     quarantined,
     run_isolated,
     settings_key,
 )
-from alidade.pipelines.applications.fleet.tables import Cell, Row
 from alidade.pipelines.errors import InputError
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from alidade.pipelines.applications.fleet.histories import History, change_table
 from alidade.pipelines.applications.fleet.montecarlo import Study, run_table, summary_table
 from alidade.pipelines.applications.fleet.pages import fleet_report, study_report
 from alidade.pipelines.applications.fleet.recordings import find
-from alidade.pipelines.applications.fleet.tables import csv_text, write_parquet
+from alidade.pipelines.applications.fleet.store import csv_text, write_parquet
 from alidade.pipelines.files import write_whole
 from alidade.pipelines.reports.html import render_html
 

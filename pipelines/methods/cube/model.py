@@ -61,8 +61,15 @@ from alidade.pipelines.methods.cube.recording import (
     nominal,
     stated_density,
 )
-from alidade.pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
-from alidade.pipelines.methods.cube.static_poses import SeenTags, StaticPoses, static_poses, turn
+from alidade.pipelines.methods.cube.static_poses import (
+    Reference,
+    SeenTags,
+    StaticPoses,
+    cube_reference,
+    from_vectors,
+    static_poses,
+    turn,
+)
 from alidade.pipelines.methods.cube.tags import layout_prior
 from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
 from alidade.pipelines.recording.plausibility import DEAD_BAND, dead_band
