@@ -1,4 +1,4 @@
-"""Array types (numbers, indices, masks), and linear interpolation between the rows of an array."""
+"""Array types (numbers, indices, masks, stamps in ns), and linear interpolation between the rows of an array."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
+Stamps = NDArray[np.int64]
 
 
 def interpolated(at: Array, t: Array, values: Array) -> Array:

@@ -35,11 +35,10 @@ from alidade.pipelines.recording.topics import TEMPERATURE
 from alidade.pipelines.reports.calibration import SavedCalibration, as_saved
 
 if TYPE_CHECKING:
-    from alidade.factors.array import Array
+    from alidade.factors.array import Array, Stamps
     from alidade.pipelines.methods import Correction
     from alidade.pipelines.recording.container import MessageBlock
     from alidade.pipelines.recording.opening import Where
-    from alidade.pipelines.recording.series import Stamps
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.settings import Config
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Stamps
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.container import Channel, MessageBlock, Schema, byte_windows
 from alidade.pipelines.recording.messages import Definition, Language, Layout, Leaf, MessageError, Wire, at
@@ -23,8 +23,6 @@ from alidade.pipelines.recording.translation import Translation, is_foxglove, ro
 
 # Stamps and log times (N,), Unix ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
-Stamps = NDArray[np.int64]
-
 # Message and schema encoding as ROS 2 records.
 ENCODING = "cdr/ros2msg"
 # Encoding of the messages and of their definitions -> byte layout, and language of the definitions.

@@ -10,11 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Mask
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.checks import count
-
-Mask = NDArray[np.bool_]
 
 # A reading frozen for at least so long, s, and so many samples, that jumps to where the sensor has moved meanwhile.
 _FROZEN, _FROZEN_SAMPLES = 0.1, 10

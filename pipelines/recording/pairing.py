@@ -15,9 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array, interpolated
-
-Stamps = NDArray[np.int64]
+from alidade.factors.array import Array, Stamps, interpolated
 
 # Delays looked for, s; steps and length of the grid they are looked for on.
 _LARGEST_DELAY, _FINEST, _MOST = 2.0, 0.002, 1 << 17

@@ -16,10 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Stamps
 from alidade.pipelines.recording import messages
-
-Stamps = NDArray[np.int64]
 
 _XYZW_TO_WXYZ = (3, 0, 1, 2)
 _ABSENT = np.diag([-1.0, 0.0, 0.0])

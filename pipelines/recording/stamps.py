@@ -15,11 +15,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Stamps
 from alidade.pipelines.errors import InputError
-
-Stamps = NDArray[np.int64]
 
 # Smallest step of a clock, s, and as a share of the usual interval.
 MIN_CLOCK_STEP_S, _MIN_STEP_SHARE = 0.02, 0.5

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Stamps
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.checks import likely_time_unit
 
@@ -97,8 +98,6 @@ def _plain(text: str) -> str:
         text = text.replace(sign, letters)
     return re.sub(r"\s+", "", text)
 
-
-Stamps = NDArray[np.int64]
 
 # Stamps beyond these, s, are of another unit: the year 5138; the first too many for integer ns.
 _LATEST_S, _DAY_NS = 1e11, 86_400_000_000_000

@@ -25,8 +25,6 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.table_values import nanoseconds, unit_in, unit_named
 
-Stamps = NDArray[np.int64]
-
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 # A line of a table of sensors is shorter, and has fewer columns.
 _LONGEST_LINE, _MOST_COLUMNS = 1 << 16, 1000

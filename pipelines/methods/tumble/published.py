@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.tumble.recording import TumbleData
@@ -21,8 +21,6 @@ from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
     from alidade.pipelines.methods.tumble.model import Sensor
-
-Array = NDArray[np.float64]
 
 # Nine coefficients and a residual.
 FEWEST = 10

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import accel_square
 from alidade.pipelines.methods import temperature
@@ -19,8 +19,6 @@ from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.recording.streams import Samples, StreamReader, Temperature, white_covariance
 from alidade.pipelines.recording.topics import FIX, IMU, MAG, TEMPERATURE, Need, Setting, wanted
 from alidade.pipelines.settings import Config
-
-Array = NDArray[np.float64]
 
 TOPICS = (MAG, IMU, FIX, TEMPERATURE)
 _METHOD = Setting("`method: tumble` in the config", lambda config: config.method == "tumble")

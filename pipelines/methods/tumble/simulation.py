@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate, gravity, magnetic_field
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import Simulator
@@ -93,8 +93,6 @@ def tumble_config(scenario: TumbleScenario, **more: object) -> str:
         noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
     return recording_config("tumble", scenario, noise, date="2026-11-20", **more)
 
-
-Array = NDArray[np.float64]
 
 # Half the step of the differences that an acceleration is made of, s.
 _STEP = 1e-3

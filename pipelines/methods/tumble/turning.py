@@ -12,10 +12,9 @@ from itertools import permutations, product
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array, interpolated
+from alidade.factors.array import Array, Index, interpolated
 from alidade.factors.earth import EARTH_RATE, earth_rate
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.gyro_chain import GyroChain, shared_keyframes
@@ -38,8 +37,6 @@ from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.recording.plausibility import dead_band, hidden
 from alidade.pipelines.settings import Config
-
-Index = NDArray[np.intp]
 
 BIAS = tuple(f"gyro_bias_{axis}" for axis in "xyz")
 # The usual grade of consumer gyros, one sigma; and how far from their stamps readings of a magnetometer are taken that
