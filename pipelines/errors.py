@@ -1,4 +1,4 @@
-"""Exceptions of known causes, and how names stand in their messages."""
+"""Exceptions of known causes, how names stand in their messages, and the exit codes of what they end."""
 
 from __future__ import annotations
 
@@ -6,6 +6,24 @@ import difflib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Self
+
+# Exit codes of the command line, which a fleet prints for each recording.
+CALIBRATED = 0
+CRASHED = 1
+BAD_INPUT = 2
+UNDETERMINED = 3
+INCONSISTENT = 4
+INTERRUPTED = 130
+KILLED = 137
+
+OF_STATUS = {
+    "calibrated": CALIBRATED,
+    "unobservable": UNDETERMINED,
+    "weak": UNDETERMINED,
+    "inconsistent": INCONSISTENT,
+}
+
+OF_VALIDATION = {"holds": CALIBRATED, "same": CALIBRATED, "unknown": UNDETERMINED, "changed": INCONSISTENT}
 
 # Longer lines help nobody; names in a hostile recording can be as long as it likes.
 _LONGEST = 2000

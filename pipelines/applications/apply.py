@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 
 # Of a sensor's RMS, for the derivatives of its correction.
 _STEP = 1e-3
-# Covariance of what was not measured, as ROS has it.
-_ABSENT = np.diag([-1.0, 0.0, 0.0])
 _SENSORS = {"gyro": "gyro", "accel": "accelerometer", "field": "magnetometer"}
 
 
@@ -180,7 +178,7 @@ def _corrected(
         change[f"{column}_cov"] = np.where(C[:, :1, :1] < 0.0, C, J @ C @ J.T)
     for column in _SENSORS:  # no NaN, which ROS does not have for this
         if hasattr(read, column) and not _is_measured(read, column):
-            change |= {column: np.zeros(3), f"{column}_cov": _ABSENT}
+            change |= {column: np.zeros(3), f"{column}_cov": series.ABSENT}
     if correction.frame:
         change |= {"frame_id": correction.frame} | ({} if is_field else {"wxyz": None, "wxyz_cov": None})
     sensors = tuple(_SENSORS[column] for column in columns)

@@ -20,7 +20,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import clean
 from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.plausibility import implausible, is_there, measured_once
+from alidade.pipelines.recording.plausibility import SI, implausible, is_there, measured_once
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config
 
@@ -30,7 +30,6 @@ _SHORTEST = 16
 _MOST_GYRO_DENSITY = 3e-3
 # Readings that differ by less are one value, SI: no sensor's noise is as small, and its square is lost in rounding.
 _LEAST_SPREAD = 1e-15
-_UNITS = {"gyro": "rad/s", "accel": "m/s^2", "mag": "T"}
 # A step longer than this many intervals may be a loss; it is one if so many stamps on either side agree.
 _STEP, _AROUND = 1.5, 8
 # So many samples lost in a row are filled in, if no more than this part of all is; otherwise a piece ends.
@@ -172,7 +171,7 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
         part = f"{name} {kind}"
         rows = measured_once(part, values, dropped)
         # At rest a coarse sensor may read one value, which is noted below.
-        sound = rows[drop_faults(part, t[rows], values[rows], dropped, _UNITS[kind], may_stand=True)]
+        sound = rows[drop_faults(part, t[rows], values[rows], dropped, SI[kind], may_stand=True)]
         pieces, interval, filled = _pieces(t[sound], values[sound], rests)
         if not pieces:
             raise InputError(f"topic {part}: too many samples are missing in the {len(rests)} static intervals")
@@ -185,7 +184,7 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
                 notes.append(f"{part}: axis {letter} reads the same value whenever it is at rest")
         count = sum(len(piece) for piece in pieces)
         if axes:
-            yield SensorNoise(name, kind, _UNITS[kind], 1.0 / interval, rests, count, filled, axes)
+            yield SensorNoise(name, kind, SI[kind], 1.0 / interval, rests, count, filled, axes)
     notes += [f"{reason}: {number}" for reason, number in dropped.items()]
 
 

@@ -16,7 +16,7 @@ from alidade.pipelines.recording.checks import count
 
 SI = {"accel": "m/s^2", "gyro": "rad/s", "mag": "T"}
 # Median norms that an accelerometer in m/s^2 and a magnetometer in T show, and in which unit others are likely to be.
-_PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
+PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
 _ACCEL_UNITS = {"g": (0.5, 2.0), "mg": (500.0, 2000.0), "raw counts": (2000.0, np.inf)}
 _MAG_UNITS = {"gauss": (0.05, 5.0), "uT": (5.0, 1000.0), "mG or raw counts": (1000.0, 2e4), "nT": (2e4, np.inf)}
 _LIKELY = {"accel": _ACCEL_UNITS, "mag": _MAG_UNITS}
@@ -61,7 +61,7 @@ def implausible(kind: str, values: Array) -> str:
         kind: accel, gyro or mag.
         values: m/s^2, rad/s or T, as they should be; rows with NaN do not count.
     """
-    if kind not in _PLAUSIBLE:
+    if kind not in PLAUSIBLE:
         return ""
     norms = np.linalg.norm(values[np.isfinite(values).all(axis=1)], axis=1)
     if not len(norms):
@@ -71,7 +71,7 @@ def implausible(kind: str, values: Array) -> str:
     problem = f"{what} has a norm of {norm:.4g} (median), implausible in {SI[kind]}"
     if kind == "accel" and lacks_gravity(norms):
         return f"{problem}; {GRAVITY_REMOVED}"
-    low, high = _PLAUSIBLE[kind]
+    low, high = PLAUSIBLE[kind]
     if low <= norm <= high:
         return ""
     likely = likely_unit(kind, norm)
@@ -86,7 +86,7 @@ def likely_unit(kind: str, norm: float) -> str:
 def lacks_gravity(norms: Array) -> bool:
     """Whether accelerometer norms (N,), m/s^2 or g, are those of motion with gravity removed."""
     norm = float(np.median(norms))
-    if len(norms) < _FEWEST or norm > _PLAUSIBLE["accel"][1] or any(low < norm < high for low, high in _WITH_GRAVITY):
+    if len(norms) < _FEWEST or norm > PLAUSIBLE["accel"][1] or any(low < norm < high for low, high in _WITH_GRAVITY):
         return False
     return bool(np.mean(norms < _LOW * norm) > _LOW_SHARE)
 

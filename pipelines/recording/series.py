@@ -20,7 +20,8 @@ from alidade.factors.array import Array, Stamps
 from alidade.pipelines.recording import messages
 
 _XYZW_TO_WXYZ = (3, 0, 1, 2)
-_ABSENT = np.diag([-1.0, 0.0, 0.0])
+# Covariance of what was not measured, as ROS has it.
+ABSENT = np.diag([-1.0, 0.0, 0.0])
 _FILLED_IN: Any = None
 
 
@@ -74,7 +75,7 @@ class ImuSeries(Series):
         "accel_cov": Column("linear_acceleration_covariance", (3, 3)),
         "wxyz_cov": Column("orientation_covariance", (3, 3)),
     }
-    DEFAULTS: ClassVar[dict[str, ArrayLike]] = {"wxyz": [1.0, 0.0, 0.0, 0.0], "wxyz_cov": _ABSENT}
+    DEFAULTS: ClassVar[dict[str, ArrayLike]] = {"wxyz": [1.0, 0.0, 0.0, 0.0], "wxyz_cov": ABSENT}
 
     gyro: Array
     accel: Array = _FILLED_IN

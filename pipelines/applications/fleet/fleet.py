@@ -14,8 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from alidade.pipelines import methods
-from alidade.pipelines.applications import exit_codes
+from alidade.pipelines import errors, methods
 from alidade.pipelines.applications.fleet import require_extra
 from alidade.pipelines.applications.fleet.engine import Killed, source_version, work_off
 from alidade.pipelines.applications.fleet.histories import packed
@@ -111,7 +110,7 @@ class Outcome:
         """Summary in a few lines: how many recordings, with what verdicts, and what was quarantined."""
         done = f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run"
         lines = [f"{done}: {self.verdicts}"]
-        aside = [name for name, result in self.results.items() if result["exit_code"] == exit_codes.KILLED]
+        aside = [name for name, result in self.results.items() if result["exit_code"] == errors.KILLED]
         lines += [f"quarantined, it kills workers: {name}" for name in aside]
         return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
 
@@ -188,7 +187,7 @@ def calibrate_recording(
                     return None
                 return {**result, "tag": recording.tag, **_calibrated(path, settings, prior)}
     except (OSError, InputError) as error:
-        return failure(exit_codes.BAD_INPUT, str(error))
+        return failure(errors.BAD_INPUT, str(error))
 
 
 def _inputs(result: RecordingResult | None) -> tuple[str, str | None] | None:

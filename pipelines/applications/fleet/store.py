@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Required, TypeVar
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import TypedDict  # pydantic needs it below Python 3.12, and brings it
 
-from alidade.pipelines.applications import exit_codes
+from alidade.pipelines import errors
 from alidade.pipelines.errors import InputError
 
 if TYPE_CHECKING:
@@ -181,17 +181,17 @@ def run_isolated(summarise: Callable[[Calibration], dict[str, Any]], calibrate: 
         calibration = calibrate()
         return {
             "status": calibration.status,
-            "exit_code": exit_codes.OF_STATUS[calibration.status],
+            "exit_code": errors.OF_STATUS[calibration.status],
             "reason": "" if calibration.status == "calibrated" else calibration.headline,
             "seconds": sum(calibration.timing.values()),
             **summarise(calibration),
         }
     except InputError as error:
-        return failure(exit_codes.BAD_INPUT, str(error))
+        return failure(errors.BAD_INPUT, str(error))
     except IndeterminateError as error:
-        return failure(exit_codes.UNDETERMINED, str(error))
+        return failure(errors.UNDETERMINED, str(error))
     except Exception as error:
-        return failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
+        return failure(errors.CRASHED, f"{type(error).__name__}: {error}")
 
 
 def failure(exit_code: int, reason: str) -> Any:
@@ -201,7 +201,7 @@ def failure(exit_code: int, reason: str) -> Any:
 
 def quarantined() -> Any:
     """The result recorded for a calibration that killed its workers."""
-    return failure(exit_codes.KILLED, "killed its worker each time it was tried, at last alone; quarantined")
+    return failure(errors.KILLED, "killed its worker each time it was tried, at last alone; quarantined")
 
 
 # What text begins with that spreadsheets take for a formula (OWASP, CSV injection); an apostrophe before it says text.

@@ -30,11 +30,9 @@ from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, f
 from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, NO_RATE, TumbleData
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
-from alidade.pipelines.recording.plausibility import DEAD_BAND, SI, dead_band, likely_unit
+from alidade.pipelines.recording.plausibility import DEAD_BAND, PLAUSIBLE, SI, dead_band, likely_unit
 from alidade.pipelines.settings import Config
 
-# Plausible norms of readings with their offset, SI; others are counts.
-_PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
 # Standard gravity, and what it is off by where the latitude is unknown, m/s^2.
 _GRAVITY, _GRAVITY_SIGMA = 9.80665, 0.02
 # Fewer rests do where the device is at rest for more than this share of the time: what lies between is handling, at
@@ -572,7 +570,8 @@ def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: 
 
 
 def _is_si(name: str, raw: Array) -> bool:
-    low, high = _PLAUSIBLE[name]
+    """Whether the norms of readings with their offset are plausible in SI; others are counts."""
+    low, high = PLAUSIBLE[name]
     return low <= float(np.median(np.linalg.norm(raw, axis=1))) <= high
 
 
