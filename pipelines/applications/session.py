@@ -484,6 +484,7 @@ class Session:
                 elsewhere=others,
                 engine=self.engine,
                 error_map=True,
+                steps=True,
             )
             return estimate, problem
 

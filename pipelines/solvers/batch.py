@@ -161,6 +161,7 @@ def solve_batch(
     elsewhere: Callable[[SqrtInformation], Mapping[str, float]] | None = None,
     engine: EngineName = "auto",
     error_map: bool = False,
+    steps: bool = False,
 ) -> Estimate:
     """Compute the maximum a-posteriori estimate with the joint covariance of all parameters.
 
@@ -174,6 +175,7 @@ def solve_batch(
         elsewhere: of what it says, linear about its solution, the numbers about which it is to be linear instead.
         engine: that eliminates the linear systems.
         error_map: whether to look for errors of measurements that depend on where they are made.
+        steps: whether to test for a step of what `Problem.step_candidates` names.
 
     Raises:
         IndeterminateStateError: states other than the parameters are not determined.
@@ -183,7 +185,7 @@ def solve_batch(
     built = time.perf_counter()
     solved = solve(compiled, LevenbergConfig(max_iterations))
     found = time.perf_counter()
-    estimate = whole_estimate(solved, budget, changed)
+    estimate = whole_estimate(solved, budget, changed, steps)
     if device:
         estimate = replace(estimate, sqrt_info=_information_of(solved, device, elsewhere))
     if error_map:
@@ -216,7 +218,9 @@ def _best(compiled: Compiled, solution: Solution, config: LevenbergConfig) -> tu
     return best, None
 
 
-def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple[str, Problem]] = ()) -> Estimate:
+def whole_estimate(
+    solved: Solved, budget: bool = False, changed: Iterable[tuple[str, Problem]] = (), steps: bool = False
+) -> Estimate:
     """Compute the complete estimate of a solution, with covariance and diagnostics; see `solve_batch`."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, posterior.at
@@ -234,11 +238,11 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
     covariance = nominal.copy()
     covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
     by = sigma_ratio(np.diag(nominal), np.diag(covariance))
-    sandwich, steps, wide, innovations = None, None, by, dict[str, Residuals]()
+    sandwich, largest, wide, innovations = None, None, by, dict[str, Residuals]()
     if problem.marginal_likelihood and engine.is_chain and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
         innovations = innovations_of(compiled, solved.levels, solved.solution) if budget else innovations
-        steps = largest_steps(compiled, solved.levels, solved.solution)
+        largest = largest_steps(compiled, solved.levels, solved.solution) if steps else None
         widened = slow_widening(sandwich, len(names))
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
     history = posterior_history(compiled, posterior)
@@ -250,7 +254,7 @@ def whole_estimate(solved: Solved, budget: bool = False, changed: Iterable[tuple
         covariance=covariance,
         inflation=by,
         sandwich=sandwich,
-        steps=steps,
+        steps=largest,
         colours={family: noise.together for family, noise in noises.items()},
         converged=solved.converged,
         message=solved.message,

@@ -230,7 +230,7 @@ class IncrementalSolver:
         if self.initialising and len(self.steps_since) > self._of[0]:
             self._solve_batch()  # which may end the initialisation phase
         if self.initialising:
-            self._estimate = self._estimate_of(self._batch())
+            self._estimate = self._estimate_of(self._batch(), steps=True)
         return replace(self.estimate(), seconds={"solve": seconds})
 
     def estimate(self) -> Estimate:
@@ -242,9 +242,9 @@ class IncrementalSolver:
             self._estimate = self._estimate_of(replace(solved, posterior=self._posterior_of(solved)))
         return self._estimate
 
-    def _estimate_of(self, solved: Solved) -> Estimate:
+    def _estimate_of(self, solved: Solved, steps: bool = False) -> Estimate:
         """Return the estimate of a batch solution, with the run's history and rejected measurements."""
-        estimate = whole_estimate(solved)
+        estimate = whole_estimate(solved, steps=steps)
         return replace(
             estimate,
             solver="incremental",

@@ -38,6 +38,7 @@ from alidade.pipelines.solvers.marginal_likelihood import (
     LinearChain,
     Rows,
     Widening,
+    add_blocks,
     maximise_likelihood,
     sandwich,
     unwidened,
@@ -162,8 +163,8 @@ def _filtered(chain: LinearChain, variances: Sequence[Array]) -> _Pass:
         if len(rows.states) == 1:
             ((at, J),) = rows.states
             weighed = np.swapaxes(J, 1, 2) / variance[:, None, None]
-            np.add.at(H, at, weighed @ J)
-            np.add.at(g, at, weighed @ rows.right())
+            add_blocks(H, at, weighed @ J)
+            add_blocks(g, at, weighed @ rows.right())
     X, P, Y, R = np.zeros((n, d, q)), np.zeros((n, d, d)), np.zeros((n, d, q)), np.zeros((n, d, d))
     unit = np.eye(d)
     for k in range(n):
@@ -181,7 +182,7 @@ def _beside(chain: LinearChain, variances: Sequence[Array], begin: int, end: int
             at = rows.states[0][0]
             some = np.flatnonzero((at >= begin) & (at < end))
             both = rows.right(some)
-            np.add.at(out, at[some] - begin, np.swapaxes(both, 1, 2) @ both / variance[some, None, None])
+            add_blocks(out, at[some] - begin, np.swapaxes(both, 1, 2) @ both / variance[some, None, None])
     return out
 
 

@@ -120,9 +120,10 @@ class WeakDirections:
         others = np.linalg.svd(weak, full_matrices=True)[0][:, w:] if w else np.eye(len(R))
         T = np.asarray(np.linalg.qr(R @ np.hstack([others, weak]), mode="r"), dtype=float)
         k = others.shape[1]
-        own, slope = np.linalg.svd(T[:k, :k]), np.linalg.lstsq(T[:k, :k], T[:k, k:], rcond=None)[0]
+        own = np.linalg.svd(T[:k, :k])
         root = own[2].T / np.maximum(own[1], UNDETERMINED)
         if w:
+            slope = np.linalg.lstsq(T[:k, :k], T[:k, k:], rcond=None)[0]
             prior = np.linalg.inv(weak.T @ precision @ weak)
             root = np.hstack([root, slope @ np.linalg.cholesky(prior)])
         try:

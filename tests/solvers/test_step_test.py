@@ -60,7 +60,7 @@ def sparse(data: HeadData, kept: np.ndarray) -> HeadData:
 def found(data: HeadData) -> tuple[Estimate, Finding | None]:
     """The estimate of a recording, and the finding on a step in it."""
     of = problem(data)
-    estimate = solve_batch(of)
+    estimate = solve_batch(of, steps=True)
     assert estimate.steps is not None
     return estimate, step_finding(estimate.steps, DURATION_S, of.quantities)
 
@@ -195,7 +195,7 @@ def test_hardly_any_simulated_recording_is_called_changed() -> None:
     called, largest = 0, []
     for seed in range(40):
         session = alidade.open(alidade.simulate("head", {"duration_s": 60.0, "gyro_rate_hz": 100.0}, seed))
-        estimate = solve_batch(session.problem())
+        estimate = solve_batch(session.problem(), steps=True)
         assert estimate.steps is not None
         called += step_finding(estimate.steps, 60.0, session.problem().quantities) is not None
         largest.append(estimate.steps[0].statistic)
