@@ -84,6 +84,12 @@ def local_cluster() -> Iterator[str]:
 
 
 @pytest.fixture
+def few_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An incremental run's first phase is solved at 1, 2, 4, ... s; by default at 1, 1.15, 1.15^2, ... s."""
+    monkeypatch.setattr("alidade.pipelines.solvers.incremental.SOLVE_GROWTH", 2.0)
+
+
+@pytest.fixture
 def alidade(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
     """Runs the command in this process (imports paid once)."""
 

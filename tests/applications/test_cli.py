@@ -72,6 +72,7 @@ def test_calibrate_writes_everything(alidade: Command, session: Path, tmp_path: 
     assert run.err == ""
 
 
+@pytest.mark.usefixtures("few_solutions")
 @pytest.mark.parametrize("solver", ["incremental", "published"])
 def test_other_solvers_write_estimates_over_time(alidade: Command, brief: Path, tmp_path: Path, solver: str) -> None:
     run = alidade("calibrate", brief, "--solver", solver, "--out", tmp_path / "out")
@@ -80,6 +81,7 @@ def test_other_solvers_write_estimates_over_time(alidade: Command, brief: Path, 
     assert json.loads((tmp_path / "out" / "result.json").read_text())["solver"] == solver
 
 
+@pytest.mark.usefixtures("few_solutions")
 def test_compare_shows_truth_and_three_solvers_and_splits_the_recording_that_it_read(
     alidade: Command, brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -111,8 +111,7 @@ def _outliers(session: Session) -> Session:
     return replace(session, data=replace(session.data, error=error))
 
 
-@pytest.mark.parametrize("wrong", [_in_degrees, _outliers])
-@pytest.mark.parametrize("solver", ["batch", "incremental"])
+@pytest.mark.parametrize(("wrong", "solver"), [(_outliers, "batch"), (_in_degrees, "incremental")])
 def test_where_nothing_fits_there_is_a_result_in_time(
     wrong: Callable[[Session], Session], solver: str, recording: Path
 ) -> None:
@@ -152,6 +151,7 @@ def test_a_result_is_written_when_the_time_is_over(alidade: Command, recording: 
     assert (tmp_path / "out" / "report.html").exists()
 
 
+@pytest.mark.usefixtures("few_solutions")
 def test_compare_and_validate_say_what_the_time_limit_stopped(
     alidade: Command, recording: Path, tmp_path: Path
 ) -> None:

@@ -20,7 +20,7 @@ from tests.support.judged import judge
 
 STILL = EulerMotion()
 HEAD = HeadScenario(duration_s=12.0, head=STILL, vision_rate_hz=10.0, gyro_rate_hz=100.0, sensors=Sensors())
-LOS = LosScenario(duration_s=10.0, carrier=STILL, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+LOS = LosScenario(duration_s=10.0, carrier=STILL, image_rate_hz=10.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0)
 
 
 def head_at_rest(seed: int) -> Problem:

@@ -13,7 +13,7 @@ from alidade.pipelines.reports.result_json import result
 from alidade.pipelines.reports.sentences import REST, limits
 from tests.support.pages import Page
 
-SHORT = {"duration_s": 15.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 15.0}
+SHORT = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 10.0}
 
 
 def calibration(**sensors: object) -> Calibration:

@@ -101,7 +101,7 @@ def first_hypothesis(case: Case) -> str:
 def findings(case: Case) -> tuple[Finding, ...]:
     """Of the whole calibration, which need not have converged."""
     found, data, config = case
-    return Session(found, data, config).calibrate().findings
+    return Session(found, data, config).calibrate(report=False).findings
 
 
 def first_of_calibration(case: Case) -> str:
@@ -131,7 +131,7 @@ def test_noise_stated_three_times_too_small_is_no_cause_and_told(head: Case) -> 
 def test_noise_known_exactly_and_three_times_too_small_does_not_fit() -> None:
     find, data, config = head_of(5.0)
     known = with_noise(config, vision_attitude=1.0 / 3.0).model_copy(update={"noise_known": 0.0})
-    calibration = Session(find, data, known).calibrate()
+    calibration = Session(find, data, known).calibrate(report=False)
     assert calibration.status == "inconsistent"
     assert any(f.kind == "misfit" and f.evidence["largest"] == "vision" for f in calibration.findings)
 
@@ -479,5 +479,5 @@ def test_a_noise_many_times_larger_is_never_an_explanation(head: Case) -> None:
 def test_a_platform_taken_for_at_rest_is_a_note() -> None:
     import alidade
 
-    calibration = alidade.open(alidade.simulate("head", {"duration_s": 10.0}, seed=1)).calibrate()
+    calibration = alidade.open(alidade.simulate("head", {"duration_s": 10.0}, seed=1)).calibrate(report=False)
     assert "No platform IMU: the platform counts as at rest" in calibration.notes

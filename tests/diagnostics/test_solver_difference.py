@@ -34,6 +34,7 @@ def test_the_largest_difference_is_told() -> None:
     assert solver_difference(batch, replace(batch, converged=False)) is None
 
 
+@pytest.mark.usefixtures("few_solutions")
 @pytest.mark.parametrize("option", [[], ["--no-check"]])
 def test_the_result_has_it_unless_it_is_not_wanted(option: list[str], tmp_path: Path) -> None:
     data, truth = simulate_los(SCENARIO, 1)

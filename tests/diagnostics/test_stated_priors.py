@@ -20,7 +20,7 @@ _PLATFORM = {
     axis: [{"amplitude_deg": size, "frequency_hz": f}]
     for axis, size, f in (("yaw", 10, 0.11), ("pitch", 6, 0.17), ("roll", 8, 0.23))
 }
-HEAD = {"duration_s": 40, "gyro_rate_hz": 50, "vision_rate_hz": 8, "platform": _PLATFORM, "sensors": "ideal"}
+HEAD = {"duration_s": 30, "gyro_rate_hz": 50, "vision_rate_hz": 6, "platform": _PLATFORM, "sensors": "ideal"}
 LOS = {"duration_s": 30, "gyro_rate_hz": 100, "gimbal_rate_hz": 100, "image_rate_hz": 15}
 
 

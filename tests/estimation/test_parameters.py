@@ -158,8 +158,8 @@ def test_without_acceleration_g_sensitivity_is_fixed_with_a_finding(tmp_path: Pa
 
 
 def test_result_and_report_tell_assumptions_apart(alidade: Command, tmp_path: Path) -> None:
-    data, truth = _recording()
-    method("head").write_data(tmp_path / "s.mcap", data, truth, head_config(_scenario()))
+    brief = HeadScenario(duration_s=4.0, vision_rate_hz=10.0, gyro_rate_hz=50.0)
+    method("head").write_data(tmp_path / "s.mcap", *simulate_head(brief, 1), head_config(brief))
     alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
     parameters = {p["name"]: p for p in json.loads((tmp_path / "out" / "result.json").read_text())["parameters"]}
     scale, mount = parameters["gyro_scale_x"], parameters["helmet_mount_x"]

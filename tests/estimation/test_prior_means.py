@@ -98,6 +98,7 @@ def test_a_prior_of_which_no_solution_can_be_made_is_one_line(case: str) -> None
         with_priors(head_problem(), [gaussian_prior])
 
 
+@pytest.mark.usefixtures("few_solutions")
 def test_incremental_takes_the_same_prior() -> None:
     simulated = alidade.simulate("indexer", COARSE, seed=1)
     problem, truth = alidade.open(simulated).problem(), simulated.truth["theta_y"]
@@ -225,7 +226,7 @@ def test_yesterdays_result_with_todays_recording_is_both_together(case: str, tmp
     shared = walks(first.method, first.config, [q.name for q in first.problem().quantities])
     both = solve_batch(one_graph([first.problem(), second.problem()], shared))
     first.calibrate().write(tmp_path)
-    recursive = second.beginning_from(tmp_path / "result.json").calibrate().estimate
+    recursive = second.beginning_from(tmp_path / "result.json").calibrate(report=False).estimate
     for i, known in enumerate(recursive.names):
         of = both.names.index(known if known in shared else f"{known}@1")
         if recursive.sigmas[i] > 0.0:

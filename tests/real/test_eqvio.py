@@ -47,6 +47,7 @@ def test_two_views_give_a_mount_to_start_with(recording: eqvio.Recording, guess:
     assert _off(guess[0], recording) < 0.5
 
 
+@pytest.mark.slow
 def test_a_third_of_the_recording_gives_the_published_mount(
     recording: eqvio.Recording, guess: tuple[Array, Array]
 ) -> None:

@@ -64,6 +64,7 @@ def test_with_its_true_data_sheet_the_mount_is_right(recording: Path) -> None:
     assert all(p.value > 5.0 * p.sigma for p in scales)
 
 
+@pytest.mark.slow
 def test_its_last_twenty_seconds_alone_agree(recording: Path) -> None:
     """About states that follow vision's noise, levels at which the gyro's scale is -1 seem likelier."""
     session = alidade.open(recording, method="head", config=alidade.Config(sensors={"gyro": {"scale": 0.1}}))

@@ -13,7 +13,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 
 
-@pytest.mark.parametrize("every", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_clock_is_named(shared_data: Path, every: int) -> None:
     recording = shared_data / "openaxes_robot" / "circle-100_radius.mcap"
     whole = alidade.open(recording, method="head").data

@@ -84,8 +84,18 @@ def assert_same(ours: Any, theirs: Any, where: str) -> None:
         assert ours == theirs, where
 
 
-@pytest.mark.parametrize("form", forms.FORMS)
-@pytest.mark.parametrize("name", BRIEF)
+# Every form with head's messages, and one of each family with those of the others.
+OF_ALL = ("rosbag2 sqlite", "ros 1 lz4", "mcap json", "mcap protobuf")
+
+
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        pytest.param(name, form, marks=[pytest.mark.slow] * (name != "head" and form not in OF_ALL))
+        for name in BRIEF
+        for form in forms.FORMS
+    ],
+)
 def test_every_method_reads_the_same_out_of_every_form(
     name: str, form: str, sources: Any, as_recorded: Any, tmp_path: Path
 ) -> None:

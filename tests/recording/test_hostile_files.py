@@ -165,13 +165,12 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[str, f
     return {name: (error, seconds, peak) for name, error, seconds, peak in lines}
 
 
-@pytest.mark.parametrize("case", HOSTILE)
-def test_a_hostile_file_is_refused_in_one_line(case: str, measured: dict[str, tuple[str, float, float]]) -> None:
-    error, seconds, _ = measured[case]
-    assert error
-    assert error.isprintable()
-    assert len(error) < 3000
-    assert seconds < 10.0
+def test_a_hostile_file_is_refused_in_one_line(measured: dict[str, tuple[str, float, float]]) -> None:
+    assert measured.keys() == HOSTILE.keys()
+    for case, (error, seconds, _) in measured.items():
+        assert 0 < len(error) < 3000, case
+        assert error.isprintable(), case
+        assert seconds < 10.0, case
 
 
 def test_hostile_files_take_little_memory(measured: dict[str, tuple[str, float, float]]) -> None:

@@ -26,7 +26,7 @@ def test_a_browser_draws_the_report_at_the_width_of_a_desktop_and_of_a_phone(nam
     (tmp_path / "scenario.yaml").write_text(SCENARIOS[name])
     simulate(name, str(tmp_path / "scenario.yaml"), 1, tmp_path / "s.mcap")
     solver = "incremental" if name == "los" else "batch"
-    (calibration,) = calibrate(tmp_path / "s.mcap", [solver])
+    (calibration,) = calibrate(tmp_path / "s.mcap", [solver], report=True)
     text = report_html(calibration)
     assert drawn(text, tmp_path) == text.count('class="plot"') > 4
 
@@ -39,7 +39,7 @@ SHEETS = {"los": 5, "indexer": 5, "head": 5, "cube": 8, "tumble": 4}
 @pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "tumble")) for n in SHEETS])
 def test_a_printed_report_is_short(name: str, tmp_path: Path) -> None:
     simulate(name, None, 1, tmp_path / "s.mcap")
-    (calibration,) = calibrate(tmp_path / "s.mcap", ["batch"])
+    (calibration,) = calibrate(tmp_path / "s.mcap", ["batch"], report=True)
     assert 1 < sheets(report_html(calibration), tmp_path) <= SHEETS[name]
 
 

@@ -29,7 +29,7 @@ SCENARIOS = {"indexer": COARSE, "head": {"duration_s": 10.0, "gyro_rate_hz": 50.
 def calibration(request: pytest.FixtureRequest) -> Calibration:
     chosen = method(request.param)
     scenario = chosen.scenario.model_validate(SCENARIOS[request.param])
-    return Session.of(chosen, chosen.simulate(scenario, 1)).calibrate()
+    return Session.of(chosen, chosen.simulate(scenario, 1)).calibrate(report=False)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_a_cubes_mounts_are_those_of_its_config_corrected() -> None:
     simulated = cube.simulate(
         cube.scenario.model_validate({"poses": 4, "static_s": 1.0, "imu_rate_hz": 50.0, "camera": {"rate_hz": 2.0}}), 0
     )
-    calibration = Session.of(cube, simulated).calibrate()
+    calibration = Session.of(cube, simulated).calibrate(report=False)
     transforms = saved(calibration).transforms
     assert (transforms["BRC"].parent, transforms["BRC"].child) == ("reference", "camera")
     given = np.array(cube.report.fixed_rotations(calibration.config)["camera_rotation"])

@@ -22,6 +22,7 @@ from alidade.pipelines.methods.los.recording import read_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
+from alidade.pipelines.solvers import incremental
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental
@@ -34,7 +35,7 @@ BRISK = EulerMotion(
     yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
 )
 SCENARIO = LosScenario(
-    duration_s=66.0, carrier=BRISK, image_rate_hz=3.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL
+    duration_s=51.0, carrier=BRISK, image_rate_hz=3.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL
 )
 IDENTITY = {"recording": "first", "config": "{}"}
 
@@ -82,13 +83,16 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
     made = problem(read_los(recording, config), config)
     run = IncrementalSolver(made, 1.0)
     times = 0
-    for step in made.steps(1):
-        run.add_step(step)
-        if run.can_checkpoint:
-            times += 1
-            if times == 1:
-                save_checkpoint(checkpoint, run.state, IDENTITY)
-                levels = run.state.levels
+    with pytest.MonkeyPatch.context() as patch:  # an initialisation phase of twenty steps
+        patch.setattr(incremental, "SOLVE_GROWTH", 2.0)
+        patch.setattr(incremental, "MIN_STEPS", 20)
+        for step in made.steps(1):
+            run.add_step(step)
+            if run.can_checkpoint:
+                times += 1
+                if times == 1:
+                    save_checkpoint(checkpoint, run.state, IDENTITY)
+                    levels = run.state.levels
     assert times > 1, "the past has to be marginalised out again after the one that is saved"
     return Saved(session, checkpoint, made, levels, run.finish(0.0))
 
@@ -179,6 +183,7 @@ def test_a_checkpoint_takes_the_place_of_the_old_one_whole_or_not_at_all(
     assert [p.name for p in tmp_path.iterdir()] == ["c"]
 
 
+@pytest.mark.usefixtures("few_solutions", "early_smoother")
 def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
     """Attitudes from before the past was marginalised out were recorded then, and only then: none is lost."""
     whole = FixedLagSmoother.update

@@ -83,6 +83,7 @@ def test_independent_simulator_within_three_sigma(shared_data: Path) -> None:
     assert np.abs((estimate.values - expected) / estimate.sigmas).max() < 3.0
 
 
+@pytest.mark.usefixtures("few_solutions")
 def test_ends_where_batch_does_with_real_sensors() -> None:
     scenario = load_scenario(IndexerScenario, "indexer_nominal").model_copy(
         update={"sensors": Sensors(), "gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}

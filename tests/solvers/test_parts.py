@@ -12,13 +12,13 @@ from alidade.factors import model
 from alidade.pipelines.solvers import chain, linearization
 
 RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
-    "los": ("los", {"duration_s": 8.0, "image_rate_hz": 20.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 50.0}),
+    "los": ("los", {"duration_s": 6.0, "image_rate_hz": 15.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 50.0}),
     "head": ("head", {"duration_s": 20.0}),
     "indexer": ("indexer", {}),
     "cube": ("cube", {}),
     "a bias that walks": (
         "head",
-        {"duration_s": 20.0, "vision_rate_hz": 12.0, "gyro_rate_hz": 100.0, "noise": {"gyro_bias_walk": 3e-4}},
+        {"duration_s": 14.0, "vision_rate_hz": 10.0, "gyro_rate_hz": 100.0, "noise": {"gyro_bias_walk": 3e-4}},
     ),
 }
 

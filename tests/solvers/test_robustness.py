@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import alidade
 from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Problem
-from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube import model as cube
 from alidade.pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube, simulated
 from alidade.pipelines.methods.indexer import model as indexer
@@ -26,7 +25,6 @@ from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from alidade.pipelines.solvers.linearization import Group
 from tests.support.judged import judge
-from tests.support.solved import calibrate
 
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
@@ -138,12 +136,11 @@ def test_gross_tag_corners_cost_no_more_than_knowing_them_would() -> None:
     assert _worst(estimate, truth) < 4.0
 
 
-def test_an_estimate_that_is_no_solution_is_never_calibrated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    data, truth = simulate_los(LOS.model_copy(update={"duration_s": 5.0}), 1)
-    method("los").write_data(tmp_path / "s.mcap", data, truth, los_config(LOS))
+def test_an_estimate_that_is_no_solution_is_never_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = alidade.open(alidade.simulate("tumble", {"attitudes": 12, "magnetometer": {"rate_hz": 10.0}}))
     # What gtsam's own optimizers return silently as if it was a solution.
     monkeypatch.setattr(Group, "cost", lambda *_: np.nan)
-    (found,) = calibrate(tmp_path / "s.mcap", ["batch"])
+    found = opened.calibrate(report=False)
     assert found.status == "inconsistent"
     assert [finding.kind for finding in found.findings] == ["not_converged"]
     assert found.headline.startswith("No solution: the residuals at the start are not")

@@ -62,7 +62,7 @@ def test_batch_is_the_closed_form(seed: int) -> None:
     assert estimate.chi_square.value == pytest.approx(square, rel=1e-9)
 
 
-RUNS = pytest.mark.parametrize("runs", [25, pytest.param(200, marks=pytest.mark.slow)])
+RUNS = pytest.mark.parametrize("runs", [15, pytest.param(200, marks=pytest.mark.slow)])
 
 
 @RUNS
@@ -167,7 +167,7 @@ def test_history_is_what_batch_finds_on_the_data_so_far(window: float | None) ->
         np.testing.assert_allclose(sigma, np.sqrt(np.diag(covariance)), rtol=1e-5)
 
 
-@pytest.mark.parametrize("runs", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [3, pytest.param(20, marks=pytest.mark.slow)])
 def test_innovations_are_white(runs: int) -> None:
     """Their squares have the mean of their dimension."""
     squares = []

@@ -42,6 +42,7 @@ def in_batch(method: str) -> tuple[Problem, Estimate]:
 QUICK = [("los", None), ("head", Keyframes(10))]
 
 
+@pytest.mark.usefixtures("few_solutions")
 @pytest.mark.parametrize(
     ("method", "window"),
     [
@@ -62,6 +63,7 @@ def test_every_window_ends_where_batch_does(method: str, window: float | None, m
     np.testing.assert_allclose(incremental.sigmas[free], batch.sigmas[free], rtol=0.05)
 
 
+@pytest.mark.usefixtures("few_solutions")
 @pytest.mark.parametrize(
     ("method", "changes"),
     [

@@ -13,7 +13,7 @@ from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 
-LOS = LosScenario(duration_s=15.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+LOS = LosScenario(duration_s=12.0, image_rate_hz=12.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.05)],
     pitch=[Swing(amplitude_deg=8, frequency_hz=0.11)],

@@ -11,7 +11,7 @@ from alidade.pipelines.reports.result import Calibration
 
 
 def calibrate(
-    path: Where, solvers: Sequence[str], method: str | None = None, config: Path | None = None
+    path: Where, solvers: Sequence[str], method: str | None = None, config: Path | None = None, report: bool = False
 ) -> list[Calibration]:
-    """One calibration a solver, from one reading of a recording."""
-    return open_session(path, method, config).calibrations(solvers)
+    """One calibration a solver, from one reading of a recording; with what a report explains only where asked for."""
+    return open_session(path, method, config).calibrations(solvers, report=report)

@@ -247,7 +247,7 @@ def test_tags_whose_own_pose_no_picture_tells_are_placed() -> None:
 
 
 def test_false_detections_are_left_out() -> None:
-    drawn, rng = scene(14, 45, 1), np.random.default_rng(1)
+    drawn, rng = scene(14, 36, 1), np.random.default_rng(1)
     many = [k for k, seen in enumerate(drawn.pictures) if len(seen) > 3][::3]
     for k in many:
         seen = drawn.pictures[k]

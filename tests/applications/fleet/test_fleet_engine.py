@@ -121,17 +121,17 @@ def rows_of(out: Path) -> list[dict[str, str]]:
 def test_a_worker_killed_midway_costs_nothing(start: Start, scheduler: str, recordings: Path, tmp_path: Path) -> None:
     first, second = worker(start, scheduler), worker(start, scheduler)
     out = tmp_path / "out"
-    command = start("alidade", "fleet", recordings / "U0*.mcap", "--scheduler", scheduler, "--out", out)
-    until(lambda: len(finished(out)) >= 2)
+    command = start("alidade", "fleet", recordings / "U0[0-5].mcap", "--scheduler", scheduler, "--out", out)
+    until(lambda: len(finished(out)) >= 1)
     first.send_signal(signal.SIGKILL)
-    assert len(finished(out)) < 8, "too fast to be midway"
+    assert len(finished(out)) < 4, "too fast to be midway"
     output, error = command.communicate(timeout=60)
     assert (command.returncode, error) == (0, "")
-    assert "10 of 10 recordings, 0 from an earlier run" in output
+    assert "6 of 6 recordings, 0 from an earlier run" in output
     rows = rows_of(out)
-    assert [Path(row["recording"]).name for row in rows] == [f"U{i:02}.mcap" for i in range(10)]
+    assert [Path(row["recording"]).name for row in rows] == [f"U{i:02}.mcap" for i in range(6)]
     assert {row["status"] for row in rows} <= {"calibrated", "weak"}
-    assert len(finished(out)) == 10
+    assert len(finished(out)) == 6
     assert first.wait() == -signal.SIGKILL
     assert second.poll() is None
 

@@ -56,18 +56,18 @@ def write(path: Path, seed: int, mount_deg: Any, one_axis: bool = False) -> Path
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """15 units at one date and 6 at two, among them four faults."""
+    """Nine units at one date and five at two, among them four faults."""
     folder = tmp_path_factory.mktemp("recordings")
     rng = np.random.default_rng(5)
-    for unit in range(21):
+    for unit in range(14):
         mount = UNITS_VARY * rng.standard_normal(3)
-        if unit == 7:
+        if unit == 3:
             mount += [0.0, 6.0, 0.0]  # has drifted away from the fleet
-        for i, date in enumerate(DATES if unit >= 15 else DATES[unit % 2 :][:1]):
-            if unit == 18 and i == 1:
+        for i, date in enumerate(DATES if unit >= 9 else DATES[unit % 2 :][:1]):
+            if unit == 10 and i == 1:
                 mount += [0.0, 0.0, 4.0]  # was knocked between the dates
-            write(folder / f"U{unit:02}_{date}.mcap", 100 + 2 * unit + i, mount, one_axis=unit == 12)
-    corrupt = folder / f"U14_{DATES[0]}.mcap"
+            write(folder / f"U{unit:02}_{date}.mcap", 100 + 2 * unit + i, mount, one_axis=unit == 5)
+    corrupt = folder / f"U08_{DATES[0]}.mcap"
     content = bytearray(corrupt.read_bytes())
     third = len(content) // 3
     content[third : 2 * third] = rng.bytes(third)
@@ -112,21 +112,21 @@ def test_the_table_as_json(
     common = ("fleet", recordings / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
     assert alidade(monkeypatch, *common, "--json") == 0
     printed = json.loads(capsys.readouterr().out)
-    assert (printed["schema"], printed["wanted"], printed["interrupted"]) == ("alidade.fleet/1", 27, False)
+    assert (printed["schema"], printed["wanted"], printed["interrupted"]) == ("alidade.fleet/1", 19, False)
     rows = {row["recording"]: row for row in rows_of(calibrated / "fleet.csv")}
-    assert [unit["name"] for unit in printed["attention"]] == ["U18", "U07", "U14", "U12"]
+    assert [unit["name"] for unit in printed["attention"]] == ["U10", "U03", "U08", "U05"]
     assert {row["recording"]: row["status"] for row in printed["recordings"]} == {
         k: v["status"] for k, v in rows.items()
     }
-    assert any(change["unit"] == "U18" for change in printed["changes"])
+    assert any(change["unit"] == "U10" for change in printed["changes"])
 
 
 def test_the_table_is_complete(calibrated: Path) -> None:
     rows = rows_of(calibrated / "fleet.csv")
-    assert len({row["recording"] for row in rows}) == len(rows) == 27
-    assert len({row["unit"] for row in rows}) == 21
+    assert len({row["recording"] for row in rows}) == len(rows) == 19
+    assert len({row["unit"] for row in rows}) == 14
     good = [row for row in rows if row["status"] == "calibrated"]
-    assert len(good) == 25
+    assert len(good) == 17
     for row in good:
         assert row["exit_code"] == "0"
         assert 0.0 < float(row["helmet_mount_x_sigma"]) < 0.01
@@ -134,17 +134,17 @@ def test_the_table_is_complete(calibrated: Path) -> None:
 
 def test_planted_faults_are_told_apart(calibrated: Path, tmp_path: Path) -> None:
     rows = {row["recording"].rsplit("/")[-1]: row for row in rows_of(calibrated / "fleet.csv")}
-    assert failures(rows) == {f"U14_{DATES[0]}.mcap": "2", f"U12_{DATES[0]}.mcap": "3"}
-    assert "damaged" in rows[f"U14_{DATES[0]}.mcap"]["reason"]
-    assert "motion about two axes" in rows[f"U12_{DATES[0]}.mcap"]["reason"]
+    assert failures(rows) == {f"U08_{DATES[0]}.mcap": "2", f"U05_{DATES[1]}.mcap": "3"}
+    assert "damaged" in rows[f"U08_{DATES[0]}.mcap"]["reason"]
+    assert "motion about two axes" in rows[f"U05_{DATES[1]}.mcap"]["reason"]
     changed = [row for row in rows_of(calibrated / "changes.csv") if row["changed"] == "1"]
-    assert [(row["unit"], row["parameter"]) for row in changed] == [("U18", "helmet_mount_z")]
+    assert [(row["unit"], row["parameter"]) for row in changed] == [("U10", "helmet_mount_z")]
     assert float(changed[0]["difference"]) == pytest.approx(np.deg2rad(4.0), abs=5.0 * float(changed[0]["sigma"]))
     fits((calibrated / "fleet.html").read_text(), tmp_path)
     text = page_text(calibrated / "fleet.html")
     attention = text.split("Which units need attention?")[1].split("Parameters")[0]
-    assert set(re.findall(r"U\d\d(?= )", attention)) >= {"U07", "U18", "U14", "U12"}
-    assert "4 units need attention: U18, U07" in attention
+    assert set(re.findall(r"U\d\d(?= )", attention)) >= {"U03", "U10", "U08", "U05"}
+    assert "4 units need attention: U10, U03" in attention
     assert "helmet_mount about z moved by 4.0" in attention
 
 
@@ -194,22 +194,22 @@ def test_nothing_is_done_twice(
         assert alidade(monkeypatch, "fleet", tmp_path / pattern, *common, *options) == 0
         return capsys.readouterr().out
 
-    for path in sorted(recordings.glob("U0[0-3]*.mcap")):
+    for path in sorted(recordings.glob("U0[0-2]*.mcap")):
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    assert "3 of 3 recordings, 0 from an earlier run" in run("U0[0-2]*.mcap")
+    assert "2 of 2 recordings, 0 from an earlier run" in run("U0[01]*.mcap")
     before = (tmp_path / "out" / "results.jsonl").read_text()
-    assert "4 of 4 recordings, 3 from an earlier run" in run("*.mcap")
+    assert "3 of 3 recordings, 2 from an earlier run" in run("*.mcap")
     after = (tmp_path / "out" / "results.jsonl").read_text()
     assert after.startswith(before)
-    assert len(after.splitlines()) == 4
+    assert len(after.splitlines()) == 3
     # A line cut off by a fall of the machine costs that one.
     (tmp_path / "out" / "results.jsonl").write_text(after[:-20])
-    assert "4 of 4 recordings, 3 from an earlier run" in run("*.mcap")
+    assert "3 of 3 recordings, 2 from an earlier run" in run("*.mcap")
     write(tmp_path / f"U00_{DATES[0]}.mcap", 999, (0.0, 0.0, 0.0))
-    assert "4 of 4 recordings, 3 from an earlier run" in run("*.mcap")
+    assert "3 of 3 recordings, 2 from an earlier run" in run("*.mcap")
     config = tmp_path / "config.yaml"
     config.write_text("noise: {vision_attitude: 0.009}\n")
-    assert "4 of 4 recordings, 0 from an earlier run" in run("*.mcap", "--config", config)
+    assert "1 of 1 recordings, 0 from an earlier run" in run("U00*.mcap", "--config", config)
 
 
 @pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(4, 20))])
@@ -294,9 +294,9 @@ def test_each_unit_begins_from_its_own_calibration(
     recordings: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A recording is done again when that has changed; one whose unit has none is told."""
-    for path in sorted(recordings.glob("U1[567]_20260401*.mcap")):
+    for path in [recordings / f"{unit}_{DATES[1]}.mcap" for unit in ("U09", "U11", "U12")]:
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    for unit in ("U15", "U16"):
+    for unit in ("U09", "U11"):
         before = recordings / f"{unit}_{DATES[0]}.mcap"
         assert alidade(monkeypatch, "calibrate", before, "--quiet", "--out", tmp_path / "last" / unit) == 0
 
@@ -306,17 +306,17 @@ def test_each_unit_begins_from_its_own_calibration(
         return {row["unit"]: row for row in rows_of(tmp_path / "out" / "fleet.csv")}
 
     rows = run()
-    assert [rows[unit]["exit_code"] for unit in ("U15", "U16", "U17")] == ["0", "0", "2"]
-    assert "cannot be opened" in rows["U17"]["reason"]
-    first = json.loads((tmp_path / "last" / "U15" / "result.json").read_text())
+    assert [rows[unit]["exit_code"] for unit in ("U09", "U11", "U12")] == ["0", "0", "2"]
+    assert "cannot be opened" in rows["U12"]["reason"]
+    first = json.loads((tmp_path / "last" / "U09" / "result.json").read_text())
     alone = {p["name"]: p["sigma"] for p in first["parameters"]}
     # About as much as the first recording again.
-    ratio = float(rows["U15"]["helmet_mount_x_sigma"]) / alone["helmet_mount_x"]
+    ratio = float(rows["U09"]["helmet_mount_x_sigma"]) / alone["helmet_mount_x"]
     assert ratio == pytest.approx(0.5**0.5, abs=0.1)
-    (tmp_path / "last" / "U16" / "result.json").write_bytes((tmp_path / "last" / "U15" / "result.json").read_bytes())
+    (tmp_path / "last" / "U11" / "result.json").write_bytes((tmp_path / "last" / "U09" / "result.json").read_bytes())
     again = run()
-    assert again["U15"] == rows["U15"]
-    assert again["U16"]["helmet_mount_x"] != rows["U16"]["helmet_mount_x"]
+    assert again["U09"] == rows["U09"]
+    assert again["U11"]["helmet_mount_x"] != rows["U11"]["helmet_mount_x"]
 
 
 def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]) -> None:

@@ -118,6 +118,7 @@ def test_without_a_camera_the_accelerometer_defines_the_body() -> None:
     }
 
 
+@pytest.mark.usefixtures("few_solutions")
 def test_incremental_ends_where_batch_does() -> None:
     data, _, config = _simulated(6, poses=6)
     config = config.model_copy(update={"noise_known": 0.0})  # levels are compared elsewhere

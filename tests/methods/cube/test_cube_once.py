@@ -18,6 +18,7 @@ POSES = 4
 SCENARIO = f"{{poses: {POSES}, static_s: 2.0, turn_rad_s: 4.0, camera: {{rate_hz: 1.0, pictures: {{rate_hz: 1.0}}}}}}"
 
 
+@pytest.mark.usefixtures("few_solutions")
 @pytest.mark.parametrize("images", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["detections", "pictures"])
 def test_static_intervals_and_tag_poses_are_found_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: bool
@@ -38,6 +39,6 @@ def test_static_intervals_and_tag_poses_are_found_once(
 
     counted(static_intervals, "find_static_intervals")
     counted(pose, "estimate_pose")
-    calibrations = calibrate(tmp_path / "s.mcap", ["batch", "incremental", "published"])
+    calibrations = calibrate(tmp_path / "s.mcap", ["batch", "incremental", "published"], report=True)
     assert "Static poses" in report_html(calibrations[0])
     assert calls == {"find_static_intervals": 1, "estimate_pose": POSES}

@@ -14,7 +14,6 @@ from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
-from alidade.pipelines.reports.result import Calibration
 
 # The gyro's noise is 30 times the default, and nobody says so.
 SCENARIO = HeadScenario.model_validate(
@@ -36,17 +35,9 @@ def session() -> Session:
     return alidade.open({**vars(data), "gyro_density": None, "vision_cov": None}, method="head", config=IDEAL)
 
 
-@pytest.fixture(scope="module")
-def online(session: Session) -> Calibration:
-    return session.calibrate("incremental", check=False, report=False)
-
-
-@pytest.fixture(scope="module")
-def concluded(session: Session) -> Calibration:
-    return session.calibrate("incremental", check=True, report=False)
-
-
-def test_numbers_noise_and_verdicts_are_those_of_batch(session: Session, concluded: Calibration) -> None:
+@pytest.mark.usefixtures("few_solutions")
+def test_numbers_noise_and_verdicts_are_those_of_batch_and_the_course_is_that_of_the_run(session: Session) -> None:
+    concluded, online = (session.calibrate("incremental", check=check, report=False) for check in (True, False))
     batch = session.calibrate("batch", report=False)
     assert (concluded.estimate.solver, concluded.status) == ("incremental", batch.status)
     np.testing.assert_array_equal(concluded.estimate.values, batch.estimate.values)
@@ -55,9 +46,6 @@ def test_numbers_noise_and_verdicts_are_those_of_batch(session: Session, conclud
     used = {level.noise.name: level.used for level in concluded.estimate.levels}
     rate = np.sqrt((session.data.head_gyro**2).sum(axis=1).mean())
     assert np.hypot(used["gyro_density"], used["gyro_rate_noise"] * rate) == pytest.approx(1.5e-3, rel=0.25)
-
-
-def test_the_course_is_that_of_the_run(online: Calibration, concluded: Calibration) -> None:
     history, of_run = concluded.estimate.history, online.estimate.history
     assert history is not None
     assert of_run is not None

@@ -128,7 +128,9 @@ def test_runs_through_outages_on_the_gyro() -> None:
 def test_stays_finite_near_and_through_the_vertical(amplitude: float) -> None:
     pitch = {"amplitude_deg": amplitude, "frequency_hz": 0.1, "end_s": 10.0}
     yaw = {"amplitude_deg": 5.0, "frequency_hz": 0.3}
-    scenario = HeadScenario.model_validate({"duration_s": 25.0, "head": {"pitch": [pitch], "yaw": [yaw]}})
+    scenario = HeadScenario.model_validate(
+        {"duration_s": 25.0, "gyro_rate_hz": 100.0, "head": {"pitch": [pitch], "yaw": [yaw]}}
+    )
     data, _ = simulate_head(scenario, seed=1)
     result = run(scenario, data)
     for values in (result.wxyz, result.bias, result.bias_sigma, result.innovation):

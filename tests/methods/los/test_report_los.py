@@ -27,7 +27,7 @@ def _plots(priors: str) -> list[Plot]:
     return los_plots(data, cast(Calibration, SimpleNamespace(config=config, problem=graph, estimate=estimate)))
 
 
-@pytest.mark.parametrize("priors", ["{}", "{time_offset: 0.01}"])
+@pytest.mark.parametrize("priors", ["{time_offset: 0.01}", pytest.param("{}", marks=pytest.mark.slow)])
 def test_the_prediction_follows_the_measured_error(priors: str) -> None:
     both, left = _plots(priors)
     measured, predicted = ({mark.name.split()[0]: mark.y for mark in both.figure.marks[i::2]} for i in (0, 1))

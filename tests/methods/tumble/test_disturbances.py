@@ -68,7 +68,6 @@ def test_disturbed_interval_is_named_and_the_rest_is_calibrated(kind: str, gyro:
     ("kind", "gyro", "seeds"),
     [
         ("motor", False, 8),
-        ("ring", True, 1),
         pytest.param("motor", True, 4, marks=pytest.mark.slow),
         pytest.param("ring", True, 4, marks=pytest.mark.slow),
     ],

@@ -131,8 +131,8 @@ def _about(field: Array) -> Array:
 @pytest.mark.parametrize(
     ("latitude", "gyro", "seeds"),
     [
-        (40.0, {}, 8),
-        (None, {}, 8),
+        (40.0, {}, 4),
+        (None, {}, 4),
         pytest.param(40.0, {"gyro": {}}, 8, marks=pytest.mark.slow),
         pytest.param(None, {"gyro": {}}, 8, marks=pytest.mark.slow),
     ],

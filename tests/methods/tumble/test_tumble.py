@@ -289,7 +289,7 @@ def test_bias_of_readings_in_counts_is_shown_in_counts() -> None:
     simulated = _simulated(replace_scenario(RESTING, magnetometer=None), 1)
     assert simulated.data.accel is not None
     in_g = replace(simulated, data=replace(simulated.data, accel=simulated.data.accel / 9.80665, accel_density=None))
-    calibration = Session.of(TUMBLE, in_g).calibrate()
+    calibration = Session.of(TUMBLE, in_g).calibrate(report=False)
     (card,) = result_cards(calibration)
     scale, *_, bias = card.groups
     K, b = triad_of("accel", calibration.values)
@@ -571,7 +571,7 @@ def test_an_accelerometer_alone_if_asked_for(tmp_path: Path) -> None:
     _write(tmp_path / "s.mcap", simulated.data, mag=False)
     with pytest.raises(InputError, match="topics alone do not select a method; use --method cube or --method tumble"):
         Session.read(open_recording(tmp_path / "s.mcap"), None, None)
-    calibration = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None).calibrate()
+    calibration = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None).calibrate(report=False)
     for name, parameter in calibration.parameters.items():
         if name.startswith("accel"):
             assert abs(parameter.value - simulated.truth[name]) < 4.0 * parameter.sigma, name
@@ -776,7 +776,7 @@ def test_the_figures_of_a_published_example(tmp_path: Path) -> None:
     rows = [f"{0.02 * k:.2f},{x!r},{y!r},{z!r}" for k, (x, y, z) in enumerate((centre + axes * unit).tolist())]
     (tmp_path / "mag.csv").write_text("\n".join(["t,x,y,z", *rows]))
     config = Config.model_validate({"columns": {"/mag": {"time": "t", "field": ["x", "y", "z"]}}})
-    estimate = Session.read(open_recording(tmp_path / "mag.csv"), None, config).calibrate().estimate
+    estimate = Session.read(open_recording(tmp_path / "mag.csv"), None, config).calibrate(report=False).estimate
     K, b, _ = _centre_with_sigmas(estimate)
     assert np.linalg.det(K) ** (-1.0 / 3.0) == pytest.approx(31.0723, abs=5e-5)
     np.testing.assert_allclose(-np.linalg.solve(K, b), centre, atol=1e-4)
@@ -786,7 +786,7 @@ def test_the_figures_of_a_published_example(tmp_path: Path) -> None:
 def test_a_real_magnetometer_alone() -> None:
     """ICM-20948 counts, tumbled by hand indoors: the published centre to 0.2 % of the field, and within its sigmas."""
     path = _shared("icm20948") / "mag3_raw.csv"
-    calibration = Session.read(*_concluded(path)).calibrate()
+    calibration = Session.read(*_concluded(path)).calibrate(report=False)
     assert calibration.method.name == "tumble"
     K, b, spread = _centre_with_sigmas(calibration.estimate)
     centre = -np.linalg.solve(K, b)
@@ -875,7 +875,7 @@ def test_a_real_pair_of_accelerometer_and_magnetometer(tmp_path: Path) -> None:
         "/mag": series.MagneticSeries(stamps, mag),
     }
     write_session(tmp_path / "s.mcap", topics, {})
-    calibration = Session.read(open_recording(tmp_path / "s.mcap"), None, None).calibrate()
+    calibration = Session.read(open_recording(tmp_path / "s.mcap"), None, None).calibrate(report=False)
     K = np.array([[calibration.parameters[f"mag_k{i}{j}"].value for j in "123"] for i in "123"])
     K /= np.cbrt(abs(np.linalg.det(K)))
     np.testing.assert_allclose(K, np.diag([1.0, -1.0, -1.0]), atol=0.04)
@@ -910,7 +910,7 @@ def test_a_real_accelerometer_alone() -> None:
 def test_ten_real_rests_by_hand_in_counts(shared_data: Path) -> None:
     """MPU-6050, 16,384 counts per g to 3 %; no rest lies between x and y, so that their cross term hardly shows."""
     session = Session.read(open_recording(shared_data / "suarez_mpu6050" / "cal.mcap"), "tumble", None)
-    calibration = session.calibrate("batch")
+    calibration = session.calibrate("batch", report=False)
     values, sigmas = (
         dict(zip(calibration.estimate.names, each, strict=True))
         for each in (calibration.estimate.values, calibration.estimate.sigmas)
@@ -928,7 +928,7 @@ def test_fewer_real_rests_by_hand_determine_little(shared_data: Path) -> None:
     session = Session.read(open_recording(shared_data / "suarez_mpu6050" / "cal.mcap"), "tumble", None)
     late = session.data.accel_t > session.data.accel_t.mean()
     half = replace(session.data, accel_t=session.data.accel_t[late], accel=session.data.accel[late])
-    whole, part = (Session.of(TUMBLE, Simulated(data, {}, "")).calibrate() for data in (session.data, half))
+    whole, part = (Session.of(TUMBLE, Simulated(data, {}, "")).calibrate(report=False) for data in (session.data, half))
     assert part.status == "unobservable"
     for name, each in part.parameters.items():
         assert abs(each.value - whole.parameters[name].value) <= 3.0 * each.sigma
