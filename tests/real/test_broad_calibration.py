@@ -23,7 +23,7 @@ from tests.support.solved import calibrate
 _ALL = pytest.param((len(TRIALS), np.inf), marks=pytest.mark.slow, id="all")
 
 
-@pytest.fixture(scope="module", params=[pytest.param((1, 70.0), id="70 s of one"), _ALL])
+@pytest.fixture(scope="module", params=[pytest.param((1, 50.0), id="50 s of one"), _ALL])
 def scored(
     request: pytest.FixtureRequest, shared_data: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, tuple[Calibration, Score]]:

@@ -77,7 +77,8 @@ def test_its_last_twenty_seconds_alone_agree(recording: Path) -> None:
     assert np.abs(off).max() < 3.0
 
 
-@pytest.mark.parametrize(("name", "jump_s"), [("u1", None), pytest.param("u2", 33.46, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "jump_s"), [("u1", None), ("u2", 33.46)])
 def test_markers_that_slip_by_two_degrees_half_way(name: str, jump_s: float | None, shared_data: Path) -> None:
     """In u2 motion capture itself turns by 1 deg between two attitudes, in which the gyro has nothing."""
     path = shared_data / "upenn_imu_vicon" / f"{name}.mcap"

@@ -34,7 +34,7 @@ WARMING = (1.5e-4, -2e-4, 2.5e-4)
 
 
 # A chain has 60 steps.
-pytestmark = pytest.mark.usefixtures("early_smoother")
+pytestmark = pytest.mark.usefixtures("early_smoother", "few_solutions")
 
 
 @cache
