@@ -233,7 +233,7 @@ def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> No
 
 
 def test_a_mount_that_stays_is_calibrated() -> None:
-    calibration = session(0, 0.0).calibrate(report=False)
+    calibration = session(0, 0.0, vision_rate_hz=10.0, gyro_rate_hz=50.0).calibrate(report=False)
     assert calibration.status == "calibrated"
     assert calibration.stability is not None
     assert not calibration.stability.changed

@@ -114,7 +114,9 @@ def test_sigma_of_the_bias_is_that_of_its_error() -> None:
 
 
 def test_runs_through_outages_on_the_gyro() -> None:
-    scenario = load_scenario(HeadScenario, "head_outages").model_copy(update={"outlier_fraction": 0.0})
+    scenario = load_scenario(HeadScenario, "head_outages").model_copy(
+        update={"outlier_fraction": 0.0, "gyro_rate_hz": 100.0}
+    )
     data, _ = simulate_head(scenario, seed=1)
     result = run(scenario, data)
     first_after_gap = np.flatnonzero(np.diff(result.t) > 5.0) + 1
