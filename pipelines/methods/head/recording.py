@@ -202,26 +202,23 @@ _FEW, _QUIET = 25, 0.05
 
 
 def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
-    """Propose the kind of vision from rate, covariance, noise, type or name, with the reason; empty if undecided."""
-    if "kind" in config.vision.model_fields_set:
-        return ()
+    """Propose motion capture by name, rate or noise of the attitudes, with the reason; other kinds change nothing."""
     name = config.topic(VISION_ATTITUDE)
-    if not wanted(recording, config, VISION_ATTITUDE):
-        return ("vision: {kind: pnp} (attitudes are measured in pictures of tags)",)
+    if "kind" in config.vision.model_fields_set or not wanted(recording, config, VISION_ATTITUDE):
+        return ()
     try:
         poses = recording.poses(name)
     except InputError:
         return ()
     if _MOCAP.search(name):
         return (f"vision: {{kind: mocap}} (the name {name})",)
-    if name in recording.topics and recording.topics[name].type == messages.ODOMETRY:
-        return (f"vision: {{kind: vio}} ({name} is odometry)",)
     order = np.argsort(poses.t_ns, kind="stable")
     steps = np.diff(poses.t_ns[order])
     rate = 1e9 / float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     # Drivers that know nothing state next to nothing.
     noise = max(typical(poses.cov, 3, 4, 5) or 0.0, white_angle(poses.wxyz[order]))
-    if rate < _FAST_HZ and noise >= _TINY:
+    is_odometry = name in recording.topics and recording.topics[name].type == messages.ODOMETRY
+    if is_odometry or (rate < _FAST_HZ and noise >= _TINY):
         return ()
     return (f"vision: {{kind: mocap}} ({rate:.3g} attitudes/s on {name}, noise {np.rad2deg(noise):.2g} deg)",)
 

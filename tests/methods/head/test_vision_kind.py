@@ -77,8 +77,14 @@ def test_info_proposes_motion_capture_by_rate_or_noise(
         assert said[0].startswith(f"vision: {{kind: {kind}}} ({rate_hz:g} attitudes/s on /vision/attitude, noise")
         shown = CliRunner().invoke(app, ["info", str(tmp_path / "s.mcap")]).output
         assert f"proposed for the config: vision: {{kind: {kind}}}" in shown
-        # Proposed, not taken; and not proposed to who has said what it is.
-        assert not alidade.open(tmp_path / "s.mcap").config.model_fields_set & {"vision"}
+        # Proposed, not taken; a note of `calibrate` names the key; and not proposed to who has said what it is.
+        session = alidade.open(tmp_path / "s.mcap")
+        assert not session.config.model_fields_set & {"vision"}
+        assert session.recording is not None
+        assert session.recording.notes == (f"proposed for the config, not assumed: {said[0]}",)
+        stated = alidade.open(tmp_path / "s.mcap", config=load_config(b"vision: {kind: other}"))
+        assert stated.recording is not None
+        assert not stated.recording.notes
         assert proposed(tmp_path / "s.mcap", "vision: {kind: other}") == []
 
 
