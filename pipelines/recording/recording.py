@@ -43,6 +43,7 @@ from alidade.pipelines.recording.decoding import (
     DecodedMessage,
     MessageFormat,
     Times,
+    one_clock,
     with_log_times,
 )
 from alidade.pipelines.recording.messages import MessageError
@@ -342,7 +343,10 @@ class Recording:
         """Read the transforms on a tf2_msgs/TFMessage topic by (parent frame, child frame)."""
         if topic not in self._transforms:
             with self._problems(topic):
-                self._transforms[topic] = single_messages.transforms(self._decoded(topic, messages.TF))
+                found = single_messages.transforms(self._decoded(topic, messages.TF))
+            self._transforms[topic] = {pair: poses for pair, (poses, _) in found.items()}
+            if without := sum(left_out for _, left_out in found.values()):
+                self._unstamped[topic] = without
         return self._transforms[topic]
 
     # -- derived topics
@@ -471,20 +475,35 @@ class Recording:
         return failed
 
     def _decoded(self, topic: str, *types: str) -> Iterator[DecodedMessage]:
-        """Yield the decoded messages of a topic one by one, in file order."""
+        """Yield the decoded messages of a topic one by one, in file order; pictures and tags by one clock."""
         info = self._require(topic, *types)
+        absent = self._unstamped_of(topic) if info.type in (*messages.PICTURES, messages.TAG_DETECTIONS) else None
         times = []
         for _, block in self._blocks([topic]):
-            t_ns = []
+            kept = []
             with self._problems(topic):
-                for message in self._formats[block.channel].decode(block):
-                    t_ns.append(message.t_ns)
-                    yield message
-            times.append((np.array(t_ns, dtype=np.int64), block.log_ns))
-        self._times[topic] = _concatenate(times)
+                decoded = self._formats[block.channel].decode(block)
+                for message, log_ns in zip(decoded, block.log_ns.tolist(), strict=True):
+                    if absent == 0 and message.from_log_time:
+                        continue
+                    one = message._replace(t_ns=log_ns, from_log_time=True) if absent else message
+                    kept.append((one.t_ns, log_ns))
+                    yield one
+            times.append(np.array(kept, dtype=np.int64).reshape(-1, 2).T)
+        self._times[topic] = _concatenate([(t_ns, log_ns) for t_ns, log_ns in times])
+        self._note_unstamped(topic, self._times[topic][0], absent or 0)
         self._check_any(topic, len(self._times[topic][0]))
         if info.type in SENSOR_STAMPED_TYPES:
             check_clock(topic, *self._times[topic], self.epoch_ns)
+
+    def _unstamped_of(self, topic: str) -> int:
+        """Number of a topic's messages without a stamp where all get their log times, else 0; few are left out."""
+        blocks = (block for _, block in self._blocks([topic]))
+        both = _concatenate([(self._formats[block.channel].stamps(block), block.log_ns) for block in blocks])
+        kept, absent = one_clock(*both)
+        if without := int(np.count_nonzero(~kept)):
+            self._unstamped[topic] = without
+        return absent
 
     def _check_any(self, topic: str, number: int) -> None:
         """Raise InputError if no message of the topic is left."""

@@ -73,8 +73,8 @@ def tag_detections(messages: Iterable[DecodedMessage]) -> series.DetectionSeries
     )
 
 
-def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], series.PoseSeries]:
-    """Transforms in tf2_msgs/TFMessage messages with their log times, by (parent frame, child frame)."""
+def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], tuple[series.PoseSeries, int]]:
+    """Transforms of tf2_msgs/TFMessage messages, and how many are left out, by (parent frame, child frame)."""
     rows: dict[tuple[str, str], list[tuple[int, int, Any]]] = {}
     for message in messages:
         for one in message.content.transforms:
@@ -85,10 +85,11 @@ def transforms(messages: Iterable[DecodedMessage]) -> dict[tuple[str, str], seri
     return {pair: _poses(found) for pair, found in rows.items()}
 
 
-def _poses(rows: list[tuple[int, int, Any]]) -> series.PoseSeries:
-    """Make a series of poses from rows of stamp (0: none), log time, and x, y, z, qx, qy, qz, qw."""
+def _poses(rows: list[tuple[int, int, Any]]) -> tuple[series.PoseSeries, int]:
+    """Make poses of rows of stamp (0: none), log time, and x, y, z, qx, qy, qz, qw; count those left out."""
     stamps, log_ns = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2).T
     kept, absent = one_clock(stamps, log_ns)
     numbers = np.array([row[2] for row in rows]).reshape(-1, 7)[kept]
     t_ns, from_log = (log_ns, len(rows)) if absent else (stamps[kept], 0)
-    return series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=from_log)
+    poses = series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=from_log)
+    return poses, int(np.count_nonzero(~kept))

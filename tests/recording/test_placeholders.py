@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ T_NS = 10_000_000 * np.arange(1000)
 T_S = np.asarray(1e-9 * T_NS, dtype=np.float64)
 RATES = RNG.normal(0.0, 0.3, (1000, 3))
 NOTHING = np.zeros((1000, 3, 3))
+AB: dict[str, Any] = {"frames": ("a", "b")}
 
 
 @pytest.mark.parametrize("variance", [1e6, 99999.0, np.finfo(float).max, 1.0, -1.0, 1e-15])
@@ -192,6 +195,45 @@ def test_a_topic_has_one_clock(stamped_each: int, kept: int, by_log: int, tmp_pa
     assert np.ptp(np.diff(imu.t_ns)) == 0
     found = [recording.stamps(block) for block in recording.container.blocks(set(recording.container.channels))]
     assert np.isin(imu.t_ns, np.concatenate(found)).all()
+
+
+def _one_by_one(kind: str, t_ns: int) -> Any:
+    """A message of a type that is read one by one, with a stamp."""
+    make = forms.ROS2.types
+    if kind == "sensor_msgs/msg/CompressedImage":
+        return make[kind](forms.header(t_ns), "jpeg", np.zeros(4, np.uint8))
+    if kind == "apriltag_msgs/msg/AprilTagDetectionArray":
+        return make[kind](forms.header(t_ns), [])
+    turn = make["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    turn = make["geometry_msgs/msg/Transform"](make["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0), turn)
+    return make[kind]([make["geometry_msgs/msg/TransformStamped"](forms.header(t_ns, "a"), "b", turn)])
+
+
+@pytest.mark.parametrize(
+    ("stamped", "kept"), [(lambda i: i > 0, 49), (lambda i: i % 2 == 0, 25), (lambda i: i < 9, 50)]
+)
+@pytest.mark.parametrize(
+    ("kind", "read"),
+    [
+        ("sensor_msgs/msg/CompressedImage", lambda recording, topic: [t for t, _ in recording.images(topic)]),
+        ("apriltag_msgs/msg/AprilTagDetectionArray", lambda recording, topic: recording.detections(topic).t_ns),
+        ("tf2_msgs/msg/TFMessage", lambda recording, topic: recording.poses_of(TopicSource(topic=topic, **AB)).t_ns),
+    ],
+)
+def test_pictures_tags_and_transforms_have_one_clock(
+    kind: str, read: Callable[[Any, str], Any], stamped: Callable[[int], bool], kept: int, tmp_path: Path
+) -> None:
+    """Stamps are the device's clock, log times Unix time; messages without a stamp are left out, if they are few."""
+    log = 1_790_000_000_000_000_000
+    messages = [(log + 10_000_000 * i, _one_by_one(kind, 10_000_000 * (i + 100) * bool(stamped(i)))) for i in range(50)]
+    recording = open_recording(forms.ros2_recording(tmp_path / "mixed.mcap", {"/x": messages}))
+    t_ns = np.asarray(read(recording, "/x"))
+    assert len(t_ns) == kept
+    assert np.ptp(t_ns) <= 490_000_000
+    left_out = f"topic /x: {50 - kept} messages without a stamp, among others that have one, are left out"
+    by_log = "messages have no stamp; all get their log times"
+    assert any((by_log if kept == 50 else left_out) in note for note in recording.notes)
+    np.testing.assert_array_equal(read(recording, "/x"), t_ns)
 
 
 def test_one_of_two_devices_on_a_topic_has_no_stamps(tmp_path: Path) -> None:
