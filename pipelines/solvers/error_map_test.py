@@ -70,7 +70,8 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
 def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float) -> Estimate:
     """Re-estimate with the error map as free parameters, its prior at least as wide as the map's rms.
 
-    Directions that are weak `without` the map keep their values.
+    Directions that are weak `without` the map keep their values. A map that moves a required number by more than its
+    prior's sigma takes that number's place, as where a device hardly turns, and is no error: the estimate stays.
     """
     compiled, solution, information = _solved(problem, error_map, estimate)
     chi_square, dof, rms = _tested(_rows(information, error_map)[1], error_map, ratio)
@@ -92,6 +93,9 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
     spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
     at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
     shift = np.array([at[name] for name in estimate.names]) - estimate.values
+    required = {q.name: q.scale for q in problem.quantities if q.required}
+    if any(abs(by) > required.get(name, np.inf) for name, by in zip(estimate.names, shift.tolist(), strict=True)):
+        return estimate
     columns, rows_of = np.zeros((len(estimate.names), spread.shape[1])), [estimate.names.index(n) for n in others]
     columns[rows_of] = gain @ spread
     weak = np.zeros_like(shift)

@@ -104,6 +104,23 @@ def test_noise_of_a_gyro_that_never_rests_is_judged_by_its_rate(
 
 
 @pytest.mark.parametrize(
+    ("sign", "begin", "end", "status"),
+    [(1, 160.0, 170.0, "weak"), pytest.param(-1, 155.0, 175.0, "inconsistent", marks=pytest.mark.slow)],
+)
+def test_jitter_of_vision_contradicts_no_gyro_that_hardly_turns(
+    sign: int, begin: float, end: float, status: str, shared_data: Path
+) -> None:
+    """At .09 rad/s motion capture errs by .1 deg a picture, which passes for the gyro's; an inverted axis by more."""
+    head = methods.method("head")
+    slow = to_session(read_trial(shared_data / "broad" / "12_undisturbed_slow_translation_C.mat"), 0, 0.0)
+    slow = head.faults.segment(slow, begin, end)
+    slow = replace(slow, head_gyro=slow.head_gyro * [sign, 1, 1])
+    found = Session(head, slow, load_config(None)).calibrate("batch", report=False)
+    assert found.status == status, found.headline
+    assert any(f.kind == "direction" for f in found.findings) == (sign > 0)
+
+
+@pytest.mark.parametrize(
     "name",
     [
         pytest.param("07_undisturbed_fast_rotation_B", marks=pytest.mark.slow),

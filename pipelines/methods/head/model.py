@@ -51,6 +51,9 @@ _NEGLIGIBLE = 0.1
 # All noise over the rate, 1/sqrt(Hz), beyond which it is none: healthy gyros in motion have .019 at most (UPenn), those
 # with an axis inverted .031 and more.
 _NO_NOISE = 0.025
+# rad: motion capture of a hand that hardly turns errs by so much from picture to picture, and by .02 deg at rest (BROAD
+# 12). Levels are found where it rests, and what it errs by in motion passes for the gyro's noise.
+_JITTER = np.deg2rad(0.1)
 # So far from its stamp, s, the gyros carry an attitude to where its picture was taken.
 _NEAR = 0.1
 _FEWEST_FRAMES = 10
@@ -178,10 +181,12 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     density = at_least_at_rest(density, data.head_t, data.head_gyro, data.head_force)
     rate = max(_rate(data), 1e-12)
     no_noise = max(density.noise.spec.no_noise, _NO_NOISE * rate)
+    pictures_hz = (len(data.vision_t) - 1) / max(float(np.ptp(data.vision_t)), 1e-9)
+    in_motion = max(no_noise, _JITTER * np.sqrt(2.0 * pictures_hz))
     found = [
         estimated("vision_attitude", config, (_FAMILY,), typical(data.vision_cov, 0, 1, 2)),
         _bounded(density, no_noise),
-        _bounded(estimated("gyro_rate_noise", config, ("gyro",), beside=True), no_noise / rate),
+        _bounded(estimated("gyro_rate_noise", config, ("gyro",), beside=True), in_motion / rate),
         Level(stated("gyro_bias_walk", config)),
     ]
     if data.platform_t is not None and data.platform_gyro is not None:
