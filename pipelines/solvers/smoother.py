@@ -10,7 +10,6 @@ import gtsam
 import numpy as np
 
 from alidade.factors.array import Array
-from alidade.factors.bridge import value_at
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Factor
@@ -100,12 +99,10 @@ class FixedLagSmoother(Smoother):
         self._past: list[tuple[int, gtsam.GaussianConditional]] = []  # a variable, given younger ones; oldest first
         self._present: gtsam.GaussianConditional | None = None  # of the active variables
         self._first = gtsam.Values()  # the first value of each variable, about which it is linear
-        self._vectors: set[int] = set()  # variables with the same tangent space everywhere
         self._moves = gtsam.VectorValues()  # from there to the estimate
 
     def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
         self._first.insert(values)
-        self._vectors.update(key for key in values.keys() if isinstance(value_at(values, key), np.ndarray))
         self._stamps.update(stamps)
         graph = linear_graph_of(factors, self._first)
         first = self._oldest({key for f in factors for key in f.keys}.union(stamps))
@@ -142,20 +139,15 @@ class FixedLagSmoother(Smoother):
             key, _ = self._past.pop(0)
             self._first.erase(key)
             del self._stamps[key]
-            self._vectors.discard(key)
 
     def linearization_point(self) -> gtsam.Values:
-        point = gtsam.Values(self._first)
-        for key in self._moved():
-            point.update(key, point.atVector(key) + self._moves.at(key))
-        return point
+        return gtsam.Values(self._first)
 
     def estimate(self) -> gtsam.Values:
         return self._first.retract(self._moves)
 
     def moves(self, keys: Sequence[int]) -> Array:
-        moved = self._moved()
-        return np.concatenate([(0.0 if key in moved else 1.0) * self._moves.at(key) for key in keys])
+        return np.concatenate([self._moves.at(key) for key in keys])
 
     def active_variables(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
         """Marginal Gaussian of the active variables, and the values about which it is linear."""
@@ -170,10 +162,6 @@ class FixedLagSmoother(Smoother):
         inverse = np.linalg.inv(R)
         rows = np.concatenate([inverse[where[key]] for key in keys])
         return np.asarray(rows @ rows.T)
-
-    def _moved(self) -> set[int]:
-        """Keys of the active vectors; new factors are linearised about their estimate, not their first value."""
-        return set() if self._present is None else self._vectors.intersection(self._present.keys())
 
     def _oldest(self, keys: Collection[int]) -> int:
         """Index of the first conditional of any of the keys; the number of conditionals if none has one."""
