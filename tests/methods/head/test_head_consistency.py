@@ -116,6 +116,31 @@ def test_incremental_errors_fit_their_covariance() -> None:
     assert_consistent([Run(scenario(), seed, solve_incremental) for seed in range(15)])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("density", [1e-4, 2e-3])
+@pytest.mark.parametrize("vision", [3e-4, 5e-3])
+@pytest.mark.parametrize("amplitude", [0.3, 1.0])
+@pytest.mark.parametrize(("solve", "seeds"), [(solve_batch, 10), (solve_incremental, 4)])
+def test_scales_are_true_whatever_the_noises_and_the_motion(
+    density: float, vision: float, amplitude: float, solve: Solve, seeds: int
+) -> None:
+    """What multiplies a noisy measurement is biased where noise is whitened in other units than its own."""
+    moves = scenario().head.model_dump()
+    slighter = {
+        axis: [swing | {"amplitude_deg": amplitude * swing["amplitude_deg"]} for swing in moves[axis]]
+        for axis in ("yaw", "pitch", "roll")
+    }
+    settings = scenario(noise={"gyro_density": density, "vision_attitude": vision}, head=moves | slighter)
+    runs = [Run(settings, seed, solve) for seed in range(seeds)]
+    some = [i for i, name in enumerate(runs[0].estimate.names) if "scale" in name]
+    assert len(some) == 7
+    covariances = [run.estimate.covariance[np.ix_(some, some)] for run in runs]
+    size = sum(run.error[some] @ np.linalg.solve(P, run.error[some]) for run, P in zip(runs, covariances, strict=True))
+    assert chi2.ppf(0.0005, 7 * seeds) < size < chi2.ppf(0.9995, 7 * seeds)
+    mean = np.sum([run.error / run.estimate.sigmas for run in runs], axis=0)[some] / np.sqrt(seeds)
+    assert np.abs(mean).max() < 4.0
+
+
 @pytest.mark.usefixtures("few_solutions")
 def test_incremental_agrees_with_batch() -> None:
     """With the noise as stated: that both find the same levels is another matter."""
