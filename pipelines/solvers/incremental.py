@@ -80,8 +80,8 @@ _FREED = 10
 FIRST_SOLVE, SOLVE_GROWTH, _MAX_INITIALISATION = 1.0, 1.15, 600.0
 # Steps before which that phase does not end: few large ones cost little to solve again.
 MIN_STEPS = 100
-# Largest share of a variance that is of second order with which it ends: where motion that comes later makes a sigma ten
-# times smaller, it is a tenth. Recordings that are determined have 1e-9 and less, slow beginnings .005.
+# Largest share of a variance that is of second order with which it ends: where motion that comes later makes a sigma
+# ten times smaller, it is a tenth. Recordings that are determined have 1e-9 and less, slow beginnings .005.
 _MAX_CURVATURE = 1e-3
 # Time between marginalisations afterwards, s.
 MARGINALIZE_EVERY = 20.0
