@@ -68,12 +68,16 @@ NUMERIC_TYPES = {*_COLUMNS, messages.JOINT_STATE}
 
 
 class DecodedMessage(NamedTuple):
-    """One message: its time, Unix ns, whether that is its log time, its content, the definition of its type."""
+    """One message: its time, Unix ns, whether that is its log time, its content, the definition of its type.
+
+    `left_out`: it is of no use but to decode others of its video by, for want of a stamp.
+    """
 
     t_ns: int
     from_log_time: bool
     content: Any
     definition: Definition
+    left_out: bool = False
 
 
 class _Plan(NamedTuple):

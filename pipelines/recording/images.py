@@ -11,7 +11,7 @@ import re
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import open_binary
 
 Pixels = NDArray[Any]
+Stamp = TypeVar("Stamp")
 
 # Channels, and the order of those that are red, green, blue.
 _COLOURS = {
@@ -97,7 +98,7 @@ def _file(pixels: Pixels) -> bytes:
     return f"{kind} {pixels.shape[1]} {pixels.shape[0]} 255\n".encode() + pixels.tobytes()
 
 
-def decode_video(packets: Iterable[tuple[int, bytes]], form: str) -> Iterator[tuple[int, bytes]]:
+def decode_video(packets: Iterable[tuple[Stamp, bytes]], form: str) -> Iterator[tuple[Stamp, bytes]]:
     """Decode messages (stamp, message) of a video into (stamp, file in the Netpbm form), one picture each, in order.
 
     Raises ValueError where the messages are not of that form, or nothing of them can be decoded.
@@ -117,7 +118,7 @@ def decode_video(packets: Iterable[tuple[int, bytes]], form: str) -> Iterator[tu
         yield from zip(stamps, _decoded_pictures(whole.name, len(stamps), "messages", _NEEDED), strict=True)
 
 
-def _decoded_by_pyav(packets: Iterable[tuple[int, bytes]], form: str) -> Iterator[tuple[int, bytes]]:
+def _decoded_by_pyav(packets: Iterable[tuple[Stamp, bytes]], form: str) -> Iterator[tuple[Stamp, bytes]]:
     """Decode a video with PyAV in one thread, which has no delay: each message is a picture at once."""
     try:
         import av

@@ -485,6 +485,7 @@ class Recording:
                 decoded = self._formats[block.channel].decode(block)
                 for message, log_ns in zip(decoded, block.log_ns.tolist(), strict=True):
                     if absent == 0 and message.from_log_time:
+                        yield message._replace(left_out=True)
                         continue
                     one = message._replace(t_ns=log_ns, from_log_time=True) if absent else message
                     kept.append((one.t_ns, log_ns))

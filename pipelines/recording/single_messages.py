@@ -28,6 +28,11 @@ def camera_info(message: DecodedMessage) -> series.CameraInfo:
 
 def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
     """Yield pictures as (stamp in ns, file); raw ones and frames of a video become files in the Netpbm form."""
+    return ((t_ns, file) for t_ns, file in _files(messages, is_raw) if t_ns is not None)
+
+
+def _files(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int | None, bytes]]:
+    """Yield a picture for each message; its stamp is None where the message is left out."""
     files = (_file(message, is_raw) for message in messages)
     for t_ns, form, data in files:
         if form in images.ANNEX_B or form in images.BY_PYAV:
@@ -40,19 +45,19 @@ def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple
         yield t_ns, data
 
 
-def _file(message: DecodedMessage, is_raw: bool) -> tuple[int, str, bytes]:
+def _file(message: DecodedMessage, is_raw: bool) -> tuple[int | None, str, bytes]:
     """Return a message's stamp, ns, its format, and its picture as a file, or its packet of a video."""
-    found = message.content
+    found, t_ns = message.content, None if message.left_out else message.t_ns
     if is_raw:
-        return message.t_ns, "netpbm", images.netpbm(found)
-    return message.t_ns, found.format.lower(), found.data.tobytes()
+        return t_ns, "netpbm", images.netpbm(found)
+    return t_ns, found.format.lower(), found.data.tobytes()
 
 
 def tag_detections(messages: Iterable[DecodedMessage]) -> series.DetectionSeries:
     """Detections of apriltag_msgs/AprilTagDetectionArray messages, with corners as points or as plain numbers."""
     stamps: list[tuple[int, bool]] = []
     rows: list[tuple[int, int, Any, int, float, str]] = []
-    for i, message in enumerate(messages):
+    for i, message in enumerate(message for message in messages if not message.left_out):
         stamps.append((message.t_ns, message.from_log_time))
         numbers = message.definition.numbers
         for found in message.content.detections:

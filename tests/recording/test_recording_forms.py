@@ -6,7 +6,7 @@ import base64
 import re
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -742,9 +742,13 @@ def test_another_encoding_of_pictures_is_one_line(tmp_path: Path) -> None:
 
 
 def video(
-    path: Path, pictures: Any, change: Callable[[list[bytes]], list[bytes]] = list, form: str = "h264"
+    path: Path,
+    pictures: Any,
+    change: Callable[[list[bytes]], list[bytes]] = list,
+    form: str = "h264",
+    unstamped: Sequence[int] = (),
 ) -> Recording:
-    """A recording of Foxglove's CompressedVideo, 10 pictures a second."""
+    """A recording of Foxglove's CompressedVideo, 10 pictures a second, some of which have no stamp."""
     import foxglove
     from foxglove import channels
     from foxglove import messages as fox
@@ -753,8 +757,8 @@ def video(
     with foxglove.open_mcap(path, context=context, allow_overwrite=True):
         channel = channels.CompressedVideoChannel("/video", context=context)
         for i, data in enumerate(change(forms.h264(pictures))):
-            stamp = fox.Timestamp(1_700_000_000, 100_000_000 * i)
-            channel.log(fox.CompressedVideo(timestamp=stamp, frame_id="camera", data=data, format=form), log_time=i)
+            stamp = fox.Timestamp(0, 0) if i in unstamped else fox.Timestamp(1_700_000_000, 100_000_000 * i)
+            channel.log(fox.CompressedVideo(timestamp=stamp, frame_id="camera", data=data, format=form), log_time=i + 1)
     return open_recording(path)
 
 
@@ -777,11 +781,13 @@ def test_pictures_of_videos_of_other_forms(form: str, tmp_path: Path) -> None:
         pytest.importorskip("av", reason="needs the extra alidade[video]")
     packets = [base64.b64decode(each) for each in forms.VIDEOS[form]]
 
-    def recorded(made: list[bytes]) -> Recording:
-        return video(tmp_path / "v.mcap", np.zeros((0, 16, 16), np.uint8), lambda _: made, form)
+    def recorded(made: list[bytes], *unstamped: int) -> Recording:
+        return video(tmp_path / "v.mcap", np.zeros((0, 16, 16), np.uint8), lambda _: made, form, unstamped)
 
     found = list(recorded(packets).images("/video"))
     assert [t_ns % 10**9 for t_ns, _ in found] == [0, 100_000_000, 200_000_000]
+    # One without a stamp is left out, and those that follow are decoded by it.
+    assert list(recorded(packets, 0).images("/video")) == found[1:]
     files = [np.frombuffer(file, np.uint8) for _, file in found]
     grey = np.array([cv2.imdecode(file, cv2.IMREAD_GRAYSCALE) for file in files], float)
     assert grey.shape == (3, 64, 64)
