@@ -12,7 +12,7 @@ the floor and leave the rest where it is. The cost there counts. A gimbal that w
 its mount: 26 linear systems, where 200 damped steps alone had a third of the way before them.
 
 Where the residuals are curved as well, the linear system makes every step along the floor too short by the same part;
-after one such step the next is lengthened by what the two foretell (Aitken). Recordings at rest for 50 s, of 5 pictures
+after one such step the next is lengthened by what the two predict (Aitken). Recordings at rest for 50 s, of 5 pictures
 per second: 32 to 48 linear systems in place of 38 to 93; the worst known 70 in place of 287.
 
 Limits: a minimum is a local one. A cost is a sum of squares, in units of squared sigmas, with the losses in force.
@@ -33,7 +33,7 @@ from alidade.pipelines.solvers.linearization import Linearization, System
 # Decrease of the cost over the one predicted above which a step is doubled: along it the cost is no parabola, and falls
 # on, as it does about a saddle, where the ratio is 2.
 _DOUBLE = 1.5
-# Steps at most that one full step stands for after two that the linear system makes too short.
+# Largest length, in full steps, of a step after one that the linear system makes too short.
 _LONGEST = 8.0
 # Error of the predicted decrease of an undamped step below which that step is the last.
 _AS_PREDICTED = 2e-6
@@ -143,6 +143,8 @@ def minimize(
             decrease = here.cost - there.cost
             falls_on = damping == 0.0 and length == 1.0 and decrease > _DOUBLE * max(predicted, enough)
             before = predicted if falls_on else 0.0
+            if length > 1.0 and decrease < enough:
+                continue  # too far, which proves no minimum: the next step is the single one from here
             is_minimum = _is_minimum(enough, damping, predicted, decrease)
             if decrease > 0.0 or (is_minimum and decrease > -enough):
                 here = there
@@ -163,7 +165,7 @@ def minimize(
 
 
 def _length(predicted: float, before: float) -> float:
-    """Length of a full step after one along which the cost fell on, of predicted decrease `before` (0: there was none).
+    """Length, in full steps, of a step after one whose predicted decrease `before` was too small (0: there was none).
 
     Steps that shrink by a factor lead to the minimum as a geometric series does: Aitken's extrapolation.
     """

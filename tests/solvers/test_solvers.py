@@ -23,6 +23,7 @@ from alidade.pipelines.solvers.batch import minimum, solve_batch
 from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.solvers.layout import Tangent
 from alidade.pipelines.solvers.posterior import Reported
 from alidade.pipelines.solvers.window import Keyframes
 from tests.support import chain
@@ -219,6 +220,21 @@ def test_fixed_quantities_cost_the_others_no_digits() -> None:
     np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-6)
     assert not covariance[2].any()
     assert not covariance[:, 2].any()
+
+
+def test_a_lengthened_step_that_goes_too_far_proves_no_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At .05 sigma from the minimum, where a single step that raises the cost proves one."""
+    compiled = Compiled.of(Walk.random(0)[0].problem())
+    engine, start = compiled.engine.under(None), levenberg.Point.of(compiled.engine, compiled.initial)
+    least = start.factorization.minimum
+    step, share = Tangent(*start.factorization.solve()), 0.05 / (start.cost - least) ** 0.5
+    near = engine.layout.retract(start.values, step.times(1.0 - share))
+    lengths = iter((3.0, *(10 * [1.0])))
+    monkeypatch.setattr(levenberg, "_length", lambda *_: next(lengths))
+    found = levenberg.minimize(engine, near, levenberg.LevenbergConfig(corrections=0))
+    assert engine.cost(near) - least == pytest.approx(0.05**2, rel=1e-3)
+    assert found.converged
+    assert found.cost - least < 1e-6
 
 
 @pytest.mark.parametrize("pictures_hz", [5.0, 10.0])
