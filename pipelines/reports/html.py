@@ -1,7 +1,7 @@
 """A report as one HTML file that opens offline, and in a frame of a notebook.
 
 The page forbids itself any access to the network (Content-Security-Policy): a report seen anywhere shows what it shows
-here. Figures are drawn by BokehJS, which is in the page, compressed.
+here. Figures are drawn by BokehJS, which is in the page, compressed; small ones, beside a number, are SVG.
 """
 
 from __future__ import annotations

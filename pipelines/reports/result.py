@@ -51,10 +51,8 @@ from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
     from alidade.pipelines.methods import Method
-    from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.reports.calibration import SavedRotation
     from alidade.pipelines.reports.html import Page
-
 
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 

@@ -1,4 +1,4 @@
-"""A Foxglove WebSocket bridge as a source: its sensors' messages, written down as MCAP.
+"""A Foxglove WebSocket bridge as a source: its sensors' messages as MCAP; and the protocol, which `serve` has as well.
 
 The bridge is asked for what a method can read and nothing else. Whenever it drops the connection it is called again.
 Messages that are none are refused and counted, and cost nothing else.

@@ -1,6 +1,6 @@
 """Sources of a recording that is being made: a file or folder that another process writes, or a stream.
 
-Streams are written down as they come, so that all sources look alike: files that grow.
+Streams are written down as they come (`Spool`), so that all sources look alike: files that grow.
 """
 
 from __future__ import annotations

@@ -47,7 +47,6 @@ from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
-_LEFT, _MIDDLE = ("camera_roll", "collimation"), "axis_nonperpendicularity"
 S = tuple(name for each in SCALE for name in each.names)
 DRIVERS = SENSITIVITY.names, GYRO_SLOPE.names
 
