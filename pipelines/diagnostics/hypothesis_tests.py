@@ -85,7 +85,7 @@ def find_hypotheses(
     if any(after.fits for after, _ in found):
         found = [each for each in found if each[0].fits]
     if not found:
-        fallback = _explaining(build, data_faults(model, data, config, "fallback"), before, concurrent)
+        fallback = _explaining(build, _data_faults(model, data, config, "fallback"), before, concurrent)
         found = [each for each in fallback if each[0].fits]
     if not found and known:
         found = _noise(build, data, config)
@@ -99,7 +99,7 @@ def misstatements(build: Build, model: FaultModel, data: Any, config: Config) ->
 
     Arguments as of `find_hypotheses`. Faults without such a statement cost nothing.
     """
-    if not (cases := list(data_faults(model, data, config, "stated"))):
+    if not (cases := list(_data_faults(model, data, config, "stated"))):
         return ()
     before, *found = _solved(build, [TrialCase("", data, config), *cases], max_concurrent(model.times(data)))
     limit = before[0].cost_with_priors - _SIGNIFICANT**2
@@ -213,15 +213,15 @@ class TrialCase:
 
 def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Yield all faults to test, except those that count only where no other fits."""
-    yield from data_faults(model, data, config)
-    yield from inverted_signs(model, data, config)
-    yield from axis_orders(model, data, config)
-    yield from units(model, data, config)
-    yield from late_stamps(build, model, data, config)
-    yield from scale_factors(build, model, data, config)
+    yield from _data_faults(model, data, config)
+    yield from _inverted_signs(model, data, config)
+    yield from _axis_orders(model, data, config)
+    yield from _units(model, data, config)
+    yield from _late_stamps(build, model, data, config)
+    yield from _scale_factors(build, model, data, config)
 
 
-def data_faults(model: FaultModel, data: Any, config: Config, role: str = "usual") -> Iterator[TrialCase]:
+def _data_faults(model: FaultModel, data: Any, config: Config, role: str = "usual") -> Iterator[TrialCase]:
     """Yield trial cases of the method's own faults of one role."""
     for fault in model.faults:
         if fault.role == role and (corrected := fault.corrected(data, config)) is not None:
@@ -235,7 +235,7 @@ def _readings(model: FaultModel, data: Any) -> Iterator[tuple[str, str, Sequence
             yield name, sensor, columns, values
 
 
-def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
+def _inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Yield trial cases for every combination of inverted axes of a sensor."""
     for name, sensor, columns, values in _readings(model, data):
         for signs in product((1.0, -1.0), repeat=len(columns)):
@@ -247,7 +247,7 @@ def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[Tri
                 yield TrialCase(label, replace(data, **{name: factor * values}), config)
 
 
-def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
+def _axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Yield trial cases with a sensor's axes permuted: two swapped, or a right angle about the third."""
     for name, sensor, columns, values in _readings(model, data):
         if len(columns) < 3:
@@ -267,7 +267,7 @@ def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialC
                 yield TrialCase(label, replace(data, **{name: values @ swapped * signs}), config)
 
 
-def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
+def _units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Yield trial cases with rates in deg/s, or converted to rad/s twice."""
     for name, sensor, _, values in _readings(model, data):
         if "gyro" in name:
@@ -278,7 +278,7 @@ def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
                 yield TrialCase(label, replace(data, **{name: changed}), config)
 
 
-def late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
+def _late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Yield a trial case with delayed stamps shifted to the smallest residuals."""
     if model.clock is None:
         return
@@ -293,7 +293,7 @@ def late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> I
         yield TrialCase(f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift))
 
 
-def scale_factors(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
+def _scale_factors(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Yield trial cases with config numbers multiplied by the factor of smallest residuals."""
     for factor in model.scalings:
         if factor.apply(data, config, 1.0) is None:

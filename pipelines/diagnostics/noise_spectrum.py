@@ -344,7 +344,7 @@ class AxisNoise:
 def axis_noise(pieces: Sequence[Array], interval_s: float) -> AxisNoise:
     """Estimate one axis' noise from pieces (n,) of a record at rest, each evenly spaced by interval_s."""
     lines = find_lines(pieces, interval_s)
-    steady = without_lines(pieces, interval_s, lines) if lines else pieces
+    steady = _without_lines(pieces, interval_s, lines) if lines else pieces
     beside = _BESIDE / (interval_s * max(len(piece) for piece in pieces))
     bands = [(line.hz - beside, line.hz + beside) for line in lines]
     bands += [line.band_hz for line in find_lines(steady, interval_s)] if lines else []
@@ -425,7 +425,7 @@ def find_lines(pieces: Sequence[Array], interval_s: float) -> tuple[Line, ...]:
     return tuple(sorted(found, key=lambda line: -line.amplitude)[:_MOST_LINES])
 
 
-def without_lines(pieces: Sequence[Array], interval_s: float, lines: Sequence[Line]) -> list[Array]:
+def _without_lines(pieces: Sequence[Array], interval_s: float, lines: Sequence[Line]) -> list[Array]:
     """Subtract from each piece the sinusoids' steady part, of constant frequency, phase and amplitude."""
     out = []
     for piece in pieces:

@@ -155,7 +155,7 @@ class Calibration(SensorValues):
     @cached_property
     def uses(self) -> tuple[UseBands, ...]:
         """Uses of the calibration, with the error before and after it and the 95 % band; none without a solution."""
-        return () if has_no_solution(self.findings) else uses_of(self)
+        return () if has_no_solution(self.findings) else _uses_of(self)
 
     def plot(self, name: str | None = None) -> Page:
         """The figures of the report, which a notebook shows: all, those of a use, or the plot with a title.
@@ -436,7 +436,7 @@ class AppliedFormulas:
         return {name: value.array for name, value in found.items()}
 
 
-def uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
+def _uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
     """Return the error bands of all uses of the method; none without a solution."""
     c = calibration
     if not c.estimate.converged or not np.isfinite(c.covariance).all():

@@ -4,7 +4,7 @@ There is no camera and no reference. Without a gyro attitudes are unknown: what 
 strength, the specific force at rest another, and that the angle between them is constant. That determines each sensor's
 scale, non-orthogonality and offset, and the relative rotation of two. The body's axes are those in which the
 K of the accelerometer, or of a magnetometer alone, is symmetric: as near to the sensor's own as any can be. A gyro
-chains the attitudes (`chained`): each sample of the field then gives three residuals instead of one.
+chains the attitudes (`_chained`): each sample of the field then gives three residuals instead of one.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ def problem(data: TumbleData, config: Config) -> Problem:
     found = variables(model, config)
     sensors = model.sensors if model.guess is not None else tuple(map(unturned, model.sensors))
     for sensor in sensors:
-        check_turned(sensor, config)
+        _check_turned(sensor, config)
     if model.guess is not None:
-        return chained(data, config, model, found)
+        return _chained(data, config, model, found)
     model = replace(model, sensors=sensors)
     noises = [Level(sensor.noise, sensor.initial_level) for sensor in model.sensors]
     if model.moments is not None:
@@ -184,7 +184,7 @@ class _Graph:
     loss: TruncatedLoss
 
 
-def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variable, ...]) -> Problem:
+def _chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variable, ...]) -> Problem:
     """Build the graph of a recording with a gyro, whose mounting the model's first guess gives."""
     assert model.guess is not None
     assert model.dip is not None
@@ -384,7 +384,7 @@ def unturned(sensor: Sensor) -> Sensor:
     )
 
 
-def check_turned(sensor: Sensor, config: Config) -> None:
+def _check_turned(sensor: Sensor, config: Config) -> None:
     """Raise InputError if readings, or their means by `unturned`, cover too few attitudes for a parameter."""
     few = not sensor.rested and len(sensor.raw) < FEWEST
     # Counts may have any offset: those of a device that rests are a cloud of noise, and so is their ellipsoid.
