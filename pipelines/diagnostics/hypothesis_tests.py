@@ -23,6 +23,7 @@ from alidade.pipelines.diagnostics.fault_models import FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.observability import rejects_many
 from alidade.pipelines.diagnostics.trial_fit import Build, TrialFit, max_concurrent, score_trial, solve_trial
 from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Estimate, Residuals
 from alidade.pipelines.settings import Config
 
@@ -43,7 +44,7 @@ _NOISE_KNOWN = 0.1
 _PROMISING, _MAX_RIVAL = 0.97, 3.0
 # Scores within this share of the best are alike: the flip of any axis is the exchange of any two, with another mount.
 _ALIKE = 0.05
-# Noise less than this factor from its statement is not reported.
+# Noise less than this factor from its statement is not reported, nor larger than it was.
 _MIN_NOISE_FACTOR = 1.1
 _WHAT = "testing hypotheses"
 
@@ -177,13 +178,19 @@ def _worst_segment(residuals: Mapping[str, Residuals], length: float) -> tuple[f
 def _explains(before: TrialFit, after: TrialFit) -> bool:
     """Whether a correction reduces chi-square significantly and to (nearly) its expectation.
 
-    A corrected gyro whose noise is far larger than its residuals fits any motion, as larger noise would.
+    Of a corrected gyro also the noise at rest is another: far larger than its residuals it fits any motion.
     """
-    if after.factor < 1.0 / _MAX_NOISE_FACTOR:
+    if after.factor < 1.0 / _MAX_NOISE_FACTOR and _is_noisier(before.estimate.levels, after.estimate.levels):
         return False
     fall = (before.cost - after.cost) / max(after.factor, 1.0) ** 2
     explains = after.factor < _MAX_REMAINING * before.factor and after.factor**2 <= _MAX_LEFT
     return fall > _SIGNIFICANT**2 and (after.fits or explains)
+
+
+def _is_noisier(before: Sequence[Level], after: Sequence[Level]) -> bool:
+    """Whether a noise after a correction is larger than before it."""
+    known = {level.noise.name: level.used for level in before}
+    return any(level.used > _MIN_NOISE_FACTOR * known.get(level.noise.name, np.inf) for level in after)
 
 
 def _noise(build: Build, data: Any, config: Config) -> list[_Tested]:

@@ -55,15 +55,29 @@ def test_most_of_a_small_family_rejected_is_told(count: int, rejected: int, told
 
 
 @pytest.mark.parametrize(
-    ("left", "explains"), [(1.0, True), (0.1, True), (0.05, False), (9.0, True), (11.0, False), (200.0, False)]
+    ("left", "grown", "explains"),
+    [
+        (1.0, 1.0, True),
+        (1.0, 57.3, True),
+        (0.1, 57.3, True),
+        (0.05, 57.3, False),
+        (0.01, 1.0, True),
+        (9.0, 1.0, True),
+        (11.0, 1.0, False),
+        (200.0, 1.0, False),
+    ],
 )
-def test_what_leaves_chi_square_far_from_its_freedom_is_no_explanation(left: float, explains: bool) -> None:
-    estimate = make_calibration().estimate
+def test_what_leaves_chi_square_far_from_its_freedom_is_no_explanation(
+    left: float, grown: float, explains: bool
+) -> None:
+    """Far below it where the correction enlarges the noise; where it does not, the noise was stated too large."""
 
-    def fit(chi_square: float) -> TrialFit:
+    def fit(chi_square: float, density: float) -> TrialFit:
+        level = Level(Noise("gyro_density", density, "default", 1.0, ("gyro",)))
+        estimate = replace(make_calibration().estimate, levels=(level,))
         return TrialFit((), estimate, ChiSquare(chi_square, 1000, {}), 0.0, 1000.0)
 
-    assert hypothesis_tests._explains(fit(1e6), fit(1e3 * left)) is explains
+    assert hypothesis_tests._explains(fit(1e6, 5e-5), fit(1e3 * left, 5e-5 * grown)) is explains
 
 
 @pytest.mark.parametrize(("share", "severities"), [(0.6, [Severity.NOTE]), (0.8, [Severity.INCONSISTENT])])

@@ -103,6 +103,21 @@ def test_noise_of_a_gyro_that_never_rests_is_judged_by_its_rate(
     assert any(f.kind == "hypothesis" and "gyro's x" in f.evidence["label"] for f in found.findings) == (signs[0] < 0)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", [0, 2])
+def test_an_inverted_axis_is_named_where_vision_is_far_better_than_its_default(axis: int, shared_data: Path) -> None:
+    """Motion capture leaves a hundredth of chi-square once the sign is right."""
+    head = methods.method("head")
+    trial = to_session(read_trial(shared_data / "broad" / "12_undisturbed_slow_translation_C.mat"), 0, 0.0)
+    moving = head.faults.segment(trial, 60.0, 90.0)
+    signs = np.where(np.arange(3) == axis, -1.0, 1.0)
+    found = Session(head, replace(moving, head_gyro=moving.head_gyro * signs), load_config(None)).calibrate(
+        "batch", report=False
+    )
+    assert found.status == "inconsistent"
+    assert found.headline.startswith(f"Consistent with: the sign of the helmet gyro's {'xyz'[axis]} is wrong")
+
+
 @pytest.mark.parametrize(
     ("sign", "begin", "end", "status"),
     [(1, 160.0, 170.0, "weak"), pytest.param(-1, 155.0, 175.0, "inconsistent", marks=pytest.mark.slow)],
