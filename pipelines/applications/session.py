@@ -150,9 +150,7 @@ class Session:
             raise InputError(f"{said}{f'; nearest is {nearest}' if nearest else ''}") from error
         noted = (COPIED, OVERTAKEN, HELD, "not used (reading kept)")
         many = [f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted)]
-        unused = (*idle(recording, config, chosen.name), *empty(recording, config, chosen.name))
-        unstated = (f"proposed for the config, not assumed: {key}" for key in chosen.proposed(recording, config))
-        for sentence in (*many, *unused, *unstated):
+        for sentence in (*many, *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
             recording.remark(sentence)
         session = cls(chosen, data, config, recording)
         return session if prior is None else session.beginning_from(prior)

@@ -294,7 +294,7 @@ def _check_camera(
     found: list[SeenTags | None],
 ) -> None:
     """Raise InputError if tags do not fit, but would all fit with another camera description."""
-    from alidade.pipelines.methods.cube.tags import camera_fault
+    from alidade.pipelines.vision.camera_faults import camera_fault
 
     assert data.camera is not None
     errors = [seen.pose.rms_px for seen in found if seen is not None and len(seen.ids) > 1]

@@ -103,6 +103,9 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     vision_cov: Array | None
     if wanted(recording, config, VISION_ATTITUDE) or not wanted(recording, config, IMAGE):
         vision_t, vision_wxyz, vision_cov = _vision(reader, name)
+        stated = "kind" in config.vision.model_fields_set
+        if not stated and _like_mocap(recording, name, vision_t, vision_wxyz, vision_cov):
+            recording.remark(f"proposed for the config, not assumed: {_MOCAP_KIND}")
     else:
         name = config.topic(IMAGE)
         vision_t, vision_wxyz, vision_cov = _from_pictures(reader, config)
@@ -194,6 +197,7 @@ def _vision(reader: StreamReader, topic: str) -> tuple[Array, Array, Array | Non
 _FAST_HZ = 80.0
 # rad; so measured, motion capture at 25 Hz has 7e-5 to 5e-4 (six BROAD trials), with .5 deg of noise added 7e-3.
 _TINY = 1e-3
+_MOCAP_KIND = "vision: {kind: mocap}"
 _MOCAP = re.compile(r"mocap|vicon|optitrack|qualisys|motion_?capture", re.IGNORECASE)
 # Fourth differences of white noise have so many times its variance: the binomial of 8 over 4.
 _FOURTH = 70.0
@@ -210,17 +214,24 @@ def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
         poses = recording.poses(name)
     except InputError:
         return ()
-    if _MOCAP.search(name):
-        return (f"vision: {{kind: mocap}} (the name {name})",)
     order = np.argsort(poses.t_ns, kind="stable")
-    steps = np.diff(poses.t_ns[order])
-    rate = 1e9 / float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    t = np.asarray(1e-9 * poses.t_ns[order], dtype=float)
+    why = _like_mocap(recording, name, t, poses.wxyz[order], poses.cov[:, 3:, 3:])
+    return (f"{_MOCAP_KIND} ({why})",) if why else ()
+
+
+def _like_mocap(recording: Recording, name: str, t: Array, wxyz: Array, cov: Array | None) -> str:
+    """Why attitudes (n, 4) at t (n,), s, with covariances (n, 3, 3) look like motion capture's; empty: they do not."""
+    if _MOCAP.search(name):
+        return f"the name {name}"
+    steps = np.diff(t)
+    rate = 1.0 / float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     # Drivers that know nothing state next to nothing.
-    noise = max(typical(poses.cov, 3, 4, 5) or 0.0, white_angle(poses.wxyz[order]))
+    noise = max(typical(cov, 0, 1, 2) or 0.0, white_angle(wxyz))
     is_odometry = name in recording.topics and recording.topics[name].type == messages.ODOMETRY
     if is_odometry or (rate < _FAST_HZ and noise >= _TINY):
-        return ()
-    return (f"vision: {{kind: mocap}} ({rate:.3g} attitudes/s on {name}, noise {np.rad2deg(noise):.2g} deg)",)
+        return ""
+    return f"{rate:.3g} attitudes/s on {name}, noise {np.rad2deg(noise):.2g} deg"
 
 
 def white_angle(wxyz: Array) -> float:

@@ -81,7 +81,7 @@ def test_info_proposes_motion_capture_by_rate_or_noise(
         session = alidade.open(tmp_path / "s.mcap")
         assert not session.config.model_fields_set & {"vision"}
         assert session.recording is not None
-        assert session.recording.notes == (f"proposed for the config, not assumed: {said[0]}",)
+        assert session.recording.notes == ("proposed for the config, not assumed: vision: {kind: mocap}",)
         stated = alidade.open(tmp_path / "s.mcap", config=load_config(b"vision: {kind: other}"))
         assert stated.recording is not None
         assert not stated.recording.notes
