@@ -125,7 +125,7 @@ class Recording:
         self._assumptions: tuple[str, ...] = ()
         self.stamp_sigma_s = 0.0
         self._decoded_tables: dict[tuple[str, tuple[str, ...]], ColumnTable] = {}
-        self._transforms: dict[str, dict[tuple[str, str], series.PoseSeries]] = {}
+        self._transforms: dict[str, dict[tuple[str, str], tuple[series.PoseSeries, int]]] = {}
         self._times: dict[str, Times] = {}
         self._unstamped: dict[str, int] = {}  # topic -> messages without a stamp that were left out
         self._by_log: set[str] = set()  # topics whose messages have their log times in place of stamps
@@ -343,11 +343,8 @@ class Recording:
         """Read the transforms on a tf2_msgs/TFMessage topic by (parent frame, child frame)."""
         if topic not in self._transforms:
             with self._problems(topic):
-                found = single_messages.transforms(self._decoded(topic, messages.TF))
-            self._transforms[topic] = {pair: poses for pair, (poses, _) in found.items()}
-            if without := sum(left_out for _, left_out in found.values()):
-                self._unstamped[topic] = without
-        return self._transforms[topic]
+                self._transforms[topic] = single_messages.transforms(self._decoded(topic, messages.TF))
+        return {pair: poses for pair, (poses, _) in self._transforms[topic].items()}
 
     # -- derived topics
 
@@ -382,13 +379,15 @@ class Recording:
 
     def _between(self, topic: str, frames: tuple[str, str]) -> series.PoseSeries:
         """Read the transforms between one pair of frames, (parent, child), on a TFMessage topic."""
-        pairs = self.transforms(topic)
-        found = pairs.get((frames[0].lstrip("/"), frames[1].lstrip("/")))
+        pairs, pair = self.transforms(topic), (frames[0].lstrip("/"), frames[1].lstrip("/"))
+        found = pairs.get(pair)
         if found is None:
             there = ", ".join(f"{parent} to {child}" for parent, child in sorted(pairs)[:MAX_NAMED])
             raise InputError(
                 f"{self.path}: topic {topic} has no transform from {frames[0]} to {frames[1]}; there: {there or 'none'}"
             )
+        if without := self._transforms[topic][pair][1]:
+            self._unstamped[topic] = without
         self._note_unstamped(topic, found.t_ns, found.stamped_by_log)
         return found
 

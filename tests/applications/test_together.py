@@ -82,13 +82,13 @@ def test_it_is_one_big_graph(case: str, monkeypatch: pytest.MonkeyPatch) -> None
     """To 1e-6 sigmas at fixed noise levels, the device's numbers and those of the last recording, and their sigmas."""
     monkeypatch.setattr(together, "_STAYS", 1e-7)
     name, config, scenario = CASES[case]
-    opened = sessions(name, [1, 2], config, scenario)
+    opened = sessions(name, [1, 2, 3], config, scenario)
     problems = [each.problem() for each in opened]
     shared = walks(opened[0].method, opened[0].config, [q.name for q in problems[0].quantities])
     values, sigmas = solved(one_graph(problems, shared))
     found = jointly(opened).parameters
     for p in found.values():
-        one = p.name if p.name in shared else f"{p.name}@1"
+        one = p.name if p.name in shared else f"{p.name}@2"
         if p.sigma > 0.0:
             assert abs(p.value - values[one]) < 1e-6 * sigmas[one], p.name
             assert p.sigma == pytest.approx(p.inflation * sigmas[one], rel=1e-6), p.name

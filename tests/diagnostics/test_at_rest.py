@@ -53,7 +53,7 @@ def test_batch_names_the_motion_that_is_missing(make: Callable[[int], Problem], 
 def test_vision_better_than_the_gyro_tells_no_time_offset_at_rest(seed: int) -> None:
     """Gyro noise turns what is seen by the time offset: 320 pictures of 50 urad once gave it to 2 ms."""
     noise = HEAD.noise.model_copy(update={"vision_attitude": 5e-5})
-    clean = HEAD.model_copy(update={"duration_s": 5.0, "vision_rate_hz": 40.0, "noise": noise})
+    clean = HEAD.model_copy(update={"duration_s": 8.0, "vision_rate_hz": 40.0, "noise": noise})
     problem = head.problem(simulate_head(clean, seed)[0], load_config(head_config(clean).encode()))
     estimate = solve_batch(problem)
     assert estimate.converged, estimate.message
