@@ -75,7 +75,7 @@ def test_so_many_keyframes_are_kept(method: str, changes: dict[str, float], monk
     monkeypatch.setattr(online, "levels_settled", lambda *_: True)
     if method == "los":
         monkeypatch.setattr(online, "SOLVE_GROWTH", 1.5)
-    problem = made(method, duration_s=4.0, **changes)
+    problem = made(method, duration_s=6.0, **changes)
     run = IncrementalSolver(problem, Keyframes(7))
     held = []
     for step in problem.steps(1):
