@@ -20,7 +20,8 @@ ACCEL_B = -_GRAVITY * np.array([0.064447, 0.011034, 0.034253])
 
 def test_a_cube_turned_by_hand_without_a_word_about_noise(shared_data: Path, tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text("latitude_deg: 52.38\n")
-    (found,) = calibrate(shared_data / "openaxes_imu9" / "adxl.mcap", ["batch"], "cube", tmp_path / "c.yaml", report=True)
+    recording = shared_data / "openaxes_imu9" / "adxl.mcap"
+    (found,) = calibrate(recording, ["batch"], "cube", tmp_path / "c.yaml", report=True)
     assert found.status in ("calibrated", "weak"), found.headline
     rows = [(f"accel_k{i + 1}{j + 1}", ACCEL_K[i, j]) for i in range(3) for j in range(i, 3)]
     rows += [(f"accel_b{i + 1}", ACCEL_B[i]) for i in range(3)]
@@ -69,7 +70,8 @@ def test_a_cube_held_in_a_hand(shared_data: Path, tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text(
         "latitude_deg: 48.0\ncube: {raw: {accel: {scale: 5.985504e-4}, gyro: {scale: 1.332312e-4}}}\n"
     )
-    (found,) = calibrate(shared_data / "suarez_mpu6050" / "cal.mcap", ["batch"], "cube", tmp_path / "c.yaml", report=True)
+    recording = shared_data / "suarez_mpu6050" / "cal.mcap"
+    (found,) = calibrate(recording, ["batch"], "cube", tmp_path / "c.yaml", report=True)
     assert found.status in ("calibrated", "weak"), found.headline
     assert len(found.tables["static_poses"]) == 10
     for name, published in (("accel_k33", 0.97911 * 9.80665 / 16384), ("gyro_k22", 1.3292e-4), ("gyro_k33", 1.3394e-4)):
