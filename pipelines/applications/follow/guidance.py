@@ -69,8 +69,8 @@ class View:
 
     @property
     def status(self) -> str:
-        """Status of the estimate; empty while there are too few data for one."""
-        return "" if self.covariance is None else status(self.findings)
+        """Status of the estimate; "initialising" until there is one, with noise levels found."""
+        return "initialising" if self.covariance is None else status(self.findings)
 
     @property
     def short(self) -> tuple[str, ...]:

@@ -121,6 +121,12 @@ def _view(sigma: float) -> View:
     return View(3.0, 0, quantities, np.array([0.02]), covariance, (wanted,), None, findings, _sway)
 
 
+def test_the_status_is_initialising_until_there_is_an_estimate() -> None:
+    some = _view(1e-4)
+    assert replace(some, values=None, covariance=None, findings=()).summary["status"] == "initialising"
+    assert some.summary["status"] == "calibrated"
+
+
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_screen_says_what_is_missing_and_when_it_is_enough(terminal: bool) -> None:
     console = Console(force_terminal=terminal, width=110, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
