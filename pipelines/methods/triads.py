@@ -224,7 +224,7 @@ def gyro_reading(true: Truth, rate: Array, force: Array) -> Array:
 
 
 def triad_uses(true: Truth, sensors: Sensors) -> list[Use]:
-    """Uses for the sensors present: heading, rate and specific force."""
+    """Return errors of heading, rate and specific force in use, as far as a device's sensors are calibrated."""
     found = [_heading(true, sensors)] if "mag_k11" in true else []
     found += [_rate(sensors)] if "gyro_k11" in true or "gyro_bias_x" in true else []
     return found + ([_force(sensors)] if "accel_k11" in true else [])

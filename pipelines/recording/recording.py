@@ -489,8 +489,9 @@ class Recording:
                     one = message._replace(t_ns=log_ns, from_log_time=True) if absent else message
                     kept.append((one.t_ns, log_ns))
                     yield one
-            times.append(np.array(kept, dtype=np.int64).reshape(-1, 2).T)
-        self._times[topic] = _concatenate([(t_ns, log_ns) for t_ns, log_ns in times])
+            t_ns, log = np.array(kept, dtype=np.int64).reshape(-1, 2).T
+            times.append((t_ns, log))
+        self._times[topic] = _concatenate(times)
         self._note_unstamped(topic, self._times[topic][0], absent or 0)
         self._check_any(topic, len(self._times[topic][0]))
         if info.type in SENSOR_STAMPED_TYPES:

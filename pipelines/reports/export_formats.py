@@ -380,7 +380,7 @@ _IMU = {"accel": "accelerometer", "gyro": "gyroscope"}
 
 
 def _imu(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
-    """Return K and b of accelerometer and gyro; identity and zero for one that is not calibrated.
+    """Return gains K (3, 3) and biases b (3,), SI, of accelerometer and gyro; 1 and 0 of one that is not calibrated.
 
     Raises InputError when neither is, or one was recorded in counts.
     """

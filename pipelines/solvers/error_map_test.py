@@ -83,6 +83,11 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
         deadline.passed(_WHAT)
         return estimate
     posterior = constrained_solution(compiled, solution)
+    at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
+    shift = np.array([at[name] for name in estimate.names]) - estimate.values
+    required = {q.name: q.scale for q in problem.quantities if q.required}
+    if any(abs(by) > required.get(name, np.inf) for name, by in zip(estimate.names, shift.tolist(), strict=True)):
+        return estimate
     rows, root = _rows(information, error_map)
     p, own = len(rows) - len(root), _own(information, error_map)
     # Given the map the numbers move by -R_xx^-1 R_xc c; with its prior the information on c is R_cc' R_cc + 1 / p^2.
@@ -91,11 +96,6 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
     gain = _along_strong(_along_strong(gain, others, posterior), others, without)
     R = np.concatenate([root[:-1, :-1], np.eye(len(error_map.names)) / error_map.prior])
     spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
-    at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
-    shift = np.array([at[name] for name in estimate.names]) - estimate.values
-    required = {q.name: q.scale for q in problem.quantities if q.required}
-    if any(abs(by) > required.get(name, np.inf) for name, by in zip(estimate.names, shift.tolist(), strict=True)):
-        return estimate
     columns, rows_of = np.zeros((len(estimate.names), spread.shape[1])), [estimate.names.index(n) for n in others]
     columns[rows_of] = gain @ spread
     weak = np.zeros_like(shift)

@@ -103,8 +103,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     vision_cov: Array | None
     if wanted(recording, config, VISION_ATTITUDE) or not wanted(recording, config, IMAGE):
         vision_t, vision_wxyz, vision_cov = _vision(reader, name)
-        stated = "kind" in config.vision.model_fields_set
-        if not stated and _like_mocap(recording, name, vision_t, vision_wxyz, vision_cov):
+        if _like_mocap(recording, config, name, vision_t, vision_wxyz, vision_cov):
             recording.remark(f"proposed for the config, not assumed: {_MOCAP_KIND}")
     else:
         name = config.topic(IMAGE)
@@ -208,7 +207,7 @@ _FEW, _QUIET = 25, 0.05
 def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
     """Propose motion capture by name, rate or noise of the attitudes, with the reason; other kinds change nothing."""
     name = config.topic(VISION_ATTITUDE)
-    if "kind" in config.vision.model_fields_set or not wanted(recording, config, VISION_ATTITUDE):
+    if not wanted(recording, config, VISION_ATTITUDE):
         return ()
     try:
         poses = recording.poses(name)
@@ -216,12 +215,17 @@ def proposed(recording: Recording, config: Config) -> tuple[str, ...]:
         return ()
     order = np.argsort(poses.t_ns, kind="stable")
     t = np.asarray(1e-9 * poses.t_ns[order], dtype=float)
-    why = _like_mocap(recording, name, t, poses.wxyz[order], poses.cov[:, 3:, 3:])
+    why = _like_mocap(recording, config, name, t, poses.wxyz[order], poses.cov[:, 3:, 3:])
     return (f"{_MOCAP_KIND} ({why})",) if why else ()
 
 
-def _like_mocap(recording: Recording, name: str, t: Array, wxyz: Array, cov: Array | None) -> str:
-    """Why attitudes (n, 4) at t (n,), s, with covariances (n, 3, 3) look like motion capture's; empty: they do not."""
+def _like_mocap(recording: Recording, config: Config, name: str, t: Array, wxyz: Array, cov: Array | None) -> str:
+    """Why attitudes (n, 4) at t (n,), s, with covariances (n, 3, 3) look like motion capture's.
+
+    Empty where they do not, or where the config states the kind of vision.
+    """
+    if "kind" in config.vision.model_fields_set:
+        return ""
     if _MOCAP.search(name):
         return f"the name {name}"
     steps = np.diff(t)

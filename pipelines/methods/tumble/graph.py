@@ -321,7 +321,7 @@ def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array
 
 
 def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
-    """Attitudes nRb at keyframes; n is level, with y along the horizontal field."""
+    """Attitudes nRb (wxyz) of the turned device at keyframes; n is level, with y along the horizontal field."""
     chain, rows = graph.turning.chain, list(keyframes)
     aRb = so3.from_gtsam([values.atRot3(chain.state(k)) for k in rows])
     time = chain.time[rows]
