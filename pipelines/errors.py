@@ -8,22 +8,27 @@ from pathlib import Path
 from typing import Self
 
 # Exit codes of the command line, which a fleet prints for each recording.
-CALIBRATED = 0
-CRASHED = 1
-BAD_INPUT = 2
-UNDETERMINED = 3
-INCONSISTENT = 4
-INTERRUPTED = 130
-KILLED = 137
+EXIT_CALIBRATED = 0
+EXIT_CRASHED = 1
+EXIT_BAD_INPUT = 2
+EXIT_UNDETERMINED = 3
+EXIT_INCONSISTENT = 4
+EXIT_INTERRUPTED = 130
+EXIT_KILLED = 137
 
-OF_STATUS = {
-    "calibrated": CALIBRATED,
-    "unobservable": UNDETERMINED,
-    "weak": UNDETERMINED,
-    "inconsistent": INCONSISTENT,
+EXIT_OF_STATUS = {
+    "calibrated": EXIT_CALIBRATED,
+    "unobservable": EXIT_UNDETERMINED,
+    "weak": EXIT_UNDETERMINED,
+    "inconsistent": EXIT_INCONSISTENT,
 }
 
-OF_VALIDATION = {"holds": CALIBRATED, "same": CALIBRATED, "unknown": UNDETERMINED, "changed": INCONSISTENT}
+EXIT_OF_VALIDATION = {
+    "holds": EXIT_CALIBRATED,
+    "same": EXIT_CALIBRATED,
+    "unknown": EXIT_UNDETERMINED,
+    "changed": EXIT_INCONSISTENT,
+}
 
 # Longer lines help nobody; names in a hostile recording can be as long as it likes.
 _LONGEST = 2000

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.reports.result import Calibration
 
 # Errors that are printed in one line, by name: to import the second takes gtsam's quarter of a second.
-_TROUBLE = {"InputError": errors.BAD_INPUT, "IndeterminateError": errors.UNDETERMINED}
+_TROUBLE = {"InputError": errors.EXIT_BAD_INPUT, "IndeterminateError": errors.EXIT_UNDETERMINED}
 
 
 class _WithPlugins(TyperGroup):
@@ -280,7 +280,7 @@ def compare(
     lines = [] if written is None else [f"Comparison in {written}"]
     _show(as_json, partial(results_json, comparison.calibrations), partial(comparison_report, comparison), *lines)
     if comparison.answer == "no":
-        raise typer.Exit(errors.INCONSISTENT)
+        raise typer.Exit(errors.EXIT_INCONSISTENT)
 
 
 @app.command()
@@ -376,7 +376,7 @@ def validate(
         report = validation_report(validated)
         (written,) = write_whole(folder, {"validation.html": render_html(report)})
     _show(as_json, partial(validation_json, validated), lambda: report, f"Plots in {written}")
-    raise typer.Exit(errors.OF_VALIDATION[validated.verdict])
+    raise typer.Exit(errors.EXIT_OF_VALIDATION[validated.verdict])
 
 
 @app.command()
@@ -468,7 +468,7 @@ def plan(
         write_file(page, render_html(plan_report(planned)))
         lines.append(f"The page is {page}")
     _show(as_json, partial(plan_json, planned), partial(plan_report, planned), *lines)
-    raise typer.Exit(errors.OF_STATUS[planned.now.status])
+    raise typer.Exit(errors.EXIT_OF_STATUS[planned.now.status])
 
 
 @app.command()
@@ -593,7 +593,7 @@ def montecarlo(
         _say(report.about)
     _show(as_json, partial(study_json, study), lambda: report, _results_in(folder, written))
     if study.interrupted:
-        raise typer.Exit(errors.INTERRUPTED)
+        raise typer.Exit(errors.EXIT_INTERRUPTED)
 
 
 @app.command()
@@ -626,7 +626,7 @@ def fleet(
     text = partial(fleet_json, found.outcome, found.populations, found.histories)
     _show(as_json, text, None, *found.summary, _results_in(out, found.written))
     if found.outcome.interrupted:
-        raise typer.Exit(errors.INTERRUPTED)
+        raise typer.Exit(errors.EXIT_INTERRUPTED)
 
 
 @app.command()
@@ -783,7 +783,7 @@ def _show_result(
 
     report = partial(calibration_report if everything else short_report, calibration)
     _show(as_json, partial(results_json, [calibration]), report, _results_in(folder, written), everything=everything)
-    raise typer.Exit(errors.OF_STATUS[calibration.status])
+    raise typer.Exit(errors.EXIT_OF_STATUS[calibration.status])
 
 
 def _show(
@@ -826,13 +826,13 @@ def main() -> None:
         app(prog_name="alidade")
     except BaseException as error:
         if _interrupted(error):
-            sys.exit(errors.INTERRUPTED)
+            sys.exit(errors.EXIT_INTERRUPTED)
         names = (kind.__name__ for kind in type(error).__mro__)
         code = next((_TROUBLE[name] for name in names if name in _TROUBLE), None)
         if code is None and not isinstance(error, OSError):
             raise
         print(f"alidade: {_os_error_line(error) if isinstance(error, OSError) else error}", file=sys.stderr)
-        sys.exit(errors.BAD_INPUT if code is None else code)
+        sys.exit(errors.EXIT_BAD_INPUT if code is None else code)
 
 
 def _os_error_line(error: OSError) -> str:

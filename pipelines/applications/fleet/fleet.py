@@ -110,7 +110,7 @@ class Outcome:
         """Summary in a few lines: how many recordings, with what verdicts, and what was quarantined."""
         done = f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run"
         lines = [f"{done}: {self.verdicts}"]
-        aside = [name for name, result in self.results.items() if result["exit_code"] == errors.KILLED]
+        aside = [name for name, result in self.results.items() if result["exit_code"] == errors.EXIT_KILLED]
         lines += [f"quarantined, it kills workers: {name}" for name in aside]
         return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
 
@@ -187,7 +187,7 @@ def calibrate_recording(
                     return None
                 return {**result, "tag": recording.tag, **_calibrated(path, settings, prior)}
     except (OSError, InputError) as error:
-        return failure(errors.BAD_INPUT, str(error))
+        return failure(errors.EXIT_BAD_INPUT, str(error))
 
 
 def _inputs(result: RecordingResult | None) -> tuple[str, str | None] | None:

@@ -181,17 +181,17 @@ def run_isolated(summarise: Callable[[Calibration], dict[str, Any]], calibrate: 
         calibration = calibrate()
         return {
             "status": calibration.status,
-            "exit_code": errors.OF_STATUS[calibration.status],
+            "exit_code": errors.EXIT_OF_STATUS[calibration.status],
             "reason": "" if calibration.status == "calibrated" else calibration.headline,
             "seconds": sum(calibration.timing.values()),
             **summarise(calibration),
         }
     except InputError as error:
-        return failure(errors.BAD_INPUT, str(error))
+        return failure(errors.EXIT_BAD_INPUT, str(error))
     except IndeterminateError as error:
-        return failure(errors.UNDETERMINED, str(error))
+        return failure(errors.EXIT_UNDETERMINED, str(error))
     except Exception as error:
-        return failure(errors.CRASHED, f"{type(error).__name__}: {error}")
+        return failure(errors.EXIT_CRASHED, f"{type(error).__name__}: {error}")
 
 
 def failure(exit_code: int, reason: str) -> Any:
@@ -201,7 +201,7 @@ def failure(exit_code: int, reason: str) -> Any:
 
 def quarantined() -> Any:
     """The result recorded for a calibration that killed its workers."""
-    return failure(errors.KILLED, "killed its worker each time it was tried, at last alone; quarantined")
+    return failure(errors.EXIT_KILLED, "killed its worker each time it was tried, at last alone; quarantined")
 
 
 # What text begins with that spreadsheets take for a formula (OWASP, CSV injection); an apostrophe before it says text.
