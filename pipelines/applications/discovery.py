@@ -278,13 +278,15 @@ class _Search:
     def _candidates(self, topic: Topic) -> list[TopicSource]:
         """Return unused recorded topics of a type of `topic`: only the one that the config names, if it is recorded.
 
-        An attitude may be between any two frames of a TFMessage.
+        An attitude may be between any two frames of a TFMessage. What is part of another source is none itself.
         """
         recording, own = self._recording, self._config.topic(topic)
         if own in recording.topics:
             return [self._config.topics.get(topic.key, TopicSource(topic=own))]
-        there = [(n, t) for n, t in recording.topics.items() if t.count and t.is_readable and n not in self._taken]
-        found = [TopicSource(topic=n) for n, t in there if t.type in topic.types]
+        made = {source.name: source for source in self._config.topics.values() if source.parts}
+        taken = self._taken.union(*(source.parts for source in made.values()))
+        there = [(n, t) for n, t in recording.topics.items() if t.count and t.is_readable and n not in taken]
+        found = [made.get(n, TopicSource(topic=n)) for n, t in there if t.type in topic.types]
         if _is_attitude(topic):
             for name in (n for n, t in there if t.type == messages.TF):
                 found += [TopicSource(topic=name, frames=pair) for pair in _moving_pairs(recording, name)]

@@ -50,7 +50,7 @@ _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
 # Without names these alone are taken: others are counts as often as not.
 _UNNAMED = {"accel": ("m/s^2", "g"), "field": ("uT",)}
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
-_QUATERNION = re.compile(r"(q|quat|orientation|rot|attitude)\w*w$|^w$")
+_QUATERNION = "q|quat|orientation|rot|attitude"
 # Unix time of the years 1985 to 2128, s.
 _UNIX_S = (0.5e9, 5e9)
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
@@ -140,6 +140,8 @@ class _Table:
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
+        rate = next((found[1] for line in self._form.preamble if (found := _RATE.search(line))), None)
+        self._rate = float(rate or 0.0)  # Hz, by its preamble
         texts, _ = read_columns(self._form, names)
         self._texts = [texts[name][:_ROWS] for name in names]
         self._values = [self._numbers(i) for i in range(len(names))]
@@ -159,12 +161,11 @@ class _Table:
                 self.doubts.append(f"{self._where}{topic}: {error}")
 
         if not time:
-            rate = next((found[1] for line in self._form.preamble if (found := _RATE.search(line))), None)
-            time = {"rate": float(rate or 100.0)}
-            if rate is None:
-                self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
+            time = {"rate": self._rate or 100.0}
+            if self._rate:
+                self.reasons.append(f"{self._where}no column of time; {self._rate:g} Hz by its preamble")
             else:
-                self.reasons.append(f"{self._where}no column of time; {rate} Hz by its preamble")
+                self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
         units = {kind: self._unit(kind, columns) for kind, columns in named.items()}
         imu = {kind: self._names(columns) for kind, columns in named.items() if kind != "field"}
         if imu:
@@ -227,6 +228,13 @@ class _Table:
         stated = self._stated(chosen) or _unit_word(_bare(full))
         unit = stated if stated in TIME_UNITS else _time_unit(self._values[chosen])
         by = "header" if stated == unit else "steps"
+        step = 1e-9 * TIME_UNITS[unit] * _median_step(self._values[chosen])
+        # Units differ by ten and more: those of Xsens's SampleTimeFine are 0.1 ms.
+        if step > 0.0 and self._rate and abs(np.log10(step * self._rate)) > 0.5:
+            self.doubts.append(
+                f"{self._where}{name} : no unit makes its steps {self._rate:g} Hz: not used"
+            )
+            return {}
         self.reasons.append(f"{self._where}{name} is the time, in {unit} by its {by}")
         return {"time": name} if unit == "s" else {"time": name, "unit": unit}
 
@@ -321,13 +329,19 @@ class _Table:
         return found
 
     def _quaternion(self) -> list[str]:
-        """Return the columns w, x, y, z of a quaternion of unit norm; empty without one."""
-        names = [_bare(name) for name in self._form.names]
-        for stem in {name[:-1] for name in names if _QUATERNION.search(name)}:
-            if all(f"{stem}{axis}" in names for axis in "wxyz"):
-                columns = [names.index(f"{stem}{axis}") for axis in "wxyz"]
+        """Return the columns w, x, y, z of a quaternion of unit norm, or those numbered so; empty without one."""
+        names = [re.sub(r"\W", "", _bare(name)) for name in self._form.names]
+        for axes in ("wxyz", "0123", "1234"):
+            last = re.compile(rf"({_QUATERNION})\w*{axes[0]}$")
+            for stem in [name[:-1] for name in names if last.search(name) or name == axes[0] == "w"]:
+                if not all(f"{stem}{axis}" in names for axis in axes):
+                    continue
+                columns = [names.index(f"{stem}{axis}") for axis in axes]
                 if abs(float(np.median(self._norms(columns))) - 1.0) < 0.01:
-                    return self._names(columns)
+                    found = self._names(columns)
+                    if axes != "wxyz":
+                        self.doubts.append(f"{self._where}{', '.join(found)} are taken as w, x, y, z")
+                    return found
         return []
 
 
@@ -337,8 +351,8 @@ def _kind(name: str) -> str:
 
 
 def _bare(name: str) -> str:
-    """A column's name without its unit, lower case."""
-    plain = name.strip().lower()
+    """A column's name without its unit and the `field.` that `rostopic echo -p` begins all names with, lower case."""
+    plain = re.sub(r"^field\.(?=\w+\.)", "", name.strip().lower())
     return re.sub(r"\s*[(\[{][^()\[\]{}]*[)\]}]$", "", plain) if unit_hinted(name) else plain
 
 
@@ -350,9 +364,7 @@ def _unit_word(name: str) -> str:
 
 def _time_unit(values: Array) -> str:
     """Return the unit of times: by their size where they are Unix times, else by their median step."""
-    values = values[np.isfinite(values)]
-    steps = np.diff(values)
-    step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+    step, values = _median_step(values), values[np.isfinite(values)]
     for unit, size in TIME_UNITS.items():
         second = 1e9 / size
         if _UNIX_S[0] * second < float(np.median(values)) < _UNIX_S[1] * second and step < SLOWEST_S * second:
@@ -360,6 +372,12 @@ def _time_unit(values: Array) -> str:
     if step < 0.9:
         return "s"
     return "ms" if step < 500.0 else "us" if step < 5e5 else "ns"
+
+
+def _median_step(values: Array) -> float:
+    """Return the median step of times; 0 without any."""
+    steps = np.diff(values[np.isfinite(values)])
+    return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
 
 
 def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:

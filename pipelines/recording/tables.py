@@ -132,7 +132,8 @@ def table_form(path: Path, data: Path) -> TableForm:
     cells = [_cells(line, delimiter) for line in lines]
     if max(map(len, cells)) > _MOST_COLUMNS:
         raise NotARecordingError.of(path)
-    usual = Counter(map(len, cells[-_SAMPLE:])).most_common(1)[0][0]
+    sample = [row for row in cells[-_SAMPLE:] if any(row)]
+    usual = Counter((len(row), _begins_with_value(row)) for row in sample).most_common(1)[0][0] if sample else (0, True)
     first = next((i for i, row in enumerate(cells) if _is_row(row, usual) and not _is_comment(lines[i])), len(lines))
     width = len(cells[first]) if first < len(lines) else 0
     header, units = _header(lines[:first], delimiter, width)
@@ -143,6 +144,8 @@ def table_form(path: Path, data: Path) -> TableForm:
     names = (
         [f"column {i + 1}" for i in range(width)] if header is None else _cells(_uncommented(lines[header]), delimiter)
     )
+    if len(names) == width - 1 and _begins_with_row_number(cells[first:]):
+        names = ["row", *names]
     names = names[:-1] if len(names) > 1 and not names[-1] else names
     stated = [unit_named(cell) for cell in _cells(lines[units], delimiter)] if units is not None else []
     stated += [""] * (len(names) - len(stated))
@@ -158,6 +161,15 @@ def table_form(path: Path, data: Path) -> TableForm:
         min(width, len(names)),
         tuple(line.strip() for line in lines[: first if header is None else header] if line.strip()),
     )
+
+
+def _begins_with_row_number(rows: Sequence[Sequence[str]]) -> bool:
+    """Whether rows begin with their number, which has no name where a header is one name short, and then the time."""
+    try:
+        number, time = np.array([row[:2] for row in rows[:_SAMPLE]], dtype=float).T
+    except ValueError:
+        return False
+    return len(number) > 1 and bool((np.diff(number) == 1.0).all() and (np.diff(time) > 0.0).all())
 
 
 def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:
@@ -317,17 +329,22 @@ def _uncommented(line: str) -> str:
     return line.lstrip().lstrip("#/%").strip() if _is_comment(line) else line
 
 
-def _is_row(cells: Sequence[str], usual: int) -> bool:
+def _is_row(cells: Sequence[str], usual: tuple[int, bool]) -> bool:
     """Whether most cells are numbers, times or empty, as in a row of a table.
 
-    What begins with a word is one if it has as many cells as rows usually have, three numbers or more among them: a
-    label, and no line of a preamble.
+    What begins with a word is one, and no line of a preamble, if rows usually do: with as many cells, three numbers or
+    more among them.
     """
     filled = [cell for cell in cells if cell.lower() not in _ABSENT]
     values = sum(map(_is_value, filled))
     if not filled or 2 * values < len(filled):
         return False
-    return _is_value(filled[0]) or (values >= _LEAST_LABELLED and len(cells) == usual)
+    return _begins_with_value(cells) or (values >= _LEAST_LABELLED and usual == (len(cells), False))
+
+
+def _begins_with_value(cells: Sequence[str]) -> bool:
+    """Whether the first cell of a row that holds something is a number or a time."""
+    return _is_value(next((cell for cell in cells if cell.lower() not in _ABSENT), ""))
 
 
 def _is_value(cell: str) -> bool:

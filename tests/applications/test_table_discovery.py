@@ -105,6 +105,37 @@ CASES = {
         (SECONDS, DIRECTIONS),
         {"/imu": {"time": "time", "accel": ["gFx", "gFy", "gFz"], "units": {"accel": "g"}}},
     ),
+    "rows that begin with a number that the header does not name": (
+        "timestamp,ang_vel_x,ang_vel_y,ang_vel_z",
+        (np.arange(N), 1.5e9 + SECONDS, RATES),
+        {"/imu": {"time": "timestamp", "gyro": [f"ang_vel_{axis}" for axis in "xyz"]}},
+    ),
+    "a pose as rostopic writes it": (
+        "%time,field.header.seq,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
+        + ",".join(f"field.pose.orientation.{axis}" for axis in "xyzw"),
+        (1.5e18 + 1e7 * np.arange(N), np.arange(N), 0.5 * DIRECTIONS, np.full((N, 4), 0.5)),
+        {"/attitude": {"time": "time", "unit": "ns", "wxyz": [f"field.pose.orientation.{axis}" for axis in "wxyz"]}},
+    ),
+    "a rigid body as Motive exports it": (
+        "Format Version,1.23,Take Name,Take,Capture Frame Rate,100.000000,Rotation Type,Quaternion\n\n"
+        f",Type{8 * ',Rigid Body'}\n,Name{8 * ',Head'}\n,ID{8 * ',1'}\n"
+        f",{4 * ',Rotation'}{3 * ',Position'},Mean Marker Error\nFrame,Time (Seconds),X,Y,Z,W,X,Y,Z,",
+        (np.arange(N), SECONDS, np.full((N, 4), 0.5), DIRECTIONS, np.full(N, 3e-4)),
+        {"/attitude": {"time": "Time (Seconds)", "wxyz": ["W", "column 3", "column 4", "column 5"]}},
+    ),
+    "a quaternion by numbers, a clock of 0.1 ms beside the rate": (
+        "// Update Rate: 100.0Hz\nSampleTimeFine,Gyr_X,Gyr_Y,Gyr_Z,Quat_q0,Quat_q1,Quat_q2,Quat_q3",
+        (100 * np.arange(N), RATES, np.full((N, 4), 0.5)),
+        {
+            "/imu": {"rate": 100.0, "gyro": ["Gyr_X", "Gyr_Y", "Gyr_Z"]},
+            "/attitude": {"rate": 100.0, "wxyz": [f"Quat_q{i}" for i in range(4)]},
+        },
+    ),
+    "a quaternion in brackets": (
+        "timestamp,q[0],q[1],q[2],q[3],delta_q_reset[0],delta_q_reset[1],delta_q_reset[2],delta_q_reset[3]",
+        (1e4 * np.arange(N), np.full((N, 4), 0.5), np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))),
+        {"/attitude": {"time": "timestamp", "unit": "us", "wxyz": [f"q[{i}]" for i in range(4)]}},
+    ),
     "a pose": (
         "timestamp,qw,qx,qy,qz",
         (1.79e9 + SECONDS, np.tile([0.5, 0.5, 0.5, 0.5], (N, 1))),
@@ -217,6 +248,21 @@ def test_a_phones_files_of_one_sensor_each_are_one_imu(tmp_path: Path, alidade: 
     assert run.code == 2
     assert "topic /imu has no gyro, which is needed here" in run.err
     assert "name those of one by their folder, or by a pattern in quotes" in run.err
+
+
+def test_the_parts_of_an_imu_are_no_gyros_beside_it(tmp_path: Path, alidade: Command) -> None:
+    t = 0.01 * np.arange(2000)
+    turned = np.stack([0.8 * np.sin(1.9 * t), 0.5 * np.sin(2.7 * t + 1.0), 0.3 * np.sin(3.7 * t)], axis=1)
+    wxyz = so3.exp(turned)
+    rates = so3.log(so3.multiply(so3.inverse(wxyz[:-1]), wxyz[1:])) / 0.01
+    folder = tmp_path / "phone"
+    folder.mkdir()
+    write(folder / "Gyroscope.csv", "seconds_elapsed,x,y,z", t[1:], rates)
+    write(folder / "Accelerometer.csv", "seconds_elapsed,x,y,z", t, so3.rotate(so3.inverse(wxyz), [0.0, 0.0, 9.81]))
+    write(folder / "Orientation.csv", "seconds_elapsed,qw,qx,qy,qz", t, wxyz)
+    out = alidade("info", str(folder)).out
+    assert "head_imu: {gyro: /imu/gyro, accel: /imu/accel}" in out
+    assert "vision_attitude: /attitude" in out
 
 
 def test_one_command_calibrates_a_phones_table(tmp_path: Path, alidade: Command) -> None:
