@@ -30,6 +30,8 @@ _ALIKE = 0.6
 _CLEARLY = 0.1
 # Of the pairs of frames of a TFMessage so many are tried, those with so many transforms at least.
 _MOST_PAIRS, _FEWEST = 12, 20
+# Units of rates and of times differ by ten and more: half of that, as a power.
+_OTHER_UNIT = 0.5
 # Delays worth a word, s.
 _DELAY = 0.002
 
@@ -248,6 +250,12 @@ class _Search:
                 "by itself: mend the order, or say invert in the config"
             )
             return {attitude.key, *to_choose}
+        if abs(np.log10(found.ratio)) > _OTHER_UNIT:
+            self._reasons.append(
+                f"{g.name} turns with {a.name}, but {found.ratio:.3g} times as fast: is the unit of the gyro right, or "
+                "that of the times? Not taken by itself"
+            )
+            return {attitude.key, gyro.key, *to_choose}
         if self._config.topic(gyro) != g.name and gyro.key not in to_choose:
             self._topics[gyro.key] = g
         if (self._config.topic(attitude) != a.name or found.inverted) and attitude.key not in to_choose:

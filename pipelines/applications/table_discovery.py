@@ -231,9 +231,7 @@ class _Table:
         step = 1e-9 * TIME_UNITS[unit] * _median_step(self._values[chosen])
         # Units differ by ten and more: those of Xsens's SampleTimeFine are 0.1 ms.
         if step > 0.0 and self._rate and abs(np.log10(step * self._rate)) > 0.5:
-            self.doubts.append(
-                f"{self._where}{name} : no unit makes its steps {self._rate:g} Hz: not used"
-            )
+            self.doubts.append(f"{self._where}{name} : no unit makes its steps {self._rate:g} Hz: not used")
             return {}
         self.reasons.append(f"{self._where}{name} is the time, in {unit} by its {by}")
         return {"time": name} if unit == "s" else {"time": name, "unit": unit}

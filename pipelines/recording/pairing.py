@@ -48,6 +48,7 @@ class Pairing:
         angle: of that rotation, rad.
         order: of the quaternions' components, w, x, y, z, as recorded; another one where an inverse that fits is beyond
             MAX_MOUNT and another order, which fits as well, is not.
+        ratio: of the gyro's rates to those of the attitude: that of their units.
     """
 
     correlation: float
@@ -56,6 +57,7 @@ class Pairing:
     fit: float
     angle: float = 0.0
     order: tuple[int, int, int, int] = (0, 1, 2, 3)
+    ratio: float = 1.0
 
 
 class _Gyro:
@@ -111,25 +113,25 @@ def pair(
     if correlation is None:
         return None
 
-    def fits(later: float, of: Sequence[Array] = ways) -> list[tuple[float, float]]:
-        """Return the explained share of the rates and the rotation angle, rad, of both directions, at a delay, s."""
+    def fits(later: float, of: Sequence[Array] = ways) -> list[tuple[float, float, float]]:
+        """Return what `_fit` does of both directions, at a delay, s."""
         inside = ours.covers(a + later, b + later)
         against = ours.mean(a[inside] + later, b[inside] + later)
         return [_fit(one[inside], against) for one in of]
 
-    way = int(np.argmax([share for share, _ in fits(offset)]))
+    way = int(np.argmax([share for share, _, _ in fits(offset)]))
     middle = directions[way][stride // 2 :][: len(steps)][whole]
     seen = _Seen(a, b, ways[way], so3.matrix(middle).swapaxes(1, 2))
     offset = _refined(offset, seen, ours, [_Gyro(t_ns, rates, start) for t_ns, rates in others])
-    fit, angle = fits(offset)[way]
+    fit, angle, ratio = fits(offset)[way]
     if way == 1 and angle > MAX_MOUNT:
         # (x, y, z, w) read as (w, x, y, z) is exactly an inverse between two constant rotations.
         reordered = [quaternions[:, components] for components in _ORDERS]
         turns = [_rates(one[:-stride], one[stride:], steps)[whole] for one in reordered]
-        for components, (share, turned) in zip(_ORDERS, fits(offset, turns), strict=True):
+        for components, (share, turned, _) in zip(_ORDERS, fits(offset, turns), strict=True):
             if share > _AS_WELL * fit and turned < MAX_MOUNT:
-                return Pairing(correlation, offset, False, share, turned, components)
-    return Pairing(correlation, offset, way == 1, fit, angle)
+                return Pairing(correlation, offset, False, share, turned, components, ratio)
+    return Pairing(correlation, offset, way == 1, fit, angle, ratio=ratio)
 
 
 class _Seen(NamedTuple):
@@ -210,9 +212,15 @@ def _rates(first: Array, second: Array, steps: Array) -> Array:
     return so3.local(first, second) / steps[:, None]
 
 
-def _fit(ours: Array, theirs: Array) -> tuple[float, float]:
-    """Share of the squared rates (n, 3) explained by the rotation that fits best (Wahba's problem), and its angle."""
+def _fit(ours: Array, theirs: Array) -> tuple[float, float, float]:
+    """Fit of an attitude's rates (n, 3) to a gyro's by a rotation (Wahba's problem).
+
+    Returns:
+        the share of the squared rates that it explains, its angle, rad, and the ratio of the gyro's rates to the other.
+    """
     rotation = so3.align(ours, theirs)
-    total = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
-    explained = float((ours * so3.rotate(rotation, theirs)).sum())
-    return (explained / total if total > 0.0 else 0.0), float(np.linalg.norm(so3.log(rotation)))
+    sizes = float(np.linalg.norm(ours)), float(np.linalg.norm(theirs))
+    if not all(sizes):
+        return 0.0, float(np.linalg.norm(so3.log(rotation))), 1.0
+    explained = float((ours * so3.rotate(rotation, theirs)).sum()) / (sizes[0] * sizes[1])
+    return explained, float(np.linalg.norm(so3.log(rotation))), sizes[1] / sizes[0]

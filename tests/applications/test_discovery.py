@@ -284,6 +284,21 @@ def twins(simulated: Path, path: Path, poses: bool = False) -> Recording:
     return open_recording(path)
 
 
+def test_rates_in_another_unit_than_the_attitudes_are_not_taken(simulated: Path, tmp_path: Path) -> None:
+    whole = open_recording(simulated)
+    poses, imu = whole.poses("/vision/attitude"), whole.imu("/platform/imu")
+    gyro = whole.imu("/head/imu")
+    fast = {
+        "/tracker/pose": dataclasses.replace(poses, t_ns=poses.t_ns // 5),
+        "/xsens/data": dataclasses.replace(gyro, t_ns=gyro.t_ns // 5),
+        "/vehicle/imu": dataclasses.replace(imu, t_ns=imu.t_ns // 5),
+    }
+    write_session(tmp_path / "s.mcap", fast)
+    (found,) = suggestions(open_recording(tmp_path / "s.mcap"), NONE, ["head"])
+    assert "/xsens/data turns with /tracker/pose, but 0.2" in " ".join(found.reasons)
+    assert "vision_attitude" not in found.topics
+
+
 def test_of_two_gyros_on_one_body_people_choose(simulated: Path, tmp_path: Path, alidade: Command) -> None:
     recording = twins(simulated, tmp_path / "s.mcap")
     (head,) = (found for found in suggestions(recording, NONE) if found.method == "head")
