@@ -86,7 +86,6 @@ def unit_of(quantity: str, unit: str) -> str:
 
 def _plain(text: str) -> str:
     """Return the text of a unit without brackets and blanks, in ASCII."""
-    text = text.strip().strip("()[]{}").strip()
     for sign, letters in {
         "\u00b5": "u",
         "\u03bc": "u",
@@ -96,7 +95,7 @@ def _plain(text: str) -> str:
         "\u207b\u00b9": "^-1",
     }.items():
         text = text.replace(sign, letters)
-    return re.sub(r"\s+", "", text)
+    return re.sub(r"[\s()\[\]{}]+", "", text)
 
 
 # Stamps beyond these, s, are of another unit: the year 5138; the first too many for integer ns.

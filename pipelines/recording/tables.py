@@ -292,9 +292,9 @@ def _header(lines: Sequence[str], delimiter: str, width: int) -> tuple[int | Non
 
 
 def _are_units(cells: Sequence[str]) -> bool:
-    """Whether all cells that are not empty name units."""
+    """Whether most cells that are not empty name units; others may be of a vendor's own (`local_flux`)."""
     filled = [cell for cell in cells if cell]
-    return bool(filled) and all(unit_named(cell) for cell in filled)
+    return 2 * sum(bool(unit_named(cell)) for cell in filled) > len(filled)
 
 
 def _rows(form: TableForm) -> Iterator[tuple[int, list[str]]]:
@@ -330,14 +330,14 @@ def _uncommented(line: str) -> str:
 
 
 def _is_row(cells: Sequence[str], usual: tuple[int, bool]) -> bool:
-    """Whether most cells are numbers, times or empty, as in a row of a table.
+    """Whether most cells are numbers, times or empty, and as many as in half of a usual row at least.
 
     What begins with a word is one, and no line of a preamble, if rows usually do: with as many cells, three numbers or
     more among them.
     """
     filled = [cell for cell in cells if cell.lower() not in _ABSENT]
     values = sum(map(_is_value, filled))
-    if not filled or 2 * values < len(filled):
+    if not filled or 2 * values < len(filled) or 2 * len(cells) < usual[0]:
         return False
     return _begins_with_value(cells) or (values >= _LEAST_LABELLED and usual == (len(cells), False))
 

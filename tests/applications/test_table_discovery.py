@@ -131,6 +131,20 @@ CASES = {
             "/attitude": {"rate": 100.0, "wxyz": [f"Quat_q{i}" for i in range(4)]},
         },
     ),
+    "a line of units, one of them a vendor's own": (
+        "D_Timestamp,D_Accel_X,D_Accel_Y,D_Accel_Z,D_Mag_X,D_Mag_Y,D_Mag_Z\n"
+        "ms,m/(s^2),m/(s^2),m/(s^2),local_flux,local_flux,local_flux",
+        (1.6e12 + 10 * np.arange(N), 9.81 * DIRECTIONS, DIRECTIONS),
+        {
+            "/imu": {"time": "D_Timestamp", "unit": "ms", "accel": [f"D_Accel_{axis}" for axis in "XYZ"]},
+            "/mag": {
+                "time": "D_Timestamp",
+                "unit": "ms",
+                "field": [f"D_Mag_{axis}" for axis in "XYZ"],
+                "units": {"field": "G"},
+            },
+        },
+    ),
     "a quaternion in brackets": (
         "timestamp,q[0],q[1],q[2],q[3],delta_q_reset[0],delta_q_reset[1],delta_q_reset[2],delta_q_reset[3]",
         (1e4 * np.arange(N), np.full((N, 4), 0.5), np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))),
