@@ -142,8 +142,8 @@ class _Table:
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
         rate = next((found[1] for line in self._form.preamble if (found := _RATE.search(line))), None)
         self._rate = float(rate or 0.0)  # Hz, by its preamble
-        texts, _ = read_columns(self._form, names)
-        self._texts = [texts[name][:_ROWS] for name in names]
+        texts, _ = read_columns(self._form, names, _ROWS)
+        self._texts = list(texts.values())
         self._values = [self._numbers(i) for i in range(len(names))]
 
     def topics(self) -> dict[str, TableTopic]:

@@ -13,8 +13,8 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ _LONGEST_LINE, _MOST_COLUMNS = 1 << 16, 1000
 _HEAD, _SAMPLE = 1 << 18, 200
 # Numbers of a row that begins with a word, at least: a vector.
 _LEAST_LABELLED = 3
+# Rows whose cells are kept as Python's strings at once.
+_BLOCK = 1 << 16
 # Rows cut short, as by a logger that lost power, are dropped up to this share of all.
 _MOST_CUT = 0.01
 _BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -182,38 +184,45 @@ def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:
         )
 
 
-def read_columns(form: TableForm, names: Sequence[str]) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+def read_columns(
+    form: TableForm, names: Sequence[str], most: int | None = None
+) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
     """Return the named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
     are no rows; a last row that is cut short is left out, and so are others up to 1 % of all.
 
+    Args:
+        form: of the table.
+        names: of the columns.
+        most: number of rows at most that are looked at; None for all.
+
     Raises:
         InputError: a column is missing, or more rows are too short; the first of them is named.
     """
-    rows, notes = _whole_rows(form, [form.index(name) for name in names])
-    table = np.array(rows, dtype=np.str_).reshape(len(rows), len(names))
+    columns, notes = _whole_rows(form, [form.index(name) for name in names], most)
     if form.decimal == ",":
-        table = np.char.replace(table, ",", ".")
-    return {name: table[:, i] for i, name in enumerate(names)}, notes
+        columns = [np.char.replace(column, ",", ".") for column in columns]
+    return dict(zip(names, columns, strict=True)), notes
 
 
 def numbers(path: Path, columns: Mapping[str, NDArray[np.str_]], names: Sequence[str]) -> Array:
     """Convert columns to numbers (N, len(names)), NaN for missing ones. Raises InputError, naming the cell, at text."""
-    table = np.stack([columns[name] for name in names], axis=1)
+    return np.column_stack([_numbers(path, name, columns[name]) for name in names])
+
+
+def _numbers(path: Path, name: str, texts: NDArray[np.str_]) -> Array:
     try:
-        return np.where(table == "", "nan", table).astype(float)
+        return np.where(texts == "", "nan", texts).astype(float)
     except ValueError:
         pass
-    out = np.full(table.shape, np.nan)
-    for at, cell in np.ndenumerate(table):
+    out = np.full(len(texts), np.nan)
+    for i, cell in enumerate(texts.tolist()):
         if cell.lower() not in _ABSENT:
             try:
-                out[at] = float(cell)
+                out[i] = float(cell)
             except ValueError:
-                raise InputError(
-                    f"{path}: row {at[0] + 1}, column {names[at[1]]}: {str(cell)[:40]!r} is no number"
-                ) from None
+                raise InputError(f"{path}: row {i + 1}, column {name}: {cell[:40]!r} is no number") from None
     return out
 
 
@@ -222,25 +231,39 @@ def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
     return ~np.isin(np.char.lower(texts), list(_ABSENT))
 
 
-def _whole_rows(form: TableForm, wanted: Sequence[int]) -> tuple[list[list[str]], list[str]]:
-    """Return the wanted cells of each whole row, and sentences about rows that are left out; see `read_columns`."""
+def _whole_rows(
+    form: TableForm, wanted: Sequence[int], most: int | None = None
+) -> tuple[list[NDArray[np.str_]], list[str]]:
+    """Return the wanted columns of whole rows, and sentences about rows that are left out; see `read_columns`."""
+    blocks: list[list[NDArray[np.str_]]] = [[] for _ in wanted]
     rows: list[list[str]] = []
     cut: list[tuple[int, int]] = []
-    headers, needed = 1, max(form.width, *(i + 1 for i in wanted))
-    for number, row in _rows(form):
+    count, headers, needed = 0, 1, max(form.width, *(i + 1 for i in wanted))
+
+    def close() -> None:
+        """Store the rows so far as arrays: a cell in a list takes several times its place there."""
+        for i, block in enumerate(blocks):
+            block.append(np.array([row[i] for row in rows], dtype=np.str_))
+        rows.clear()
+
+    for number, row in islice(_rows(form), most):
         if len(row) < needed:
             cut.append((number, len(row)))
         elif row[: len(form.names)] == list(form.names[: len(row)]):
             headers += 1
         else:
+            count += 1
             rows.append([row[i] for i in wanted])
-    if len(cut) > max(1, _MOST_CUT * len(rows)):
+            if len(rows) == _BLOCK:
+                close()
+    close()
+    if len(cut) > max(1, _MOST_CUT * count):
         number, width = cut[0]
         raise InputError(f"{form.path}: line {number} has {width} columns instead of {needed}")
     notes = [f"{form.path.name}: rows cut short, the first in line {cut[0][0]}: {len(cut)} left out"] if cut else []
     if headers > 1:
         notes.append(f"{form.path.name}: its header is there {headers} times, as of a logger that was started again")
-    return rows, notes
+    return [np.concatenate(blocks.pop(0)) for _ in wanted], notes
 
 
 def _encoding(start: bytes) -> str:
@@ -361,7 +384,6 @@ def _trajectory(form: TableForm) -> series.PoseSeries | None:
             return None
     except ValueError:
         return None
-    rows, _ = _whole_rows(form, range(len(_TUM)))
-    columns: dict[str, Any] = dict(zip(_TUM, np.array(rows, dtype=np.str_).T, strict=True))
+    columns = dict(zip(_TUM, _whole_rows(form, range(len(_TUM)))[0], strict=True))
     position, xyzw = (numbers(form.path, columns, names) for names in (_TUM[1:4], _TUM[4:]))
     return series.PoseSeries(nanoseconds(form.path, columns["t"], "s"), xyzw[:, [3, 0, 1, 2]], position)
