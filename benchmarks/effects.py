@@ -99,9 +99,14 @@ class Found:
 
 
 def effects(method: str, scenario: str | None, drawn: Mapping[str, Any] | None = None) -> dict[str, dict[str, float]]:
-    """Effect -> the parameters it consists of, with their priors; `drawn` are settings on top of the scenario's."""
-    session = _simulated(method, scenario, drawn or {}, 0)
+    """Effect -> the parameters it consists of, with their priors; `drawn` are settings on top of the scenario's.
+
+    A simulator that draws all effects itself has none to be set: `several` varies them.
+    """
     found: dict[str, dict[str, float]] = {NOTHING: {}}
+    if not hasattr(methods.method(method).settings(scenario), "effects"):
+        return found
+    session = _simulated(method, scenario, drawn or {}, 0)
     for q in session.problem().quantities:
         if q.group == "assumption" and q.prior_sigma:
             found.setdefault(kind(q.name), {})[q.name] = q.prior_sigma
@@ -173,7 +178,8 @@ def run(case: Case, numbers: Mapping[str, float]) -> Found:
         drawn, numbers = several(case)
     else:
         signs = np.random.default_rng([case.seed, 2]).choice([-1.0, 1.0], len(numbers))
-        drawn = {"effects": {n: float(s * case.size * p) for s, (n, p) in zip(signs, numbers.items(), strict=True)}}
+        effect = {n: float(s * case.size * p) for s, (n, p) in zip(signs, numbers.items(), strict=True)}
+        drawn = {"effects": effect} if effect else {}
     try:
         with deadline.within(LIMIT_S):
             calibration = _simulated(case.method, case.scenario, drawn, case.seed).calibrate(case.solver)
