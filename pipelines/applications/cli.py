@@ -730,9 +730,10 @@ def cube_layout(
     """
     from alidade.pipelines.config import configured
     from alidade.pipelines.methods.cube.layout import cube_layout as estimate
-    from alidade.pipelines.methods.cube.layout import layout_json, layout_report, layout_yaml
+    from alidade.pipelines.methods.cube.layout import layout_yaml
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports.html import render_html
+    from alidade.pipelines.reports.layout_report import layout_json, layout_report
 
     page = out.with_suffix(".html")
     if page == out:
