@@ -1,6 +1,6 @@
 """Commands that are killed (SIGKILL) at random moments leave results that are whole, or none, and no process.
 
-200 moments of each command, in parts. tests/reports/test_whole.py kills a writer of results a few times,
+200 moments of each command, in parts. tests/test_files.py kills a writer of results a few times,
 tests/applications/follow and fleet their commands once.
 """
 
