@@ -17,7 +17,7 @@ bound is the quantile of 4,000 draws. Bands are conditional on the posterior: NE
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -180,13 +180,16 @@ class Band:
 _LARGEST = {"deg": 180.0, "mrad": 1e3 * np.pi}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class UseBands:
     """A use with the band of each of its lines; `drawn`: bounds are quantiles of draws."""
 
     use: Use
-    bands: Mapping[str, Band] = field(default_factory=dict)
+    bands: Mapping[str, Band]
     drawn: bool = False
+
+    def __repr__(self) -> str:
+        return f"<{self.use.name}: {self.before:.3g} {self.use.unit} before, {self.after:.3g} after, 95 %>"
 
     def figure(self, values: Callable[[Band], Array]) -> float:
         """Largest value of the bands, or that at the operating point `at`, in the use's unit; at most half a turn."""

@@ -368,8 +368,10 @@ def test_what_is_shown_at_a_prompt_is_one_short_line(
 ) -> None:
     calibration.write(tmp_path)
     saved = alidade.load(tmp_path / "calibration.yaml")
-    shown = (simulated, alidade.open(simulated), calibration, saved, calibration.parameters["time_offset"])
-    for each in (*shown, saved.parameters["time_offset"], alidade.Config({"latitude_deg": 48.0})):
+    shown = (simulated, alidade.open(simulated), calibration, *calibration.uses, saved)
+    assert calibration.uses
+    parameters = calibration.parameters["time_offset"], saved.parameters["time_offset"]
+    for each in (*shown, *parameters, alidade.Config({"latitude_deg": 48.0})):
         assert len(repr(each)) < 100
         assert "\n" not in repr(each)
 
