@@ -28,8 +28,8 @@ import numpy as np
 import psutil
 
 from alidade.pipelines.applications.follow import follow as following
-from alidade.pipelines.applications.follow.bridge import SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.follower import Settings
+from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websockets
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.result import Calibration

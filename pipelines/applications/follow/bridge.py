@@ -1,4 +1,4 @@
-"""A Foxglove WebSocket bridge as a source: its sensors' messages as MCAP; and the protocol, which `serve` has as well.
+"""A Foxglove WebSocket bridge as a source: its sensors' messages as MCAP.
 
 The bridge is asked for what a method can read and nothing else. Whenever it drops the connection it is called again.
 Messages that are none are refused and counted, and cost nothing else.
@@ -8,68 +8,27 @@ from __future__ import annotations
 
 import base64
 import json
-import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 from mcap.writer import Writer
 
+from alidade.pipelines.applications.follow.protocol import (
+    MESSAGE_DATA,
+    MESSAGE_HEAD,
+    SUBPROTOCOLS,
+    RefusedError,
+    read_id,
+    read_message,
+    websockets,
+)
 from alidade.pipelines.applications.follow.sources import Spool, Stream
-from alidade.pipelines.errors import InputError, printable
+from alidade.pipelines.errors import printable
 from alidade.pipelines.recording.container import Channel, Schema
 from alidade.pipelines.recording.decoding import MessageFormat
 from alidade.pipelines.recording.messages import SENSORS
-
-# The part of the protocol, foxglove-websocket v1, that this client and the server of `serve` use.
-SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-# Binary: opcode, subscription, time in ns, then the message.
-MESSAGE_DATA = 1
-MESSAGE_HEAD = struct.Struct("<BIQ")
-# Channels and subscriptions are numbered with 32 bits.
-LARGEST_ID = (1 << 32) - 1
-
-
-class RefusedError(Exception):
-    """Raised at a message from the other side that breaks the protocol, with the reason as text."""
-
-
-def read_message(text: str) -> dict[str, Any]:
-    """Parse a text message: a JSON object of numbers and Unicode text. Raises RefusedError."""
-    try:
-        content = json.loads(text, parse_constant=_refuse_constant)
-        if "\\u" in text:
-            json.dumps(content, ensure_ascii=False).encode()  # half of a surrogate pair is no text
-    except (ValueError, RecursionError) as error:
-        raise RefusedError(f"no JSON ({type(error).__name__})") from error
-    if not isinstance(content, dict):
-        raise RefusedError("no JSON object")
-    return content
-
-
-def read_id(value: Any) -> int:
-    """Check and return the number of a channel or a subscription. Raises RefusedError."""
-    if type(value) is not int or not 0 <= value <= LARGEST_ID:
-        raise RefusedError("a number of a channel that is none")
-    return value
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no JSON")
-
-
-def websockets() -> Any:
-    """Import the library websockets. Raises InputError when it is not installed."""
-    try:
-        import websockets.sync.client
-        import websockets.sync.server
-    except ImportError as error:
-        raise InputError(
-            "ws:// and --serve need websockets, which is not installed: pip install 'alidade[live]'"
-        ) from error
-    return websockets
-
 
 # Encoding of messages -> that of their schema, where a bridge does not say it.
 _SCHEMAS = {

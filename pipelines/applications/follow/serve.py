@@ -17,7 +17,9 @@ from typing import Any, NamedTuple
 
 from pydantic_core import to_json
 
-from alidade.pipelines.applications.follow.bridge import (
+from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Gate
+from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.applications.follow.protocol import (
     MESSAGE_DATA,
     MESSAGE_HEAD,
     SUBPROTOCOLS,
@@ -26,8 +28,6 @@ from alidade.pipelines.applications.follow.bridge import (
     read_message,
     websockets,
 )
-from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Gate
-from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.errors import InputError
 
 # Others on the network have no business with a calibration bench.

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from alidade.pipelines.applications.follow.bridge import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, Bridge, websockets
+from alidade.pipelines.applications.follow.bridge import Bridge
 from alidade.pipelines.applications.follow.gate import (
     MAX_ATTEMPTS,
     MAX_CONNECTIONS,
@@ -33,6 +33,7 @@ from alidade.pipelines.applications.follow.gate import (
 )
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.page import LivePage
+from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import MAX_SUBSCRIPTIONS, LiveServer
 from alidade.pipelines.applications.follow.sources import Spool
 from alidade.pipelines.estimation.problem import Quantity

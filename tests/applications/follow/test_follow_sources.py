@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alidade.pipelines.applications.follow.bridge import SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import LiveServer
 from alidade.pipelines.applications.follow.sources import Replay, Source, StandardInput, source_of
 from alidade.pipelines.errors import InputError
