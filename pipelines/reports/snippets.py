@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,17 +33,15 @@ _RANKS: tuple[Kind, ...] = ("scalar", "vector", "matrix")
 
 @dataclass(frozen=True)
 class _Node:
-    """Part of an expression: a constant with its value, or an operation on other parts.
+    """Part of an expression: a constant with its value, an operation of `operate` on other parts, or a leaf.
 
-    Operations: the name of an input, "name"; a call of an earlier formula, "call"; those of `operate`.
+    A leaf is an input or an earlier formula: `op` is its name or its call, as Python and C write them.
     """
 
     kind: Kind
     value: Value | None = None
     op: str = ""
     parts: tuple[_Node, ...] = ()
-    name: str = ""
-    arguments: tuple[str, ...] = ()
 
     @property
     def array(self) -> Array | None:
@@ -71,9 +69,9 @@ class _Reader:
         """Return the node of a name: an earlier formula, an input or a parameter."""
         if name in self._earlier:
             node, arguments = self._earlier[name]
-            return node if node.value is not None else _Node(node.kind, None, "call", (), name, arguments)
+            return node if node.value is not None else _Node(node.kind, None, f"{name}({', '.join(arguments)})")
         if name in self._inputs:
-            return _Node(_kind_in_code(input_kind(name)), None, "name", (), name)
+            return _Node(_kind_in_code(input_kind(name)), None, name)
         return _constant(Value.constant(self._known.get(name, np.array(0.0))))
 
 
@@ -109,7 +107,7 @@ def python_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str
     reader, lines = _Reader(values), []
     for formula in formulas:
         node = reader.read(formula)
-        text = ast.unparse(ast.parse(_python(node), mode="eval"))
+        text = ast.unparse(ast.parse(_code(node, _PYTHON, _python_numbers), mode="eval"))
         lines += ["", "", f"# {formula.description}"]
         if node.value is not None:
             lines.append(f"{formula.name} = {text}")
@@ -132,34 +130,39 @@ _PYTHON_HELPERS = {
 }
 
 
-_SIGNS = {"add": "+", "sub": "-", "mul": "*", "div": "/", "pow": "**"}
+# Operation, and for some the kinds of its parts -> code, for Python with more brackets than it needs.
+_PYTHON = {
+    "add": "({}) + ({})",
+    "sub": "({}) - ({})",
+    "mul": "({}) * ({})",
+    ("mul", "matrix", "vector"): "({}) @ ({})",
+    ("mul", "matrix", "matrix"): "({}) @ ({})",
+    "div": "({}) / ({})",
+    "pow": "({}) ** ({})",
+    "minus": "-({})",
+    "inverse": "({}).T",
+    "sin": "np.sin({})",
+    "cos": "np.cos({})",
+}
 
 
-def _python(node: _Node) -> str:
-    """Return a node as Python, with more brackets than it needs."""
+def _python_numbers(value: Array) -> str:
+    text = repr(np.vectorize(_digits, otypes=[float])(value).tolist())
+    return text if value.ndim == 0 else f"np.array({text})"
+
+
+def _code(node: _Node, operations: Mapping[Any, str], numbers: Callable[[Array], str]) -> str:
+    """Return a node as code; an operation that is not in the table is a call of a function of its name."""
     if node.array is not None:
-        text = repr(np.vectorize(_digits, otypes=[float])(node.array).tolist())
-        return text if node.kind == "scalar" else f"np.array({text})"
-    turned = _axis_turn(node)
-    if turned:
-        return f"{turned[0]}({_python(turned[1])})"
-    parts = [_python(part) for part in node.parts]
-    match node.op:
-        case "name":
-            return node.name
-        case "call":
-            return f"{node.name}({', '.join(node.arguments)})"
-        case "add" | "sub" | "mul" | "div" | "pow":
-            is_product = node.op == "mul" and node.parts[0].kind == "matrix" and node.parts[1].kind != "scalar"
-            return f"({parts[0]}) {'@' if is_product else _SIGNS[node.op]} ({parts[1]})"
-        case "minus":
-            return f"-({parts[0]})"
-        case "inverse":
-            return f"({parts[0]}).T"
-        case "sin" | "cos":
-            return f"np.{node.op}({parts[0]})"
-        case _:
-            return f"{node.op}({parts[0]})"
+        return numbers(node.array)
+    if turned := _axis_turn(node):
+        return f"{turned[0]}({_code(turned[1], operations, numbers)})"
+    if not node.parts:
+        return node.op
+    parts = [_code(part, operations, numbers) for part in node.parts]
+    kinds = (part.kind for part in node.parts)
+    form = operations.get((node.op, *kinds)) or operations.get(node.op) or f"{node.op}({{}})"
+    return form.format(*parts)
 
 
 def _axis_turn(node: _Node) -> tuple[str, _Node] | None:
@@ -186,7 +189,7 @@ def c_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str:
             lines.append(f"static const {kind} {formula.name} = {_c_numbers(node.array)};")
         else:
             needed = ", ".join(f"{_C_TYPES[reader.name(name).kind]} {name}" for name in formula.inputs)
-            lines.append(f"static {kind} {formula.name}({needed}) {{ return {_c(node)}; }}")
+            lines.append(f"static {kind} {formula.name}({needed}) {{ return {_code(node, _C, _c_part)}; }}")
     body = "\n".join(lines)
     needed_helpers: list[str] = []
     for name, text in reversed(_C_HELPERS.items()):
@@ -232,49 +235,36 @@ _C_HELPERS = {
 }
 
 
-def _c(node: _Node) -> str:
-    if node.array is not None:
-        text = _c_numbers(node.array)
-        return text if node.kind == "scalar" else f"({_C_TYPES[node.kind]}){text}"
-    turned = _axis_turn(node)
-    if turned:
-        return f"{turned[0]}({_c(turned[1])})"
-    parts = [_c(part) for part in node.parts]
-    kinds = [part.kind for part in node.parts]
-    match node.op, kinds:
-        case "name", _:
-            return node.name
-        case "call", _:
-            return f"{node.name}({', '.join(node.arguments)})"
-        case "mul", ["matrix", "matrix"]:
-            return f"product({parts[0]}, {parts[1]})"
-        case "mul", ["matrix", "vector"]:
-            return f"turned({parts[0]}, {parts[1]})"
-        case (("add" | "sub" | "mul"), ["vector", "vector"]):
-            return f"{'each' if node.op == 'mul' else node.op}({parts[0]}, {parts[1]})"
-        case "pow", ["vector", "scalar"]:
-            return f"power({parts[0]}, {parts[1]})"
-        case "mul", ["scalar", "vector"]:
-            return f"scaled({parts[1]}, {parts[0]})"
-        case (("mul" | "div"), ["vector", "scalar"]):
-            return f"scaled({parts[0]}, {parts[1] if node.op == 'mul' else f'1.0 / ({parts[1]})'})"
-        case (("add" | "sub"), ["vector", "scalar"]):
-            return f"shifted({parts[0]}, {'' if node.op == 'add' else '-'}({parts[1]}))"
-        case (("add" | "sub" | "mul" | "div"), ["scalar", "scalar"]):
-            return f"({parts[0]} {_SIGNS[node.op]} {parts[1]})"
-        case "minus", ["scalar"]:
-            return f"-({parts[0]})"
-        case "inverse", _:
-            return f"transposed({parts[0]})"
-        case _:
-            return f"{node.op}({', '.join(parts)})"
+_C = {
+    ("mul", "matrix", "matrix"): "product({}, {})",
+    ("mul", "matrix", "vector"): "turned({}, {})",
+    ("mul", "vector", "vector"): "each({}, {})",
+    ("mul", "scalar", "vector"): "scaled({1}, {0})",
+    ("mul", "vector", "scalar"): "scaled({}, {})",
+    ("mul", "scalar", "scalar"): "({} * {})",
+    ("add", "vector", "vector"): "add({}, {})",
+    ("add", "vector", "scalar"): "shifted({}, ({}))",
+    ("add", "scalar", "scalar"): "({} + {})",
+    ("sub", "vector", "vector"): "sub({}, {})",
+    ("sub", "vector", "scalar"): "shifted({}, -({}))",
+    ("sub", "scalar", "scalar"): "({} - {})",
+    ("div", "vector", "scalar"): "scaled({}, 1.0 / ({}))",
+    ("div", "scalar", "scalar"): "({} / {})",
+    ("pow", "vector", "scalar"): "power({}, {})",
+    ("pow", "scalar", "scalar"): "pow({}, {})",
+    ("minus", "scalar"): "-({})",
+    "inverse": "transposed({})",
+}
 
 
 def _c_numbers(value: Array) -> str:
-    if value.ndim == 0:
-        return repr(_digits(float(value)))
-    # A struct around its array.
-    return f"{{{_c_list(value.tolist())}}}"
+    """Return numbers as C initialises a variable with them: a struct around its array."""
+    text = _c_list(value.tolist())
+    return text if value.ndim == 0 else f"{{{text}}}"
+
+
+def _c_part(value: Array) -> str:
+    return f"({('', 'vec', 'mat')[value.ndim]}){_c_numbers(value)}" if value.ndim else _c_numbers(value)
 
 
 def _c_list(value: Any) -> str:
