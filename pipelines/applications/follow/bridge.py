@@ -179,7 +179,7 @@ class _Record:
         if self._out.is_full:
             self.flush()
         if self._out.is_full:
-            self._out.drop()
+            self._out.dropped += 1
             return
         if not self._channels:
             self._writer.start("", "alidade")

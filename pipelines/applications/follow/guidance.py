@@ -14,6 +14,7 @@ from alidade.pipelines.diagnostics.change_test import Stability, change_finding,
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.diagnose import misfits
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
+from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.finding import Finding, by_severity, status
 from alidade.pipelines.estimation.problem import Quantity
@@ -121,6 +122,20 @@ class View:
             return tuple(rows[:_MOST_SHOWN])
         ratio = self.sigmas / np.array([q.require for q in self.quantities])
         return tuple(sorted(sorted(rows, key=lambda i: -ratio[i])[:_MOST_SHOWN]))
+
+    @property
+    def rows(self) -> list[dict[str, str]]:
+        """Name, unit and required sigma of the parameters to show, and value, sigma and verdict once there are some."""
+        rows, verdicts = [], self.verdicts
+        for i in self.shown:
+            q = self.quantities[i]
+            unit, factor = human_unit(q)
+            row = {"name": q.name, "unit": unit, "require": rounded(factor * q.require)}
+            if self.values is not None and self.sigmas is not None:
+                value, sigma = factor * float(self.values[i]), factor * float(self.sigmas[i])
+                row |= {"value": to_digits_of(value, sigma), "sigma": rounded(sigma), "verdict": verdicts[q.name]}
+            rows.append(row)
+        return rows
 
     @property
     def estimated(self) -> tuple[str, ...]:

@@ -30,7 +30,6 @@ from pydantic_core import to_json
 
 from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, MAX_CONNECTIONS, Attempts, Gate
 from alidade.pipelines.applications.follow.guidance import WAITING, View
-from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError, printable
 from alidade.pipelines.reports.result import Calibration
 
@@ -204,26 +203,11 @@ class LivePage:
                 del history[1:-1:2]
 
     def _parameters(self, view: View) -> list[dict[str, Any]]:
-        found = []
-        for i in view.shown:
-            q = view.quantities[i]
-            unit, factor = human_unit(q)
-            require = factor * q.require
-            one: dict[str, Any] = {
-                "name": q.name,
-                "unit": unit.replace("^2", "²").strip("1"),
-                "require": to_digits_of(require, require),
-            }
-            if view.values is not None and view.sigmas is not None:
-                sigma = float(view.sigmas[i])
-                one |= {
-                    "value": to_digits_of(factor * float(view.values[i]), factor * sigma),
-                    "sigma": to_digits_of(factor * sigma, factor * sigma),
-                    "verdict": view.verdicts[q.name],
-                    "history": self._histories.get(q.name, []),
-                }
-            found.append(one)
-        return found
+        """Return the rows of a view in the page's units, with the history of each parameter."""
+        return [
+            {**row, "unit": row["unit"].replace("^2", "²").strip("1"), "history": self._histories.get(row["name"], [])}
+            for row in view.rows
+        ]
 
     # -- answers
 

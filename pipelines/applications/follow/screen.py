@@ -11,8 +11,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from alidade.pipelines.applications.follow.guidance import View
-from alidade.pipelines.display.table import Cell, Column, Row, Table
-from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.display.table import Cell, Column, Table
 from alidade.pipelines.reports.terminal import rich_table
 
 # Readers want four light modules around the code; the encoder leaves two.
@@ -68,19 +67,14 @@ def _page(view: View) -> Group:
 
 
 def _parameters(view: View) -> Table:
-    rows: list[Row] = []
-    for i in view.shown:
-        q = view.quantities[i]
-        unit, factor = human_unit(q)
-        known = ("", "")
-        if view.values is not None and view.sigmas is not None:
-            sigma = factor * float(view.sigmas[i])
-            known = to_digits_of(factor * float(view.values[i]), sigma), rounded(sigma)
-        verdict = view.verdicts.get(q.name, "")
-        rows.append((q.name, unit, *known, rounded(factor * q.require), Cell(verdict, tone=verdict)))
+    rows = tuple(
+        (*(row.get(key, "") for key in ("name", "unit", "value", "sigma", "require")), Cell(verdict, tone=verdict))
+        for row in view.rows
+        for verdict in (row.get("verdict", ""),)
+    )
     few = f", the least accurate of {len(view.estimated)}" if len(view.shown) < len(view.estimated) else ""
     columns = (f"parameter{few}", Column("unit", "text"), "value", "sigma", "required", Column("verdict", "text"))
-    return Table("", "", columns, tuple(rows))
+    return Table("", "", columns, rows)
 
 
 def _collected(view: View) -> Table:

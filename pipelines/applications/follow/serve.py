@@ -13,6 +13,7 @@ import socket
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from pydantic_core import to_json
@@ -219,14 +220,14 @@ class _Last(NamedTuple):
     data: bytes
 
 
+@dataclass
 class _Client:
     """State of a client: the channels it wants, by subscription, and the last message sent to each."""
 
-    def __init__(self) -> None:
-        self.wanted: dict[int, int] = {}
-        self.sent: dict[int, int] = {}  # subscription -> number of the last message
-        self.channels = 0  # announced
-        self.gone = False
+    wanted: dict[int, int] = field(default_factory=dict)
+    sent: dict[int, int] = field(default_factory=dict)  # subscription -> number of the last message
+    channels: int = 0  # announced
+    gone: bool = False
 
     def take(self, text: str | bytes) -> None:
         """Apply a client's subscriptions, up to MAX_SUBSCRIPTIONS; ignore all other messages."""

@@ -241,7 +241,7 @@ class Spool:
         self._waiting = bytearray()
         self._end = 0  # of what is on the disk
         self._due: float | None = None  # when to try again, while there is no room
-        self.dropped = 0
+        self.dropped = 0  # records lost for want of room
 
     @property
     def is_full(self) -> bool:
@@ -256,10 +256,6 @@ class Spool:
     def tell(self) -> int:
         """Return the position: bytes written so far, on the disk or in the buffer."""
         return self._end + len(self._waiting)
-
-    def drop(self) -> None:
-        """Count a record that is lost for want of room."""
-        self.dropped += 1
 
     def flush(self, at_once: bool = False) -> None:
         """Write the buffer to the disk if there is room; call between records, to write whole ones alone."""
