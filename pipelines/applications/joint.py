@@ -30,7 +30,7 @@ from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
+from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import kind
 from alidade.pipelines.estimation.prior_replacement import with_priors
@@ -68,14 +68,12 @@ class Alone:
         calibration: what result.json says of it by itself, without the data behind it.
         day: its date, days since 1970.
         sqrt_info: information about its numbers.
-        quantities: of its graph.
         data: the file in which its data wait.
     """
 
     calibration: Calibration
     day: float
     sqrt_info: SqrtInformation
-    quantities: Mapping[str, Quantity]
     data: Path
 
     @classmethod
@@ -112,7 +110,6 @@ class Alone:
             calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
             day=_day(session),
             sqrt_info=estimate.sqrt_info,
-            quantities={q.name: q for q in problem.quantities},
             data=data,
         )
 
@@ -125,11 +122,6 @@ class Alone:
     def start(self) -> datetime.datetime:
         """Date of the recording."""
         return datetime.datetime.fromtimestamp(self.day * DAY_S, datetime.UTC)
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Values that the recording alone gave, by parameter."""
-        return {name: p.value for name, p in self.calibration.parameters.items()}
 
     def loaded(self) -> Any:
         """The recording's data, read back from their file."""
@@ -155,7 +147,7 @@ def calibrate_together(
         for i, read in enumerate(sessions):
             session = read()
             if alone:
-                session = replace(session, near=alone[0].values)
+                session = replace(session, near=alone[0].calibration.values)
             calibration = session.calibrated_beside(partial(_with_those_before, session, alone))
             alone.append(Alone.of(session, calibration, Path(folder) / str(i)))
             written(calibration)
@@ -191,7 +183,7 @@ def _one_device(alone: Sequence[Alone]) -> Method:
 
 def _rates(method: Method, alone: Sequence[Alone]) -> dict[str, float]:
     """Return the random-walk rates of the device's parameters, SI per root day. Raises InputError as `walks` does."""
-    names = list(dict.fromkeys(name for each in alone for name in each.quantities))
+    names = list(dict.fromkeys(name for each in alone for name in each.calibration.quantities))
     return walks(method, alone[0].calibration.config, names)
 
 
@@ -344,11 +336,12 @@ def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, f
     """
     known: dict[str, Quantity] = {}
     for each in alone:
-        known.update({q.name: q for q in each.quantities.values() if q.prior_sigma != 0.0 and q.name in found})
-    own = tuple(replace(p, quantities=tuple(known.get(q.name, q) for q in p.quantities)) for p in problem.parameters)
-    there = {q.name for p in own for q in p.quantities}
+        own = each.calibration.quantities
+        known |= {name: q for name, q in own.items() if q.prior_sigma != 0.0 and name in found}
+    last = tuple(replace(p, quantities=tuple(known.get(q.name, q) for q in p.quantities)) for p in problem.parameters)
+    there = {q.name for p in last for q in p.quantities}
     missing = tuple(q for name, q in known.items() if name not in there)
-    return (*own, *((Parameter(_NO_VARIABLE, missing),) if missing else ()))
+    return (*last, *((Parameter(_NO_VARIABLE, missing),) if missing else ()))
 
 
 def _inflation(name: str, alone: Sequence[Alone]) -> float:
@@ -375,7 +368,7 @@ def _findings(
     value, dof = joined.disagreement
     if not steps and dof >= 1 and value > Fit.of(value, float(dof)).high:
         found.append(_disagreement([each.name for each in alone], (), value, dof))
-    found.append(Finding("remark", Severity.NOTE, {"text": f"{len(alone)} recordings of one device"}))
+    found.append(remark(f"{len(alone)} recordings of one device"))
     return by_severity(found)
 
 
@@ -464,7 +457,7 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
     gaussian_prior = joined.all(i).of([*part.own, *joined.walking])
 
     def number(name: str, value: float, sigma: float) -> PartParameter:
-        quantity = alone.quantities[name]
+        quantity = by_itself.quantities[name]
         whole = float(np.hypot(sigma * by_itself.parameters[name].inflation, quantity.extra_sigma))
         return PartParameter(name=name, value=value, sigma=whole, unit=quantity.unit)
 

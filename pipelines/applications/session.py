@@ -39,7 +39,7 @@ from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config, with_conflicts
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError, NotARecordingError
-from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
+from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
 from alidade.pipelines.estimation.problem import (
     AttitudeRate,
     Attitudes,
@@ -332,7 +332,7 @@ class Session:
                             *self._findings(problem, estimate, quantities, change, conflicts),
                             *_remarks(problem, estimate, difference),
                             *carried,
-                            *_stopped(),
+                            *map(remark, filter(None, [deadline.stopped()])),
                         ]
                     ),
                     recording=self.name,
@@ -671,9 +671,9 @@ def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference 
     if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
         yield Finding("solver_difference", Severity.NOTE, asdict(difference))
     if estimate.concluded:
-        yield Finding("remark", Severity.NOTE, {"text": f"{_CONCLUDED}; estimates over time are the run's"})
-    for premise in problem.premises if estimate.solver != "published" else ():
-        yield Finding("remark", Severity.NOTE, {"text": premise})
+        yield remark(f"{_CONCLUDED}; estimates over time are the run's")
+    if estimate.solver != "published":
+        yield from map(remark, problem.premises)
 
 
 def _steps_with_progress(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
@@ -703,14 +703,7 @@ def _carried(seen: Attitudes, dense: Attitudes) -> Finding:
     time = np.sort(seen.time)
     gaps = np.diff(time)
     where = f", over {gaps.max():.2g} s at most, at {time[gaps.argmax()]:.6g} s" if len(gaps) else ""
-    text = (
+    return remark(
         f"attitude.tum has {len(dense.time)} attitudes at the gyro's samples: the gyro carries them from those by "
         f"vision before and after{where}, and the difference between both is distributed evenly over that time"
     )
-    return Finding("remark", Severity.NOTE, {"text": text})
-
-
-def _stopped() -> list[Finding]:
-    """Return a note on what the time limit stopped; empty if nothing."""
-    text = deadline.stopped()
-    return [Finding("remark", Severity.NOTE, {"text": text})] if text else []

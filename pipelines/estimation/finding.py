@@ -72,6 +72,11 @@ class Finding:
             raise ValueError(f"evidence of {self.kind}: {', '.join(KINDS[self.kind])}; not {', '.join(self.evidence)}")
 
 
+def remark(text: str) -> Finding:
+    """Note in words: a premise of the method, what a time limit ended."""
+    return Finding("remark", Severity.NOTE, {"text": text})
+
+
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Sort findings by severity, the most severe first, equally severe ones in the given order."""
     return tuple(sorted(findings, key=lambda finding: -finding.severity))
