@@ -30,6 +30,7 @@ from alidade.pipelines.settings import (
     first_error,
     section_in,
     sensor_sheets,
+    validated,
 )
 
 if TYPE_CHECKING:
@@ -73,10 +74,7 @@ def _override(given: object) -> tuple[str, Mapping[Any, Any]]:
     if given is None:
         return "", {}
     if isinstance(given, Mapping):
-        try:
-            given = model().model_validate(dict(given))
-        except ValidationError as error:
-            raise InputError(f"config: {first_error(error, model())[1]}") from error
+        given = validated(model(), dict(given), "config")
     if isinstance(given, Config):
         return "config", given.model_dump(exclude_unset=True)
     if not isinstance(given, str | Path):

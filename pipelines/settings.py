@@ -328,6 +328,7 @@ class MethodSection(Section):
 
 
 _Own = TypeVar("_Own", bound=MethodSection)
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 class Config(Section):
@@ -440,6 +441,14 @@ def first_error(error: ValidationError, model: type[BaseModel]) -> tuple[tuple[i
         return path, f"{key}: must be a section of keys, not {reprlib.repr(given)}"
     text = first["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     return path, f"{key}: {text}{'' if isinstance(given, dict) else f', not {reprlib.repr(given)}'}"
+
+
+def validated(model: type[_Model], content: object, where: object) -> _Model:
+    """Return content as a model. Raises InputError with the first error, and where it is."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{where}: {first_error(error, model)[1]}") from error
 
 
 def _known_at(model: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:

@@ -35,7 +35,7 @@ from alidade.pipelines.recording.checks import (
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.shapes import Rows, as_dates, rows_by_name
 from alidade.pipelines.settings import Config as _BaseConfig
-from alidade.pipelines.settings import first_error
+from alidade.pipelines.settings import first_error, validated
 from alidade.pipelines.simulation.scenario import Simulated
 
 if TYPE_CHECKING:
@@ -257,10 +257,7 @@ def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel 
     if isinstance(given, BaseModel):
         return given
     if isinstance(given, Mapping):
-        try:
-            return method.scenario.model_validate(dict(given))
-        except ValidationError as error:
-            raise InputError(f"scenario: {first_error(error, method.scenario)[1]}") from error
+        return validated(method.scenario, dict(given), "scenario")
     return method.settings(None if given is None else str(given), images)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from alidade.factors.chi_square import student
 from alidade.pipelines.display.table import Cell, Column, Table
@@ -29,7 +29,7 @@ from alidade.pipelines.reports.dcc import digital_certificate
 from alidade.pipelines.reports.html import render_html
 from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
 from alidade.pipelines.reports.result_json import Result, read_result
-from alidade.pipelines.settings import first_error
+from alidade.pipelines.settings import validated
 from alidade.pipelines.solvers.joint import RECORDING
 
 # Of effective degrees of freedom more than this are as good as infinitely many.
@@ -157,11 +157,7 @@ def certificate(
 
 
 def _read_fields(path: Path) -> Fields:
-    content = load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path)) or {}
-    try:
-        return Fields.model_validate(content)
-    except ValidationError as error:
-        raise InputError(f"{path}: {first_error(error, Fields)[1]}") from error
+    return validated(Fields, load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path)) or {}, path)
 
 
 def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[Row]:

@@ -8,11 +8,11 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from alidade.pipelines.errors import InputError, nearest_three
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
-from alidade.pipelines.settings import first_error
+from alidade.pipelines.settings import validated
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -72,10 +72,7 @@ def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | N
     """
     path = _find(name_or_path, folder)
     content = load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path))
-    try:
-        return model.model_validate({} if content is None else content)
-    except ValidationError as error:
-        raise InputError(f"{path}: {first_error(error, model)[1]}") from error
+    return validated(model, {} if content is None else content, path)
 
 
 def shipped(folder: Path | None = None) -> dict[str, Path]:

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from alidade.pipelines.applications.follow.guidance import View
-from alidade.pipelines.display.table import Cell, Column, Table
+from alidade.pipelines.display.table import Cell, Column, Row, Table
 from alidade.pipelines.reports.terminal import rich_table
 
 # Readers want four light modules around the code; the encoder leaves two.
@@ -67,14 +67,14 @@ def _page(view: View) -> Group:
 
 
 def _parameters(view: View) -> Table:
-    rows = tuple(
-        (*(row.get(key, "") for key in ("name", "unit", "value", "sigma", "require")), Cell(verdict, tone=verdict))
-        for row in view.rows
-        for verdict in (row.get("verdict", ""),)
-    )
+    rows: list[Row] = []
+    for row in view.rows:
+        verdict = row.get("verdict", "")
+        numbers = (row.get("value", ""), row.get("sigma", ""), row["require"])
+        rows.append((row["name"], row["unit"], *numbers, Cell(verdict, tone=verdict)))
     few = f", the least accurate of {len(view.estimated)}" if len(view.shown) < len(view.estimated) else ""
     columns = (f"parameter{few}", Column("unit", "text"), "value", "sigma", "required", Column("verdict", "text"))
-    return Table("", "", columns, rows)
+    return Table("", "", columns, tuple(rows))
 
 
 def _collected(view: View) -> Table:
