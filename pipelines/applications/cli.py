@@ -236,7 +236,7 @@ def calibrate(
                 calibration = calibrate_together([partial(read, each) for each in recordings], by_itself)
         else:
             session = read(recordings[0])
-            (calibration,) = session.calibrations([solver], parse_window(window), check=not no_check)
+            calibration = session.calibrate(solver, parse_window(window), check=not no_check)
         with progress.doing("writing"):
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))

@@ -283,12 +283,12 @@ class Session:
 
     def judged(
         self,
-        solved: Iterable[tuple[Estimate, Problem]],
+        solved: Iterable[Estimate],
         seconds: Mapping[str, float],
         check: bool = False,
         report: bool = True,
     ) -> list[Calibration]:
-        """Return a calibration for each estimate with the problem it solves: findings added, ready for reports.
+        """Return a calibration for each estimate of the session's parameters: findings added, ready for reports.
 
         Args:
             solved: as above.
@@ -303,8 +303,8 @@ class Session:
             raise InputError(f"attitude rate gyro: {self.method.name} has no attitudes between those it estimates")
         # The facts before anything is solved, so that the stamps need not be kept meanwhile.
         sha256, truth, facts = self.sha256(), self.truth(), self.facts
-        found, published = [], None
-        for estimate, problem in solved:
+        found, published, problem = [], None, self.problem()
+        for estimate in solved:
             quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
             estimate = replace(estimate, covariance=finite_covariance(quantities, estimate.covariance))
             difference = None
@@ -321,7 +321,7 @@ class Session:
             if change is not None and change.kind == "change" and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
             tables = self.method.report.findings(self.data, self.config, estimate) if report else {}
-            estimate, carried = self._at_gyro_rate(problem, estimate)
+            estimate, carried = self._at_gyro_rate(estimate)
             found.append(
                 Calibration(
                     method=self.method,
@@ -329,7 +329,7 @@ class Session:
                     estimate=estimate,
                     findings=by_severity(
                         [
-                            *self._findings(problem, estimate, quantities, change, conflicts),
+                            *self._findings(estimate, quantities, change, conflicts),
                             *_remarks(problem, estimate, difference),
                             *carried,
                             *map(remark, filter(None, [deadline.stopped()])),
@@ -350,8 +350,9 @@ class Session:
             )
         return found
 
-    def _at_gyro_rate(self, problem: Problem, estimate: Estimate) -> tuple[Estimate, list[Finding]]:
+    def _at_gyro_rate(self, estimate: Estimate) -> tuple[Estimate, list[Finding]]:
         """Return the estimate with attitudes at the wanted rate, and a note on the gaps between those by vision."""
+        problem = self.problem()
         if self.attitude_rate == "vision" or estimate.attitudes is None or problem.at_gyro_rate is None:
             return estimate, []
         dense = problem.at_gyro_rate(estimate.attitudes, problem.numbers(estimate))
@@ -370,15 +371,14 @@ class Session:
 
     def _findings(
         self,
-        problem: Problem,
         estimate: Estimate,
         quantities: Sequence[Quantity],
         change: Finding | None,
         conflicts: Sequence[Finding],
     ) -> tuple[Finding, ...]:
         """Return the findings on an estimate; hypotheses are tested if the estimate is suspect."""
-        contradicted = self._contradictions(estimate, quantities)
-        findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted, conflicts)
+        contradicted, advice = self._contradictions(estimate, quantities), self.problem().advice
+        findings = diagnose(estimate, quantities, advice, change, (), contradicted, conflicts)
         if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
             return findings
         hypotheses = misstatements(self.method.graph, self.method.faults, self.data, self.config)
@@ -393,7 +393,7 @@ class Session:
         deadline.passed(_HYPOTHESES)
         # A fault that explains more than freeing what is fixed is what these contradictions come from.
         contradicted = () if hypotheses else contradicted
-        return diagnose(estimate, quantities, problem.advice, change, hypotheses, contradicted, conflicts)
+        return diagnose(estimate, quantities, advice, change, hypotheses, contradicted, conflicts)
 
     def _contradictions(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Finding, ...]:
         """Return findings on inputs that the config fixes and the recording contradicts."""
@@ -445,7 +445,7 @@ class Session:
 
         Where batch does not converge, the run's own estimate, and None.
         """
-        batch, _ = self._solve("batch", None, report=report)
+        batch = self._solve("batch", None, report=report)
         if not batch.converged:
             return estimate, None
         batch = replace(batch, covariance=finite_covariance(quantities, batch.covariance))
@@ -457,12 +457,12 @@ class Session:
         window: float | None,
         others: Callable[[SqrtInformation], Mapping[str, float]] | None = None,
         report: bool = True,
-    ) -> tuple[Estimate, Problem]:
+    ) -> Estimate:
         problem = self.problem()
         if solver == "published":
             start = time.perf_counter()
             estimate = self.method.published(self.data, self.config, problem)
-            return replace(estimate, seconds={"solve": time.perf_counter() - start}), problem
+            return replace(estimate, seconds={"solve": time.perf_counter() - start})
         if all(q.prior_sigma == 0.0 for q in problem.quantities):
             raise InputError("priors: every parameter is fixed (0), so that there is nothing to calibrate; free one")
         if solver == "incremental":
@@ -470,13 +470,13 @@ class Session:
 
             shown = replace(problem, steps=partial(_steps_with_progress, problem, self.facts.duration_s))
             with deadline.of_processor():
-                return solve_incremental(shown, window), problem
+                return solve_incremental(shown, window)
         from alidade.pipelines.solvers.batch import solve_batch
 
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"), deadline.of_processor():
             changed = self._changed() if report else ()
-            estimate = solve_batch(
+            return solve_batch(
                 problem,
                 budget=report,
                 changed=changed,
@@ -486,7 +486,6 @@ class Session:
                 error_map=True,
                 steps=True,
             )
-            return estimate, problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Yield the name of each fixed input of the graph, and the graph with that input off by its step."""
@@ -505,7 +504,7 @@ class Session:
     def _published(self) -> Estimate | None:
         """Return the published solver's estimate; None if that solver, which needs more data, cannot serve."""
         try:
-            return self._solve("published", None)[0]
+            return self._solve("published", None)
         except InputError:
             return None
 

@@ -338,7 +338,7 @@ class Follower:
         self._take(growing, steps)
         estimate = self._run.finish(time.perf_counter() - started)
         with session.usual_time(online=True):
-            (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
+            (calibration,) = session.judged([estimate], {"read": read}, self.settings.check)
         return calibration
 
 
