@@ -101,7 +101,7 @@ class Calibration(SensorValues):
     recordings: Sequence[PartResult] = ()
     changes: Changes | None = None
 
-    @property
+    @cached_property
     def parameters(self) -> dict[str, ParameterResult]:
         """Parameters by name, as result.json lists them."""
         given = self.verdicts
@@ -234,7 +234,7 @@ class Calibration(SensorValues):
         """Status: calibrated, weak, unobservable or inconsistent."""
         return status(self.findings)
 
-    @property
+    @cached_property
     def verdicts(self) -> dict[str, Verdict]:
         """Verdicts by parameter, of those with a required accuracy."""
         return verdicts(
@@ -247,7 +247,7 @@ class Calibration(SensorValues):
         known = quantities_of(self.problem, self.estimate)
         return derived(known, self.estimate.covariance, self.estimate.values, self.findings)
 
-    @property
+    @cached_property
     def quantities(self) -> dict[str, Quantity]:
         """Quantities by name, those of several recordings too."""
         return {q.name: q for q in self.problem.quantities}
