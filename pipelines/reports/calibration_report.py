@@ -44,7 +44,7 @@ from alidade.pipelines.reports.report import (
     Tone,
 )
 from alidade.pipelines.reports.result import Calibration, quantities_of
-from alidade.pipelines.reports.result_json import ParameterResult, truth_errors
+from alidade.pipelines.reports.result_json import TruthResult, truth_errors
 from alidade.pipelines.reports.results_table import (
     LEGEND,
     MAX_SIGMA_OVER_PRIOR,
@@ -359,8 +359,8 @@ def _details(c: Calibration) -> tuple[Block, ...]:
     parts: list[tuple[str, tuple[Block, ...]]] = [
         ("All findings", (Text(c.headline, soft=False),)),
         ("Unobservable and weak directions", direction_blocks(c.findings)),
-        ("Parameters", (_parameter_table(c),)),
-        ("Nuisance parameters", _nuisance_parameters(c)),
+        ("Parameters", _parameters(c)),
+        ("Nuisance parameters", _parameters(c, nuisance=True)),
         ("K matrices and offsets b", matrices),
         ("Sensitivity to fixed inputs", _fixed_inputs(c)),
         ("Most influential measurements", _influential_measurements(c)),
@@ -418,67 +418,49 @@ def _frames(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     return (Card((drawing, Bullets(lines), Text("Dashed: the axes as estimated.")), style="sketch"),)
 
 
-def _parameter_table(c: Calibration) -> Table:
-    columns: Columns = (
-        *("parameter", "value", "sigma", Column("unit", "text"), "prior", "required", Column("verdict", "text")),
-        *_error_column(c),
-    )
+def _parameters(c: Calibration, nuisance: bool = False) -> tuple[Block, ...]:
+    """Return a table of the calibrated or of the nuisance parameters; their errors too where the truth is known."""
+    own: Columns = ("z-score",) if nuisance else ("required", Column("verdict", "text"))
+    error = () if c.truth is None else (Column("error", wide=True),)
+    errors = truth_errors(c)
     rows: list[Row] = []
-    for q, p in _rows(c):
-        require = "" if p.require is None else rounded(human_unit(q)[1] * p.require, 3)
-        verdict = p.observability or ""
-        rows.append((*_estimate_cells(c, q), require, Cell(verdict, tone=verdict), *_error_cells(c, q)))
+    for q in quantities_of(c.problem, c.estimate):
+        p, (unit, factor) = c.parameters[q.name], human_unit(q)
+        if (p.group is not None) != nuisance:
+            continue
+        is_known = p.sigma < MAX_SIGMA_OVER_PRIOR * q.scale
+        value, sigma = (
+            to_digits_of(factor * x, factor * p.sigma) if is_known else "unknown" for x in (p.value, p.sigma)
+        )
+        prior = "free" if p.prior_sigma is None else rounded(factor * p.prior_sigma, 3)
+        row: Row = (Cell(p.name, c.method.describe(p.name)), value, sigma, unit, prior)
+        if nuisance:
+            row += ("" if p.pull is None else signed(p.pull),)
+        else:
+            verdict = p.observability or ""
+            row += ("" if p.require is None else rounded(factor * p.require, 3), Cell(verdict, tone=verdict))
+        if error:
+            row += (_error(errors.get(q.name) if is_known else None, factor, p.sigma),)
+        rows.append(row)
+    columns: Columns = ("parameter", "value", "sigma", Column("unit", "text"), "prior", *own, *error)
     caption = "Sigma, prior and required are standard deviations in the unit of the row."
-    if c.truth is not None:
+    if nuisance:
+        caption = (
+            "Sensor errors, estimated with data-sheet priors (`sensors` in the config). z-score: (estimate - prior "
+            "mean) over its expected spread; none where the recording has no information."
+        )
+    elif error:
         caption += " Error is the estimate minus the truth that came with the recording; nothing else uses that truth."
-    return Table("", caption, columns, tuple(rows), "parameters", "dense", None)
+    id = "assumptions" if nuisance else "parameters"
+    return (Table("", caption, columns, tuple(rows), id, "dense", None),) if rows else ()
 
 
-def _nuisance_parameters(c: Calibration) -> tuple[Block, ...]:
-    columns: Columns = ("parameter", "value", "sigma", Column("unit", "text"), "prior", "z-score", *_error_column(c))
-    rows = tuple(
-        (*_estimate_cells(c, q), "" if p.pull is None else signed(p.pull), *_error_cells(c, q))
-        for q, p in _rows(c, nuisance=True)
-    )
-    caption = (
-        "Sensor errors, estimated with data-sheet priors (`sensors` in the config). z-score: (estimate - prior mean) "
-        "over its expected spread; none where the recording has no information."
-    )
-    return (Table("", caption, columns, rows, "assumptions", "dense", None),) if rows else ()
-
-
-def _rows(c: Calibration, nuisance: bool = False) -> list[tuple[Quantity, ParameterResult]]:
-    """Return the calibrated or the nuisance parameters of the estimate, each with its quantity."""
-    pairs = zip(quantities_of(c.problem, c.estimate), c.parameters.values(), strict=True)
-    return [(q, p) for q, p in pairs if (p.group is not None) == nuisance]
-
-
-def _estimate_cells(c: Calibration, q: Quantity) -> tuple[Cell | str, ...]:
-    """Return the cells of a parameter: name, value, sigma, unit and prior."""
-    p, (unit, factor) = c.parameters[q.name], human_unit(q)
-    numbers = (p.value, p.sigma) if _is_known(q, p) else ()
-    value, sigma = (to_digits_of(factor * x, factor * p.sigma) for x in numbers) if numbers else ("unknown", "unknown")
-    prior = "free" if p.prior_sigma is None else rounded(factor * p.prior_sigma, 3)
-    return Cell(p.name, c.method.describe(p.name)), value, sigma, unit, prior
-
-
-def _is_known(q: Quantity, p: ParameterResult) -> bool:
-    return p.sigma < MAX_SIGMA_OVER_PRIOR * q.scale
-
-
-def _error_column(c: Calibration) -> tuple[Column, ...]:
-    return () if c.truth is None else (Column("error", wide=True),)
-
-
-def _error_cells(c: Calibration, q: Quantity) -> tuple[str, ...]:
-    """Return a cell with a parameter's error where its truth is known; no cell without any truth."""
-    if c.truth is None:
-        return ()
-    p, error, factor = c.parameters[q.name], truth_errors(c).get(q.name), human_unit(q)[1]
-    if error is None or not _is_known(q, p):
-        return ("",)
-    in_sigmas = "" if error.error_sigmas is None else f" ({signed(error.error_sigmas)} σ)"
-    return (to_digits_of(factor * error.error, factor * p.sigma) + in_sigmas,)
+def _error(found: TruthResult | None, factor: float, sigma: float) -> str:
+    """Return an error with its size in sigmas, in the unit of the factor; empty without one."""
+    if found is None:
+        return ""
+    in_sigmas = "" if found.error_sigmas is None else f" ({signed(found.error_sigmas)} σ)"
+    return to_digits_of(factor * found.error, factor * sigma) + in_sigmas
 
 
 def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
