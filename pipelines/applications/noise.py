@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,13 +85,6 @@ class NoiseStudy:
         return f"<NoiseStudy of {self.recording}: {', '.join(f'{s.topic} {s.kind}' for s in self.sensors)}>"
 
 
-class _Device(NamedTuple):
-    """Data of one topic: stamps, ns, and the samples (N, 3) of each sensor by kind."""
-
-    t_ns: NDArray[np.int64]
-    sensors: dict[str, Array]
-
-
 def noise(
     recording: str | Path, *, config: Settings = None, strict: bool = False, auto_columns: bool = False
 ) -> NoiseStudy:
@@ -153,13 +145,13 @@ def _rates_alone(settings: Config) -> set[str]:
 
 def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[SensorNoise]:
     """Yield the noise of each sensor of a topic, none of a topic without sensors. Raises InputError."""
-    device = _device(recording, name)
-    if not device.sensors:
+    t_ns, sensors = _sensors(recording, name)
+    if not sensors:
         return
     dropped: dict[str, int] = {}
-    together = np.hstack(list(device.sensors.values()))
-    t, keep = clean(name, device.t_ns, recording.epoch_ns, together, dropped, least=3)
-    samples = {kind: values[keep] for kind, values in device.sensors.items()}
+    together = np.hstack(list(sensors.values()))
+    t, keep = clean(name, t_ns, recording.epoch_ns, together, dropped, least=3)
+    samples = {kind: values[keep] for kind, values in sensors.items()}
     _check_units(name, t, samples)
     rests = stretches_at_rest(t, list(samples.values()), samples.get("gyro"))
     if not len(rests):
@@ -207,7 +199,8 @@ def _check_units(name: str, t: Array, samples: Mapping[str, Array]) -> None:
         )
 
 
-def _device(recording: Recording, name: str) -> _Device:
+def _sensors(recording: Recording, name: str) -> tuple[NDArray[np.int64], dict[str, Array]]:
+    """Return the stamps of a topic, ns, and the samples (N, 3) of each sensor by kind."""
     if recording.topics[name].type == messages.MAGNETIC_FIELD:
         field = recording.magnetic(name)
         sensors, t_ns = {"mag": field.field}, field.t_ns
@@ -217,7 +210,7 @@ def _device(recording: Recording, name: str) -> _Device:
         covariances = {"gyro": imu.gyro_cov, "accel": imu.accel_cov}
         sensors = {kind: values for kind, values in sensors.items() if is_there(kind, values, covariances[kind])}
     # A field of the message that nobody filled in is no sensor.
-    return _Device(t_ns, {kind: values for kind, values in sensors.items() if np.any(np.nan_to_num(values))})
+    return t_ns, {kind: values for kind, values in sensors.items() if np.any(np.nan_to_num(values))}
 
 
 def _pieces(t: Array, values: Array, rests: Array) -> tuple[list[Array], float, int]:

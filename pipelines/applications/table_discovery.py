@@ -272,7 +272,8 @@ class _Table:
             kind = _kind(name) or self._kind_of_units(columns)
             # ROS calls linear acceleration what has gravity in it.
             is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
-            if is_linear or (kind == "accel" and self._lacks_gravity(columns)):
+            norms = self._norms(columns)
+            if is_linear or (kind == "accel" and len(norms) and lacks_gravity(norms)):
                 self.doubts.append(f"{self._where}{self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
             elif kind and kind not in out:
                 out[kind] = columns
@@ -296,10 +297,6 @@ class _Table:
         norms = self._norms(columns)
         spread = min(float(np.nanstd(self._values[i])) for i in columns) if len(norms) else 0.0
         return bool(spread > _TURNED * float(np.median(norms))) if len(norms) else False
-
-    def _lacks_gravity(self, columns: Sequence[int]) -> bool:
-        norms = self._norms(columns)
-        return bool(len(norms)) and lacks_gravity(norms)
 
     def _size(self, kind: str, columns: Sequence[int]) -> str:
         """Return the unit in which the columns' median norm is plausible for that kind of sensor; empty for none."""

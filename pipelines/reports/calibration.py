@@ -222,19 +222,19 @@ def calibration_yaml(calibration: Calibration) -> str:
 
 def saved(calibration: Calibration) -> SavedCalibration:
     """Return a calibration as the content of its calibration.yaml."""
-    method = calibration.problem.method
+    used = calibration.applied_values
     parameters = {
         p.name: SavedParameter(
             value=_rounded(p.value),
             sigma=_rounded(p.sigma),
             unit=p.unit,
             verdict=p.observability,
-            applied=_other(calibration.applied_values.get(p.name, p.value), p.value),
+            applied=None if (applied := _rounded(used.get(p.name, p.value))) == _rounded(p.value) else applied,
         )
         for p in calibration.parameters.values()
     }
     content = SavedCalibration(
-        method=method,
+        method=calibration.problem.method,
         solver=calibration.estimate.solver,
         status=calibration.status,
         recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=calibration.start),
@@ -383,10 +383,6 @@ def _plain(row: Mapping[str, object]) -> dict[str, object]:
         return _rounded(value, _FEWER_DIGITS) if isinstance(value, float) else value
 
     return {name: rounded(value) for name, value in row.items()}
-
-
-def _other(value: float, usual: float) -> float | None:
-    return None if _rounded(value) == _rounded(usual) else _rounded(value)
 
 
 def _rounded(value: float, digits: int = _DIGITS) -> float:

@@ -210,7 +210,7 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
         fits = c.fit.low <= c.fit.value <= c.fit.high
         found.append(
             Badge(
-                "fit as expected" if fits else f"misfit: {_misfit(c.fit)}",
+                "fit as expected" if fits else f"misfit: residuals {c.fit.noise_factor:.2g} × the noise",
                 "good" if fits else "warn",
                 "99.9 % interval of chi-square",
             )
@@ -221,11 +221,6 @@ def _badges(c: Calibration) -> tuple[Badge, ...]:
     if errors:
         found.append(Badge(f"simulated: largest error {max(errors):.1f} σ of {len(errors)}", "fixed"))
     return tuple(found)
-
-
-def _misfit(fit: Fit) -> str:
-    """Return a phrase with the ratio of the residuals to the noise used."""
-    return f"residuals {fit.noise_factor:.2g} × the noise"
 
 
 def _stability_badge(changed: bool, findings: Sequence[Finding]) -> Badge:
@@ -468,13 +463,14 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     needed = " ".join(formula.expression for formula in c.formulas)
     constants = [f"{name} = {value:.6g}" for name, value in c.problem.constants.items() if name in needed]
     formulas = tuple(f"`{line}`" for line in (*(formula.text for formula in c.formulas), *constants))
+    inputs = dict.fromkeys(name for formula in c.formulas for name in formula.inputs)
     sensors = [name for name in TRIADS if f"{name}_k11" in c.values]
     used = [f'K, bias = calibration.matrix("{name}"), calibration.bias("{name}")' for name in sensors[-1:]]
     session = [
         "import alidade",
         "",
         'calibration = alidade.load("calibration.yaml")',
-        *(used or [_CALL.format(_call(c))]),
+        *(used or [_CALL.format(", ".join(f"{name}={name}" for name in inputs))]),
     ]
     if not formulas or c.status not in ("calibrated", "weak"):
         return ()
@@ -490,11 +486,6 @@ def _application(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     snippets = (Details(language, (Code(text, copied=True),), "screen") for language, text in code)
     formulas_block = Details("Formulas", (Bullets(formulas),))
     return (Card((Code("\n".join(session), copied=True), formulas_block, said, *snippets), id="application"),)
-
-
-def _call(c: Calibration) -> str:
-    """Return the measured inputs of the formulas as keyword arguments of a call."""
-    return ", ".join(f"{name}={name}" for name in dict.fromkeys(n for formula in c.formulas for n in formula.inputs))
 
 
 def _noise(c: Calibration) -> Table | None:

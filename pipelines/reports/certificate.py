@@ -133,7 +133,7 @@ def certificate(
     """
     path, earlier_path = Path(results), None if before is None else Path(before)
     path = path / "result.json" if path.is_dir() else path
-    result, stated = read_result(path), Fields() if fields is None else _read_fields(Path(fields))
+    result, stated = read_result(path), _read_fields(fields)
     if result.status in ("inconsistent", "unobservable"):
         raise InputError(f"{path}: is {result.status}, there is nothing to certify: {result.headline}")
     earlier = {} if earlier_path is None else load_known(earlier_path).of_method(result.method).values
@@ -156,8 +156,9 @@ def certificate(
     return write_whole(path.parent if out is None else Path(out), files), missing
 
 
-def _read_fields(path: Path) -> Fields:
-    return validated(Fields, load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path)) or {}, path)
+def _read_fields(path: str | Path | None) -> Fields:
+    content = None if path is None else load_yaml(read_bytes(Path(path), MAX_YAML_BYTES), str(path))
+    return validated(Fields, content or {}, path)
 
 
 def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[Row]:

@@ -121,8 +121,8 @@ _AXES = "XYZ"
 
 
 def _triads(saved: SavedCalibration, names: Collection[str] = TRIADS) -> dict[str, tuple[Array, Array]]:
-    """Return K (3, 3) and b (3,) of the calibrated sensors among `names`."""
-    return {name: _triad(saved, name) for name in names if f"{name}_k11" in saved.parameters}
+    """Return K (3, 3) and b (3,) of the calibrated sensors among `names`: nominal = K raw + b."""
+    return {name: triad_of(name, saved.values) for name in names if f"{name}_k11" in saved.parameters}
 
 
 def _in_si(
@@ -147,11 +147,6 @@ def _in_si(
                 "converted, as the program has them, or export ros2"
             )
     return triads, notes
-
-
-def _triad(saved: SavedCalibration, name: str) -> tuple[Array, Array]:
-    """Return K (3, 3) and b (3,) of a sensor: nominal = K raw + b."""
-    return triad_of(name, {key: parameter.value for key, parameter in saved.parameters.items()})
 
 
 def zero_offset(K: Array, b: Array) -> Array:
@@ -260,7 +255,7 @@ def _compass_in_counts(saved: SavedCalibration, neutral: str) -> tuple[Array, ND
     """
     if "mag_k11" not in saved.parameters or not _unit(saved).endswith("/count"):
         raise InputError("this format corrects a magnetometer in counts: calibrate what the flight controller logs")
-    K, b = _triad(saved, "mag")
+    K, b = triad_of("mag", saved.values)
     offset = np.round(zero_offset(K, b)).astype(np.int64)
     if np.abs(offset).max() > np.iinfo(np.int16).max:
         raise InputError(f"mag has an offset of {np.abs(offset).max()} counts, and this format has 16 bits")

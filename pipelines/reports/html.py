@@ -117,14 +117,12 @@ def _packed(plots: Sequence[Plot]) -> dict[str, str]:
 
 
 def _described(figure: Figure) -> dict[str, Any]:
-    return {**vars(figure), "marks": [_mark(mark, figure.x_scale == "datetime") for mark in figure.marks]}
-
-
-def _mark(mark: Mark, dates: bool) -> dict[str, Any]:
-    columns = {
-        name: _numbers(column, dates and name in ("x", "x1", "left", "right")) for name, column in mark.columns.items()
-    }
-    return {**vars(mark), "texts": list(mark.texts), "columns": columns}
+    marks = []
+    for mark in figure.marks:
+        dates = ("x", "x1", "left", "right") if figure.x_scale == "datetime" else ()
+        columns = {name: _numbers(column, name in dates) for name, column in mark.columns.items()}
+        marks.append({**vars(mark), "texts": list(mark.texts), "columns": columns})
+    return {**vars(figure), "marks": marks}
 
 
 def _numbers(column: Array, dates: bool) -> list[float | None]:

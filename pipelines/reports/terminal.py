@@ -14,7 +14,7 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from alidade.pipelines.display.table import Cell, Column, Table
+from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import printable
 from alidade.pipelines.reports.report import Block, Bullets, Card, Code, Details, Heading, Report, Tables, Text, Tiles
 
@@ -155,7 +155,8 @@ def rich_table(table: Table, columns: Sequence[int] | None = None) -> RichTable:
         if len(row) == 1 < len(table.heads):
             heading, alone = row[0].text, all(len(after) == 1 for after in table.cells[k + 2 : k + 3])
             continue
-        texts = [heading if alone else _under(heading, row[0].text), *(_with_verdict(cell) for cell in row[1:])]
+        cells = (f"{cell.text} {cell.tone}" if cell.tone and cell.hint else cell.text for cell in row[1:])
+        texts = [heading if alone else _under(heading, row[0].text), *cells]
         out.add_row(*(RichText(printable(texts[i], _MAX_LINE), COLOURS.get(row[i].tone, "")) for i in columns))
     return out
 
@@ -164,11 +165,6 @@ def _under(heading: str, name: str) -> str:
     """Return the name of a row with the heading above it: "x" under "Bias, mg" is "Bias x, mg"."""
     what, comma, unit = heading.rpartition(", ")
     return f"{what if comma else unit} {name}{comma}{unit if comma else ''}".strip()
-
-
-def _with_verdict(cell: Cell) -> str:
-    """Return the text of a cell, followed by its verdict where a page shows that as a mark."""
-    return f"{cell.text} {cell.tone}" if cell.tone and cell.hint else cell.text
 
 
 def _width(table: RichTable) -> int:
