@@ -94,7 +94,9 @@ def _solver_table(
             sigmas = [p.sigma for c in calibrations if (p := c.parameters.get(q.name)) and p.sigma > 0.0]
             row.append("" if truth is None else to_digits_of(truth * factor, min(sigmas, default=0.0) * factor))
         for c, scores in zip(calibrations, z, strict=True):
-            row += [_estimate(c, q), signed(scores[q.name]) if q.name in scores else ""]
+            p = c.parameters.get(q.name)
+            row.append("-" if p is None else _with_sigma(factor * p.value, factor * p.sigma))
+            row.append(signed(scores[q.name]) if q.name in scores else "")
         rows.append(tuple(row))
     return Table("", caption, tuple(columns), tuple(rows), style="small", most_rows=None)
 
@@ -106,14 +108,6 @@ def _z_scores(calibrations: Sequence[Calibration], quantities: Sequence[Quantity
         return [{name: e.error_sigmas for name, e in each.items() if e.error_sigmas is not None} for each in errors]
     far = ([(q.name, _from_batch(c, calibrations, q.name)) for q in quantities] for c in calibrations)
     return [{name: z for name, z in each if z is not None} for each in far]
-
-
-def _estimate(c: Calibration, q: Quantity) -> str:
-    """Return value and sigma of a parameter as text; a dash if the solver does not estimate it."""
-    found, (_, factor) = c.parameters.get(q.name), human_unit(q)
-    if found is None:
-        return "-"
-    return _with_sigma(factor * found.value, factor * found.sigma)
 
 
 def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], name: str) -> float | None:

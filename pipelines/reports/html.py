@@ -10,7 +10,7 @@ import base64
 import gzip
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from html import escape
@@ -145,7 +145,8 @@ def _compressed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
 
 
-_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 470.0, 56.0, 20.0, 20.0, 40.0
+# Size of the drawing and edges of its plot, px; the last one is the distance from below.
+_WIDTH, _LEFT, _RIGHT, _TOP, _BOTTOM = 470.0, 56.0, 450.0, 20.0, 40.0
 _DASHES = {"solid": "", "dashed": "7 3", "dotdash": "9 3 2 3", "dotted": "2 3"}
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 _ANGLES = (15.0, 30.0, 45.0, 90.0)
@@ -167,23 +168,18 @@ class _Drawing:
         self._y = figure.y_range or self._reach()
 
     def markup(self) -> str:
-        f, (left, right), middle = self._figure, self._edges, 0.5 * (self._edges[0] + self._edges[1])
+        f, middle = self._figure, 0.5 * (_LEFT + _RIGHT)
         title = f'<text class="title" x="6" y="12">{escape(f.y_title)}</text>'
         below = (
             f'<text class="title" x="{middle:.0f}" y="{self._height - 4:.0f}" text-anchor="middle">{escape(f.x_title)}'
         )
-        axes = "".join([self._across(), self._upwards(left, right)])
         marks = "".join(self._band(m) for m in f.marks if m.kind == "band")
         marks += "".join(self._line(m) for m in f.marks if m.kind == "line")
         names = f"{f.y_title} over {f.x_title}: {', '.join(dict.fromkeys(m.name for m in f.marks if m.name))}"
         return (
             f'<svg class="curve" viewBox="0 0 {_WIDTH:.0f} {self._height:.0f}" role="img" aria-label="{escape(names)}">'
-            f"{axes}{marks}{title}{below}</text></svg>"
+            f"{''.join(self._axes())}{marks}{title}{below}</text></svg>"
         )
-
-    @property
-    def _edges(self) -> tuple[float, float]:
-        return _LEFT, _WIDTH - _RIGHT
 
     def _reach(self) -> tuple[float, float]:
         ends = [mark.columns[key] for mark in self._figure.marks for key in ("y", "low", "high") if key in mark.columns]
@@ -192,26 +188,20 @@ class _Drawing:
         return (1.06 * low, 1.06 * high) if high > low else (-1.0, 1.0)
 
     def _at(self, x: float, y: float) -> tuple[float, float]:
-        (x0, x1), (y0, y1), (left, right) = self._x, self._y, self._edges
+        (x0, x1), (y0, y1) = self._x, self._y
         across, up = (x - x0) / (x1 - x0), (y - y0) / (y1 - y0)
-        return left + across * (right - left), self._height - _BOTTOM - up * (self._height - _BOTTOM - _TOP)
+        return _LEFT + across * (_RIGHT - _LEFT), self._height - _BOTTOM - up * (self._height - _BOTTOM - _TOP)
 
-    def _across(self) -> str:
-        parts = []
+    def _axes(self) -> Iterator[str]:
+        """Yield the lines of the grid with their numbers."""
         for value, text in ticks(*self._x, 6, "deg" in self._figure.x_title):
             x, bottom = self._at(value, self._y[0])
-            parts.append(f'<path class="grid" d="M{x:.1f} {_TOP:.0f}V{bottom:.1f}"/>')
-            parts.append(f'<text x="{x:.1f}" y="{bottom + 15:.1f}" text-anchor="middle">{text}</text>')
-        return "".join(parts)
-
-    def _upwards(self, left: float, right: float) -> str:
-        parts = []
+            yield f'<path class="grid" d="M{x:.1f} {_TOP:.0f}V{bottom:.1f}"/>'
+            yield f'<text x="{x:.1f}" y="{bottom + 15:.1f}" text-anchor="middle">{text}</text>'
         for value, text in ticks(*self._y, 4):
             y = self._at(self._x[0], value)[1]
-            kind = "grid zero" if value == 0.0 else "grid"
-            parts.append(f'<path class="{kind}" d="M{left:.0f} {y:.1f}H{right:.0f}"/>')
-            parts.append(f'<text x="{left - 5:.0f}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
-        return "".join(parts)
+            yield f'<path class="{"grid zero" if value == 0.0 else "grid"}" d="M{_LEFT:.0f} {y:.1f}H{_RIGHT:.0f}"/>'
+            yield f'<text x="{_LEFT - 5:.0f}" y="{y + 4:.1f}" text-anchor="end">{text}</text>'
 
     def _line(self, mark: Mark) -> str:
         pieces, pen = [], "M"

@@ -335,15 +335,14 @@ class Calibration(SensorValues):
     @property
     def applied(self) -> list[str]:
         """The parameters, without nuisance parameters of which the recording says no more than their prior mean, 0."""
-        given = self.parameters
-        return [q.name for q in self.problem.quantities if q.group is None or self._is_nonzero(q, given.get(q.name))]
-
-    @staticmethod
-    def _is_nonzero(q: Quantity, found: ParameterResult | None) -> bool:
-        """Whether a nuisance parameter is known to differ from 0: by the recording, a prior conflict or its prior."""
-        if found is None:
-            return False
-        return q.prior_mean != 0.0 or q.determined(found.sigma) or abs(found.pull or 0.0) > LIMITS.prior_z
+        names = []
+        for q in self.problem.quantities:
+            p = self.parameters.get(q.name)
+            # By its prior, the recording or a prior conflict.
+            known = p and (q.prior_mean != 0.0 or q.determined(p.sigma) or abs(p.pull or 0.0) > LIMITS.prior_z)
+            if q.group is None or known:
+                names.append(q.name)
+        return names
 
     @cached_property
     def applied_values(self) -> dict[str, float]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from alidade.pipelines import errors, methods
@@ -31,7 +31,7 @@ from alidade.pipelines.applications.fleet.store import (
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import as_date
+from alidade.pipelines.files import as_date, load_yaml
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.reports.calibration import load_known
@@ -185,7 +185,8 @@ def calibrate_recording(
                 result: Any = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **stated}
                 if _inputs(result) == known:
                     return None
-                return {**result, "tag": recording.tag, **_calibrated(path, settings, prior)}
+                found: RecordingResult = run_isolated(_summary, partial(_calibration, path, settings, prior))
+                return {**result, "tag": recording.tag, **found}
     except (OSError, InputError) as error:
         return failure(errors.EXIT_BAD_INPUT, str(error))
 
@@ -219,18 +220,10 @@ def _metadata(path: Path) -> dict[str, str]:
     return {key: value for key, value in from_metadata(path).items() if key != "date" or as_date(value)}
 
 
-def _calibrated(path: Path, settings: Settings, prior: Path | None) -> RecordingResult:
-    with TemporaryDirectory(prefix="alidade.") as folder:
-        config = None
-        if settings.config is not None:
-            config = Path(folder) / "config.yaml"
-            config.write_text(settings.config, encoding="utf-8")
-        return run_isolated(_summary, lambda: _calibration(path, settings, config, prior))
-
-
-def _calibration(path: Path, settings: Settings, config: Path | None, prior: Path | None) -> Calibration:
+def _calibration(path: Path, settings: Settings, prior: Path | None) -> Calibration:
     from alidade.pipelines.applications.session import open_session
 
+    config = None if settings.config is None else load_yaml(settings.config, "config")
     session = open_session(path, settings.method, config, prior=prior)
     return session.calibrate(settings.solver, settings.window, report=False)
 
