@@ -14,7 +14,7 @@ import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -409,14 +409,15 @@ def _disagreement(names: Sequence[str], dates: Sequence[str], chi_square: float,
 
 
 def _combined_levels(each: Sequence[Sequence[Level]]) -> tuple[Level, ...]:
-    """Combine the noise levels of all recordings: estimates weighted by information, used levels by their mean."""
-    names = dict.fromkeys(level.noise.name for levels in each for level in levels)
-    return tuple(
-        _combined([level for levels in each for level in levels if level.noise.name == name]) for name in names
-    )
+    """Combine the noise levels of all recordings, by name."""
+    by_name: dict[str, list[Level]] = {}
+    for level in chain.from_iterable(each):
+        by_name.setdefault(level.noise.name, []).append(level)
+    return tuple(map(_combined, by_name.values()))
 
 
 def _combined(levels: Sequence[Level]) -> Level:
+    """Combine levels of one noise: estimates weighted by information, used levels by their mean."""
     newest, sqrt_info = levels[-1], [(x.found, x.sigma) for x in levels if x.found is not None and x.sigma]
     scale = float(np.mean([level.used for level in levels])) / newest.noise.stated if newest.noise.stated else 1.0
     if not sqrt_info:
@@ -462,6 +463,8 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
         return PartParameter(name=name, value=value, sigma=whole, unit=quantity.unit)
 
     found = [by_itself.parameters[name] for name in part.names]
+    chi_square = by_itself.estimate.chi_square
+    is_noise_estimated = any(level.noise.estimated for level in by_itself.estimate.levels)
     return PartResult(
         recording=alone.name,
         sha256=by_itself.sha256,
@@ -469,15 +472,9 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
         duration_s=by_itself.facts.duration_s,
         status=by_itself.status,
         headline=by_itself.headline,
-        dof=_noise_dof(by_itself),
+        dof=chi_square.dof if chi_square and is_noise_estimated else None,
         parameters=[
             number(*each) for each in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True)
         ],
         alone=[PartParameter(name=p.name, value=p.value, sigma=p.sigma, unit=p.unit) for p in found],
     )
-
-
-def _noise_dof(by_itself: Calibration) -> float | None:
-    """Return the degrees of freedom of a recording's noise estimate; None if stated, or without chi-square."""
-    chi_square, levels = by_itself.estimate.chi_square, by_itself.estimate.levels
-    return chi_square.dof if chi_square and any(level.noise.estimated for level in levels) else None
