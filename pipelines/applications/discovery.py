@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -301,9 +302,15 @@ class _Search:
         return found
 
     def _pairing(self, gyro: str, attitude: TopicSource) -> Pairing | None:
-        key = gyro, attitude.name
+        """Return how an attitude turns with a gyro; None where one of them cannot be read."""
+        key, recording = (gyro, attitude.name), self._recording
         if key not in self._pairings:
-            self._pairings[key] = _paired(self._recording, gyro, attitude)
+            self._pairings[key] = None
+            with suppress(InputError):
+                rates, poses = recording.imu(gyro), recording.poses_of(attitude)
+                imus = [n for n, topic in recording.topics.items() if topic.type in messages.IMUS and n != gyro]
+                carriers = [(imu.t_ns, imu.gyro) for n in imus if (imu := _rates(recording, n)) is not None]
+                self._pairings[key] = pair(rates.t_ns, rates.gyro, poses.t_ns, poses.wxyz, carriers)
         return self._pairings[key]
 
     def _split_imu(self, used: set[str]) -> TopicSource | None:
@@ -350,17 +357,6 @@ def _moving_pairs(recording: Recording, topic: str) -> list[tuple[str, str]]:
     except InputError:
         return []
     return sorted((pair for pair, n in counts.items() if n >= _FEWEST), key=lambda pair: -counts[pair])[:_MOST_PAIRS]
-
-
-def _paired(recording: Recording, gyro: str, attitude: TopicSource) -> Pairing | None:
-    try:
-        rates, poses = recording.imu(gyro), recording.poses_of(attitude)
-    except InputError:
-        return None
-    there = (name for name, topic in recording.topics.items() if topic.type in messages.IMUS and name != gyro)
-    others = filter(None, (_rates(recording, name) for name in there))
-    carriers = [(other.t_ns, other.gyro) for other in others]
-    return pair(rates.t_ns, rates.gyro, poses.t_ns, poses.wxyz, carriers)
 
 
 def _rates(recording: Recording, topic: str) -> ImuSeries | None:

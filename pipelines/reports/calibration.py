@@ -374,15 +374,13 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
     return found
 
 
-def _plain(row: Mapping[str, object]) -> dict[str, object]:
-    """Return a row of findings with its numbers rounded."""
-
-    def rounded(value: object) -> object:
-        if isinstance(value, list):
-            return [rounded(v) for v in value]
-        return _rounded(value, _FEWER_DIGITS) if isinstance(value, float) else value
-
-    return {name: rounded(value) for name, value in row.items()}
+def _plain(value: Any) -> Any:
+    """Return a row of findings, or a value in it, with its numbers rounded."""
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return _rounded(value, _FEWER_DIGITS) if isinstance(value, float) else value
 
 
 def _rounded(value: float, digits: int = _DIGITS) -> float:

@@ -67,12 +67,8 @@ class ResultRow:
 
     def times(self, factor: float) -> ResultRow:
         """Return the row in another unit: its numbers multiplied by a factor."""
-        scaled = {
-            name: None if number is None else factor * number
-            for name, number in vars(self).items()
-            if name in ("value", "sigma", "require", "error")
-        }
-        return replace(self, **scaled)  # type: ignore[arg-type]
+        require, error = (None if number is None else factor * number for number in (self.require, self.error))
+        return replace(self, value=factor * self.value, sigma=factor * self.sigma, require=require, error=error)
 
     @property
     def ratio(self) -> float:
