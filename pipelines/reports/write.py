@@ -31,6 +31,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes, History
 from alidade.pipelines.files import Content, write_whole
 from alidade.pipelines.recording.array_container import encode_series
+from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.messages import JOINT_STATE, definition_text
 from alidade.pipelines.recording.series import JointSeries
 from alidade.pipelines.reports.calibration import calibration_yaml
@@ -85,7 +86,7 @@ def adopt_parts(out_dir: Path, written: Path) -> None:
 def tum(attitudes: Attitudes, epoch_ns: int) -> str:
     """Return attitude.tum: lines `t tx ty tz qx qy qz qw` by time; t is Unix time in s to the ns, the position zero."""
     order = np.argsort(attitudes.time, kind="stable")
-    stamps = epoch_ns + np.round(attitudes.time[order] * 1e9).astype(np.int64)
+    stamps = nanoseconds(attitudes.time[order], epoch_ns)
     lines = []
     for t_ns, (w, x, y, z) in zip(stamps.tolist(), attitudes.wxyz[order].tolist(), strict=True):
         # In whole numbers: a double holds today's Unix time to a quarter of a microsecond only.
@@ -131,11 +132,11 @@ def write_estimates(path: Path, calibration: Calibration, history: History) -> N
             for kind, over_time in known.items():
                 metadata = {"unit": p.unit, "method": calibration.problem.method}
                 channel = writer.register_channel(f"/{kind}/{p.name}", "cdr", schema, metadata)
-                stamps = _stamps(epoch_ns, over_time)
+                stamps = nanoseconds(over_time.time, epoch_ns)
                 encoded = _encode(stamps, over_time.values[:, i], over_time.sigmas[:, i])
                 messages += [(t, channel, row.tobytes()) for t, row in zip(stamps.tolist(), encoded, strict=True)]
         joints = writer.register_schema(JOINT_STATE, "ros2msg", definition_text(JOINT_STATE).encode())
-        stamps = _stamps(epoch_ns, history)
+        stamps = nanoseconds(history.time, epoch_ns)
         for topic, unit, names, numbers in _plots(calibration, history):
             channel = writer.register_channel(
                 topic, "cdr", joints, {"unit": unit, "method": calibration.problem.method}
@@ -160,10 +161,6 @@ def _plots(calibration: Calibration, history: History) -> Iterator[tuple[str, st
         edges = tuple(f"{q.name}{edge}" for q in members for edge in ("", "_lower", "_upper"))
         yield f"/plot/{variable}", unit, edges, bands
         yield f"/sigma/{variable}", unit, tuple(q.name for q in members), sigmas
-
-
-def _stamps(epoch_ns: int, over_time: History) -> NDArray[np.int64]:
-    return np.asarray(epoch_ns + np.round(over_time.time * 1e9).astype(np.int64))
 
 
 def _encode(stamps: NDArray[np.int64], value: Array, sigma: Array) -> NDArray[np.void]:
