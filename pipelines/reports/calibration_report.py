@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
@@ -66,8 +66,6 @@ _TONES: dict[str, Tone] = {"calibrated": "good", "weak": "warn", "unobservable":
 _CALL = "found = calibration.apply({})  # by name: everything that the formulas give"
 # Badges: inflation of sigmas, share of a family that is rejected, noise used over stated and its inverse.
 _NOTABLE_INFLATION, _NOTABLE_REJECTION, _NOTABLE_NOISE = 1.1, 0.1, 2.0
-# Who stated a noise, in a badge.
-_STATED = {"default": "the default"}
 # Ratio from which on two bounds are said to differ.
 _GAIN = 1.2
 # Parameters whose error budget is shown: those nearest to their requirement.
@@ -159,7 +157,7 @@ def summary_of(c: Calibration, cards: Sequence[ResultCard]) -> Summary:
         c.findings, c.quantities, c.verdicts, _nearest(*worst, bool(missed)) if worst else ""
     )
     steps = (action,) if action else ()
-    return Summary("", c.status, _TONES[c.status], text, c.notes, steps, _badges(c))
+    return Summary("", c.status, _TONES[c.status], text, c.notes, steps, tuple(_badges(c)))
 
 
 def _nearest(card: ResultCard, group: ResultGroup, row: ResultRow, missed: bool) -> str:
@@ -176,51 +174,37 @@ def _nearest(card: ResultCard, group: ResultGroup, row: ResultRow, missed: bool)
     return f", worst {name}: ± {sigma} {group.unit} where {require} is required"
 
 
-def _badges(c: Calibration) -> tuple[Badge, ...]:
-    """Return badges: inflation, rejections, noise, priors, change, misfit, error if simulated."""
+def _badges(c: Calibration) -> Iterator[Badge]:
+    """Yield badges: inflation, rejections, noise, priors, change, misfit, error if simulated."""
     if has_no_solution(c.findings):
-        return ()
-    found = []
+        return
     inflation = max((p.inflation for p in c.parameters.values()), default=1.0)
     if inflation > _NOTABLE_INFLATION:
-        found.append(Badge(f"sigmas × {inflation:.1f} for correlated noise", "warn", "included in all sigmas"))
+        yield Badge(f"sigmas × {inflation:.1f} for correlated noise", "warn", "included in all sigmas")
     slow = sentences.slow_error(c.findings)
     if slow > sentences.SLOW_ERROR_WARNING:
-        found.append(Badge(f"sigmas × {slow:.1f} for slow errors", "warn", "included in all sigmas"))
+        yield Badge(f"sigmas × {slow:.1f} for slow errors", "warn", "included in all sigmas")
     for family, residuals in c.residuals.items():
         share = 1.0 - float(residuals.used.mean()) if len(residuals.used) else 0.0
         if share > _NOTABLE_REJECTION:
-            found.append(
-                Badge(f"{100.0 * share:.0f} % of {family} rejected", "warn", "measurements that fit no solution")
-            )
-    found += [
-        Badge(
-            f"{n.name} {rounded(n.used / n.stated)} × {_STATED.get(n.source, 'stated')}",
-            "warn",
-            f"noise, by {n.source}",
-        )
-        for n in c.noises
-        if n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE
-    ]
+            yield Badge(f"{100.0 * share:.0f} % of {family} rejected", "warn", "measurements that fit no solution")
+    for n in c.noises:
+        if n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE:
+            by = "the default" if n.source == "default" else "stated"
+            yield Badge(f"{n.name} {rounded(n.used / n.stated)} × {by}", "warn", f"noise, by {n.source}")
     alone = [name for name, each in c.verdicts.items() if each == "prior"]
     if alone:
         more = f" + {len(alone) - 1}" if len(alone) > 1 else ""
-        found.append(Badge(f"prior alone: {alone[0]}{more}", "warn", "within the requirement by the prior alone"))
+        yield Badge(f"prior alone: {alone[0]}{more}", "warn", "within the requirement by the prior alone")
     if c.fit is not None:
         fits = c.fit.low <= c.fit.value <= c.fit.high
-        found.append(
-            Badge(
-                "fit as expected" if fits else f"misfit: residuals {c.fit.noise_factor:.2g} × the noise",
-                "good" if fits else "warn",
-                "99.9 % interval of chi-square",
-            )
-        )
+        text = "fit as expected" if fits else f"misfit: residuals {c.fit.noise_factor:.2g} × the noise"
+        yield Badge(text, "good" if fits else "warn", "99.9 % interval of chi-square")
     if c.stability is not None:
-        found.append(_stability_badge(c.stability.changed, c.findings))
+        yield _stability_badge(c.stability.changed, c.findings)
     errors = [abs(e.error_sigmas) for e in truth_errors(c).values() if e.error_sigmas is not None]
     if errors:
-        found.append(Badge(f"simulated: largest error {max(errors):.1f} σ of {len(errors)}", "fixed"))
-    return tuple(found)
+        yield Badge(f"simulated: largest error {max(errors):.1f} σ of {len(errors)}", "fixed")
 
 
 def _stability_badge(changed: bool, findings: Sequence[Finding]) -> Badge:
