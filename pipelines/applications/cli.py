@@ -580,8 +580,7 @@ def montecarlo(
     """
     from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study
     from alidade.pipelines.applications.fleet.pages import study_report
-    from alidade.pipelines.applications.fleet.write import write_study
-    from alidade.pipelines.reports.plain_json import study_json
+    from alidade.pipelines.applications.fleet.write import study_json, write_study
 
     folder = out or Path(f"{method}-montecarlo")
     chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
@@ -618,13 +617,12 @@ def fleet(
     The same command resumes after an interruption.
     """
     from alidade.pipelines.applications.fleet.write import fleet as run
-    from alidade.pipelines.reports.plain_json import fleet_json
+    from alidade.pipelines.applications.fleet.write import fleet_json
 
     work = partial(run, recordings, out, method=method, config=config, solver=solver, window=parse_window(window))
     with progress.shown(quiet or as_json):
         found = work(names=names, prior=prior, scheduler=scheduler, jobs=jobs)
-    text = partial(fleet_json, found.outcome, found.populations, found.histories)
-    _show(as_json, text, None, *found.summary, _results_in(out, found.written))
+    _show(as_json, partial(fleet_json, found), None, *found.summary, _results_in(out, found.written))
     if found.outcome.interrupted:
         raise typer.Exit(errors.EXIT_INTERRUPTED)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import NormalDist
-from typing import Literal
+from typing import ClassVar, Literal
 
 from alidade.pipelines import progress
 from alidade.pipelines.applications.session import Session
@@ -15,10 +15,6 @@ from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solv
 from alidade.pipelines.reports.result import Calibration
 
 SOLVERS = ("published", "batch", "incremental")
-# Difference of incremental from batch, in sigmas: at one the mean square of the error has doubled.
-MAX_DIFFERENCE = 1.0
-# Probability of a false alarm of the split-half test, all parameters together.
-SIGNIFICANCE = 1e-3
 
 Answer = Literal["yes", "no", "cannot say"]
 
@@ -35,6 +31,11 @@ class Comparison:
         unsolved: "first", "second" of the halves that have no solution.
         tested: whether the halves were solved.
     """
+
+    # Difference of incremental from batch, in sigmas: at one the mean square of the error has doubled.
+    MAX_DIFFERENCE: ClassVar = 1.0
+    # Probability of a false alarm of the split-half test, all parameters together.
+    SIGNIFICANCE: ClassVar = 1e-3
 
     calibrations: tuple[Calibration, ...]
     halves: Mapping[str, SplitHalf] = field(default_factory=dict)
@@ -59,7 +60,7 @@ class Comparison:
     @property
     def limit(self) -> float:
         """Threshold of the split-half test, sigmas."""
-        return NormalDist().inv_cdf(1.0 - 0.5 * SIGNIFICANCE / max(len(self.halves), 1))
+        return NormalDist().inv_cdf(1.0 - 0.5 * self.SIGNIFICANCE / max(len(self.halves), 1))
 
     @property
     def far(self) -> dict[str, float]:
@@ -71,7 +72,7 @@ class Comparison:
     def answer(self) -> Answer:
         """Whether batch and incremental agree, and both halves where these were solved: yes, no or cannot say."""
         online = self.difference("incremental")
-        if self.far or (online is not None and abs(online.z) > MAX_DIFFERENCE):
+        if self.far or (online is not None and abs(online.z) > self.MAX_DIFFERENCE):
             return "no"
         return "cannot say" if online is None or (self.tested and not self.halves) else "yes"
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from alidade.pipelines.applications.comparison import MAX_DIFFERENCE, SIGNIFICANCE, Comparison
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
@@ -18,6 +18,9 @@ from alidade.pipelines.reports.report import Block, Bullets, Details, Plots, Rep
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import truth_errors
 from alidade.pipelines.reports.results_table import result_cards
+
+if TYPE_CHECKING:
+    from alidade.pipelines.applications.comparison import Comparison
 
 # Bars of z end here: a published solver may be hundreds of its sigmas off.
 _MAX_Z = 12.0
@@ -145,7 +148,7 @@ def _solvers_agree(comparison: Comparison) -> str:
     online = comparison.difference("incremental")
     if online is None:
         said = "Batch and incremental cannot be compared"
-    elif abs(online.z) <= MAX_DIFFERENCE:
+    elif abs(online.z) <= comparison.MAX_DIFFERENCE:
         said = f"Batch and incremental agree within {abs(online.z):.1f} sigma"
     else:
         said = f"Batch and incremental differ by {abs(online.z):.1f} sigma ({online.parameter})"
@@ -159,17 +162,13 @@ def _solvers_agree(comparison: Comparison) -> str:
 
 def _halves_agree(comparison: Comparison) -> Iterator[str]:
     halves, far = comparison.halves, comparison.far
+    limit = f"{comparison.limit:.1f} sigma (p = {comparison.SIGNIFICANCE:g})"
     if far:
-        yield (
-            f"The halves of the recording differ by more than {comparison.limit:.1f} sigma (p = {SIGNIFICANCE:g}): "
-            f"{', '.join(f'{name} ({signed(z)})' for name, z in far.items())}."
-        )
+        differences = ", ".join(f"{name} ({signed(z)})" for name, z in far.items())
+        yield f"The halves of the recording differ by more than {limit}: {differences}."
     elif halves:
         most = max(abs(half.z) for half in halves.values())
-        yield (
-            f"Both halves agree in all {len(halves)} parameters: {most:.1f} sigma at most, threshold "
-            f"{comparison.limit:.1f} sigma (p = {SIGNIFICANCE:g})."
-        )
+        yield f"Both halves agree in all {len(halves)} parameters: {most:.1f} sigma at most, threshold {limit}."
     elif comparison.tested and comparison.stopped:
         yield "The time limit ended the test of the halves."
     elif comparison.unsolved:

@@ -6,11 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import cycle
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from alidade.pipelines.applications.noise import NoiseStudy, SensorNoise
 from alidade.pipelines.diagnostics.allan import allan_variance
 from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
 from alidade.pipelines.display.figure import AXES, Figure, Plot
@@ -19,6 +18,9 @@ from alidade.pipelines.display.units import significant
 from alidade.pipelines.reports.plain_json import plain_json
 from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
 from alidade.pipelines.reports.result import software_versions
+
+if TYPE_CHECKING:
+    from alidade.pipelines.applications.noise import NoiseStudy, SensorNoise
 
 _TITLES = {"gyro": "gyro", "accel": "accelerometer", "mag": "magnetometer"}
 _COEFFICIENTS = {"N": "white noise", "B": "bias instability", "K": "random walk", "Q": "quantisation"}

@@ -12,10 +12,6 @@ from alidade.pipelines.reports.sentences import label
 if TYPE_CHECKING:
     from alidade.pipelines.applications.apply import Applied
     from alidade.pipelines.applications.discovery import Suggestion
-    from alidade.pipelines.applications.fleet.analysis import Population
-    from alidade.pipelines.applications.fleet.fleet import Outcome
-    from alidade.pipelines.applications.fleet.histories import History
-    from alidade.pipelines.applications.fleet.montecarlo import Study
     from alidade.pipelines.applications.planning import Plan
     from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.applications.validate import Validated
@@ -107,45 +103,6 @@ def plan_json(plan: Plan) -> str:
             "missing": now.missing,
             "missing_with_changes": best.missing,
             "scenario": plan.scenario_text,
-        },
-    )
-
-
-def fleet_json(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
-    """JSON of `fleet`: rows of fleet.csv and changes.csv, components of every parameter, who needs attention."""
-    from alidade.pipelines.applications.fleet.analysis import table, units_of_interest
-    from alidade.pipelines.applications.fleet.histories import change_table
-
-    return plain_json(
-        "fleet",
-        {
-            "recordings": table(outcome.results, fleet),
-            "changes": change_table(found),
-            "attention": units_of_interest(outcome.results, fleet, found),
-            "parameters": [
-                {"name": p.name, "method": p.method, "of_device": p.of_device}
-                | {"population": p.population, "repeatability": p.repeatability}
-                for p in fleet
-            ],
-            "wanted": outcome.recordings,
-            "interrupted": outcome.interrupted,
-        },
-    )
-
-
-def study_json(study: Study) -> str:
-    """JSON of `montecarlo`: the rows of runs.csv and summary.csv."""
-    from alidade.pipelines.applications.fleet.montecarlo import run_table, summary_table
-
-    return plain_json(
-        "montecarlo",
-        {
-            "method": study.method,
-            "scenario": study.scenario,
-            "runs": run_table(study),
-            "summary": summary_table(study),
-            "wanted": study.seeds,
-            "interrupted": study.interrupted,
         },
     )
 

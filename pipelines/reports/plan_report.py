@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from alidade.pipelines import methods
-from alidade.pipelines.applications.planning import Plan
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded
 from alidade.pipelines.reports.calibration_report import direction_blocks
 from alidade.pipelines.reports.report import Code, Plots, Report, Section, Summary, Text
 from alidade.pipelines.reports.sentences import capital, limits
+
+if TYPE_CHECKING:
+    from alidade.pipelines.applications.planning import Plan
 
 # Bars of the plot end at so many times the requirement.
 _MAX_RATIO = 3.0

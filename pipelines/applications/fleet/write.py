@@ -1,4 +1,4 @@
-"""A fleet from recordings to files, and the files of a study."""
+"""A fleet from recordings to files, and files and JSON of fleets and studies."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from alidade.pipelines.applications.fleet.recordings import find
 from alidade.pipelines.applications.fleet.store import csv_text, write_parquet
 from alidade.pipelines.files import write_whole
 from alidade.pipelines.reports.html import render_html
+from alidade.pipelines.reports.plain_json import plain_json
 
 
 @dataclass(frozen=True, repr=False)
@@ -86,6 +87,41 @@ def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found:
             "fleet.parquet": partial(write_parquet, rows=rows),
             "changes.csv": csv_text(change_table(found)),
             "fleet.html": render_html(fleet_report(outcome, fleet, found)),
+        },
+    )
+
+
+def fleet_json(found: FleetResult) -> str:
+    """JSON of `fleet`: rows of fleet.csv and changes.csv, components of every parameter, who needs attention."""
+    outcome, fleet, histories = found.outcome, found.populations, found.histories
+    return plain_json(
+        "fleet",
+        {
+            "recordings": table(outcome.results, fleet),
+            "changes": change_table(histories),
+            "attention": units_of_interest(outcome.results, fleet, histories),
+            "parameters": [
+                {"name": p.name, "method": p.method, "of_device": p.of_device}
+                | {"population": p.population, "repeatability": p.repeatability}
+                for p in fleet
+            ],
+            "wanted": outcome.recordings,
+            "interrupted": outcome.interrupted,
+        },
+    )
+
+
+def study_json(study: Study) -> str:
+    """JSON of `montecarlo`: the rows of runs.csv and summary.csv."""
+    return plain_json(
+        "montecarlo",
+        {
+            "method": study.method,
+            "scenario": study.scenario,
+            "runs": run_table(study),
+            "summary": summary_table(study),
+            "wanted": study.seeds,
+            "interrupted": study.interrupted,
         },
     )
 
