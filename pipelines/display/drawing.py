@@ -80,13 +80,13 @@ class Drawing:
             f'dominant-baseline="central" fill="{_LIT if lit else _PLAIN}">{escape(text)}</text>'
         )
 
-    def word_on(self, middle: Array, along: Array, up: Array, text: str, lit: bool = False) -> None:
+    def word_on(self, middle: Array, along: Array, up: Array, text: str) -> None:
         """Write a word in a plane: it runs along one direction (3,), its top towards another (3,)."""
         ((x, y),), right, down = self._flat(middle[None]), self.projection @ along, -self.projection @ up
         matrix = " ".join(f"{v:.3f}" for v in (*right, *down, x, y))
         self._parts.append(
             f'<text transform="matrix({matrix})" font-size="34" font-weight="700" text-anchor="middle" '
-            f'dominant-baseline="central" fill="{_LIT if lit else _PLAIN}">{escape(text)}</text>'
+            f'dominant-baseline="central" fill="{_PLAIN}">{escape(text)}</text>'
         )
 
     def svg(self, label: str) -> str:

@@ -196,9 +196,9 @@ class Figure:
         """Draw horizontal lines at heights (n,)."""
         self._add("levels", {"y": y}, slice(None), color, name, bool(name), dash=dash)
 
-    def moments(self, x: ArrayLike, color: str = "soft", dash: Dash = "dashed", name: str = "") -> None:
-        """Draw vertical lines at places (n,)."""
-        self._add("moments", {"x": x}, slice(None), color, name, False, dash=dash)
+    def moments(self, x: ArrayLike, color: str = "soft", name: str = "") -> None:
+        """Draw dashed vertical lines at places (n,)."""
+        self._add("moments", {"x": x}, slice(None), color, name, False, dash="dashed")
 
     def words(self, x: ArrayLike, y: ArrayLike, texts: Sequence[str]) -> None:
         """Write words at places (n,)."""

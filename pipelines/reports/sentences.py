@@ -297,16 +297,6 @@ def _device_change(e: Mapping[str, Any], _: Severity, quantities: Quantities) ->
     return f"Change of the device {between(e['recordings'], e['dates'])}: {e['parameter']} by {step}."
 
 
-def _rejection(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    share = f"{100.0 * e['share']:.0f} % of {e['family']} measurements rejected"
-    return f"{share}; all would fit {e['noise_factor']:.2g} times the noise."
-
-
-def _disturbance(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    when = f"{e['since_s']:.1f} to {e['time_s']:.1f} s"
-    return f"{e['family']} disturbed {when}: {e['rejected']} measurements are left out there."
-
-
 def _noise(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     unit, factor = noise_unit(e["noise"], e["unit"])
     if severity > Severity.NOTE:
@@ -369,11 +359,6 @@ def _ambiguous_solution(e: Mapping[str, Any], _: Severity, quantities: Quantitie
     return f"A second solution is nearly as likely ({higher}): {', '.join(named)}; whole in second_best of result.json."
 
 
-def _recording(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
-    own: Sequence[Finding] = e["findings"]
-    return f"{e['recording']} by itself: {' '.join(_sentences(own, quantities))}"
-
-
 def _recordings_disagree(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
     sums = f"chi-square {e['chi_square']:.4g} (dof {e['dof']})"
     if e["dates"]:
@@ -390,8 +375,14 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "change": _change,
     "jump": _jump,
     "device_change": _device_change,
-    "rejection": _rejection,
-    "disturbance": _disturbance,
+    "rejection": lambda e, *_: (
+        f"{100.0 * e['share']:.0f} % of {e['family']} measurements rejected; all would fit {e['noise_factor']:.2g} "
+        "times the noise."
+    ),
+    "disturbance": lambda e, *_: (
+        f"{e['family']} disturbed {e['since_s']:.1f} to {e['time_s']:.1f} s: {e['rejected']} measurements are left out "
+        "there."
+    ),
     "noise": _noise,
     "correlation": lambda e, *_: (
         f"Residuals of {e['family']} are correlated over {100.0 * e['share']:.0f} % of the recording."
@@ -404,7 +395,9 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "solver_difference": lambda e, *_: (
         f"The run's own last estimate differed by up to {abs(e['z']):.1f} sigma ({e['parameter']})."
     ),
-    "recording": _recording,
+    "recording": lambda e, _, quantities: (
+        f"{e['recording']} by itself: {' '.join(_sentences(e['findings'], quantities))}"
+    ),
     "recordings_disagree": _recordings_disagree,
     "remark": lambda e, *_: str(e["text"]),
 }
