@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -102,10 +101,9 @@ def calibration_report(calibration: Calibration) -> Report:
 
 
 def _report(c: Calibration, more: Sequence[Section]) -> Report:
-    start = datetime.datetime.fromtimestamp(c.facts.epoch_ns // 1_000_000_000, datetime.UTC)
     about = [
         c.recording,
-        f"{start:%Y-%m-%d %H:%M:%S} UTC",
+        f"{c.start[:19].replace('T', ' ')} UTC",
         f"{c.facts.duration_s:.1f} s",
         f"{c.estimate.solver} solver",
         f"alidade {c.software.get('alidade', '')}",
