@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import cycle
 
 import numpy as np
@@ -15,7 +15,7 @@ from alidade.pipelines.display.figure import AXES, COLORS, PALE, REJECTED, Figur
 from alidade.pipelines.display.units import human_unit, noise_unit
 from alidade.pipelines.estimation.error_map import UNIT, FoundMap
 from alidade.pipelines.estimation.problem import History, Quantity, Residuals
-from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.reports.result import Calibration
 
 # Suffix of a number of one variable: an axis, an element, a harmonic.
 _AXIS = re.compile(r"_([xyzenu]{1,2}|sin|cos)$|_?\d+$")
@@ -51,8 +51,7 @@ def common_plots(calibration: Calibration) -> list[Plot]:
                 plots.append(_spectrum(family, innovations, names))
     if estimate.error_map is not None:
         plots.append(_error_map(estimate.error_map))
-    correlation, ellipses = _correlation(calibration), _ellipses(calibration)
-    return [*plots, *([correlation] if correlation else []), *([ellipses] if ellipses else [])]
+    return [*plots, *_correlations(calibration)]
 
 
 def _error_map(found: FoundMap) -> Plot:
@@ -278,48 +277,36 @@ def _common_name(names: Sequence[str]) -> str:
     return ", ".join(stems[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _correlation(calibration: Calibration) -> Plot | None:
-    quantities = quantities_of(calibration.problem, calibration.estimate)
+def _correlations(calibration: Calibration) -> Iterator[Plot]:
+    """Yield a map of the correlations, and ellipses of the strongest ones, each in units of its own two sigmas."""
     sigmas = calibration.estimate.sigmas
-    shown: NDArray[np.intp] = np.flatnonzero(sigmas > 0.0)
-    if len(shown) < 2:
-        return None
-    covariance = calibration.covariance[np.ix_(shown, shown)]
-    correlation = np.clip(covariance / np.outer(sigmas[shown], sigmas[shown]), -1.0, 1.0)
-    names = tuple(quantities[i].name for i in shown)
+    free: NDArray[np.intp] = np.flatnonzero(sigmas > 0.0)
+    if len(free) < 2:
+        return
+    covariance = calibration.covariance[np.ix_(free, free)]
+    correlation = np.clip(covariance / np.outer(sigmas[free], sigmas[free]), -1.0, 1.0)
+    names = tuple(calibration.estimate.names[i] for i in free)
     ends = (-0.5, len(names) - 0.5)
     height = 130 + max(190, round(float(np.clip(900 / len(names), 13, 24)) * len(names)))
     out = Figure("", "", height, x_labels=names, y_labels=names, x_range=ends)
     out.y_range = ends[::-1]
     out.heat(correlation, numbers=len(names) <= _MOST_LABELLED)
-    return Plot(
+    yield Plot(
         "Correlation of the parameters",
         "Red +1, blue -1. Near either, two parameters trade against each other: their errors are not independent.",
         out,
     )
-
-
-def _ellipses(calibration: Calibration) -> Plot | None:
-    """Plot one-sigma ellipses of the pairs with the strongest correlation, each in units of its own two sigmas."""
-    quantities = quantities_of(calibration.problem, calibration.estimate)
-    covariance, sigmas = calibration.covariance, calibration.estimate.sigmas
-    pairs = [
-        (float(covariance[i, j] / (sigmas[i] * sigmas[j])), i, j)
-        for i in range(len(sigmas))
-        for j in range(i)
-        if sigmas[i] > 0.0 and sigmas[j] > 0.0
-    ]
+    pairs = [(float(correlation[i, j]), i, j) for i in range(len(names)) for j in range(i)]
     strong = sorted((pair for pair in pairs if abs(pair[0]) > _STRONG), key=lambda pair: -abs(pair[0]))[:_MOST_ELLIPSES]
     if not strong:
-        return None
+        return
     out = Figure("error of the second, sigmas", "error of the first, sigmas", 380, square=True)
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    for (correlation, i, j), color in zip(strong, cycle(COLORS)):
-        correlation = float(np.clip(correlation, -1.0, 1.0))
-        x, y = np.array([[1.0, 0.0], [correlation, np.sqrt(1.0 - correlation**2)]]) @ circle
-        out.line(x, y, f"{quantities[j].name}, {quantities[i].name}: {correlation:+.2f}", color)
-    return Plot(
+    for (r, i, j), color in zip(strong, cycle(COLORS)):
+        x, y = np.array([[1.0, 0.0], [r, np.sqrt(1.0 - r**2)]]) @ circle
+        out.line(x, y, f"{names[j]}, {names[i]}: {r:+.2f}", color)
+    yield Plot(
         "Most correlated parameters",
         "One-sigma ellipses of the most correlated pairs: the thinner, the more the error of one is that of the other.",
         out,
