@@ -84,16 +84,16 @@ def _solver_table(
     caption: str = "",
 ) -> Table:
     """Return a table with the truth, where known, and value, sigma and z of each solver."""
-    errors = [truth_errors(c) for c in calibrations]
-    columns: list[Column | str] = ["parameter", Column("unit", "text"), *(["truth"] if any(errors) else [])]
+    truths = {name: error.value for c in calibrations for name, error in truth_errors(c).items()}
+    columns: list[Column | str] = ["parameter", Column("unit", "text"), *(["truth"] if truths else [])]
     for c in calibrations:
         columns += [Column(c.estimate.solver, group=c.estimate.solver), Column("z", group=c.estimate.solver)]
     rows: list[Row] = []
     for q in quantities:
         unit, factor = human_unit(q)
         row: list[Cell | str] = [Cell(q.name, hint=calibrations[0].method.describe(q.name)), unit]
-        if any(errors):
-            truth = next((found[q.name].value for found in errors if q.name in found), None)
+        if truths:
+            truth = truths.get(q.name)
             sigmas = [p.sigma for c in calibrations if (p := c.parameters.get(q.name)) and p.sigma > 0.0]
             row.append("" if truth is None else to_digits_of(truth * factor, min(sigmas, default=0.0) * factor))
         for c, scores in zip(calibrations, z, strict=True):
