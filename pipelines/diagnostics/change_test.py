@@ -26,8 +26,9 @@ from alidade.pipelines.estimation.widening import by_wider_priors, widened
 
 # Probability of calling a recording changed in which nothing changed.
 LEVEL = 1e-3
-# Paths drawn, a batch at a time.
-_PATHS, _BATCH = 4000, 500
+# Most paths drawn, a batch at a time; so many that reach the largest difference give its p-value to a tenth (Besag and
+# Clifford 1991), and no more are drawn.
+_PATHS, _BATCH, _REACHING = 4000, 500, 100
 # Directions in which the rest of the recording added less than this share of the variance have no information about a
 # change.
 _LEAST = 1e-3
@@ -260,16 +261,16 @@ def _p_value(P: Array, whitening: Sequence[Array], ranks: Array, size: float) ->
     rng = np.random.default_rng(0)
     n = P.shape[1]
     roots = [_root(P[i] - P[i + 1], P[i]) for i in range(len(P) - 1)]
-    count = 0
-    for _ in range(_PATHS // _BATCH):
+    count, drawn = 0, 0
+    while drawn < _PATHS and count < _REACHING:
         difference = np.zeros((_BATCH, n))
         largest = np.full(_BATCH, -np.inf)
         for i in reversed(range(len(roots))):
             difference += rng.standard_normal((_BATCH, n)) @ roots[i].T
             square = ((difference @ whitening[i].T) ** 2).sum(axis=1)
             largest = np.maximum(largest, _as_normal(square, ranks[i]))
-        count += int((largest >= size).sum())
-    return count / _PATHS
+        count, drawn = count + int((largest >= size).sum()), drawn + _BATCH
+    return count / drawn
 
 
 def _root(covariance: Array, larger: Array) -> Array:
