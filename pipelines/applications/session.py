@@ -485,6 +485,7 @@ class Session:
                 engine=self.engine,
                 error_map=True,
                 steps=True,
+                history=True,
             )
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:

@@ -162,6 +162,7 @@ def solve_batch(
     engine: EngineName = "auto",
     error_map: bool = False,
     steps: bool = False,
+    history: bool = False,
 ) -> Estimate:
     """Compute the maximum a-posteriori estimate with the joint covariance of all parameters.
 
@@ -176,6 +177,7 @@ def solve_batch(
         engine: that eliminates the linear systems.
         error_map: whether to look for errors of measurements that depend on where they are made.
         steps: whether to test for a step of what `Problem.step_candidates` names.
+        history: also the posterior at earlier moments of the recording.
 
     Raises:
         IndeterminateStateError: states other than the parameters are not determined.
@@ -185,7 +187,7 @@ def solve_batch(
     built = time.perf_counter()
     solved = solve(compiled, LevenbergConfig(max_iterations))
     found = time.perf_counter()
-    estimate = whole_estimate(solved, budget, changed, steps)
+    estimate = whole_estimate(solved, budget, changed, steps, history)
     if device:
         estimate = replace(estimate, sqrt_info=_information_of(solved, device, elsewhere))
     if error_map:
@@ -219,7 +221,11 @@ def _best(compiled: Compiled, solution: Solution, config: LevenbergConfig) -> tu
 
 
 def whole_estimate(
-    solved: Solved, budget: bool = False, changed: Iterable[tuple[str, Problem]] = (), steps: bool = False
+    solved: Solved,
+    budget: bool = False,
+    changed: Iterable[tuple[str, Problem]] = (),
+    steps: bool = False,
+    history: bool = False,
 ) -> Estimate:
     """Compute the complete estimate of a solution, with covariance and diagnostics; see `solve_batch`."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
@@ -245,7 +251,7 @@ def whole_estimate(
         largest = largest_steps(compiled, solved.levels, solved.solution) if steps else None
         widened = slow_widening(sandwich, len(names))
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
-    history = posterior_history(compiled, posterior)
+    past = posterior_history(compiled, posterior) if history else None
     residuals = residuals_by_family(engine, values)
     out = Estimate(
         solver="batch",
@@ -261,8 +267,8 @@ def whole_estimate(
         residuals=residuals,
         innovations=innovations,
         chi_square=fit,
-        history=None if history is None else history.history.inflated(wide),
-        posterior_history=history,
+        history=None if past is None else past.history.inflated(wide),
+        posterior_history=past,
         smoothed=smoothed(compiled, posterior, covariance),
         attitudes=problem.attitudes and problem.attitudes(compiled.keyframes, compiled.layout.to_gtsam(values)),
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},

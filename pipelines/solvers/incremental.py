@@ -245,7 +245,7 @@ class IncrementalSolver:
 
     def _estimate_of(self, solved: Solved, steps: bool = False) -> Estimate:
         """Return the estimate of a batch solution, with the run's history and rejected measurements."""
-        estimate = whole_estimate(solved, steps=steps)
+        estimate = whole_estimate(solved, steps=steps, history=True)
         return replace(
             estimate,
             solver="incremental",

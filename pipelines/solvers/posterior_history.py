@@ -6,13 +6,12 @@ square-root information of (node, shared unknowns) after each of them, all linea
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from alidade.factors.array import Array
-from alidade.pipelines.estimation.problem import History, PosteriorHistory, Problem
+from alidade.pipelines.estimation.problem import History, PosteriorHistory
 from alidade.pipelines.solvers.chain import ChainFactorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Values
@@ -31,35 +30,34 @@ def posterior_history(compiled: Compiled, posterior: Posterior) -> PosteriorHist
     keyframes, roots = at.factorization.prefix_roots()
     if len(keyframes) < 2:
         return None
-    keys = compiled.keys
-    found = [
-        _known(problem, layout, at.values, [_at_node(layout, key, int(node)) for key in keys], posterior.reported, root)
-        for node, root in zip(at.engine.piece[keyframes], roots, strict=True)
-    ]
+    nodes = at.engine.piece[keyframes].tolist()
+    reported = {node: _reported_at(compiled, at.values, node, posterior.reported) for node in set(nodes)}
+    found = [_known(reported[node], root) for node, root in zip(nodes, roots, strict=True)]
     found[-1] = posterior.reported.numbers, posterior.covariance
     numbers, covariances = (np.array(each) for each in zip(*found, strict=True))
-    moving = layout.node[layout.at(keys)] >= 0
+    moving = layout.node[layout.at(compiled.keys)] >= 0
     steady = ~np.repeat(moving, [len(p.quantities) for p in problem.parameters])
     return PosteriorHistory(at.engine.time[keyframes], numbers, covariances, steady)
 
 
-def _known(
-    problem: Problem, layout: Layout, values: Values, keys: Sequence[int], end: Reported, root: Array
-) -> tuple[Array, Array]:
-    """Filtered numbers (n,) and covariance (n, n) at one moment; `keys` of the parameters' variables then.
-
-    `end` is the same at the end, which `root` is about.
-    """
+def _reported_at(compiled: Compiled, values: Values, node: int, end: Reported) -> Reported:
+    """Reported numbers at a node of a walking bias; `end` is the same at the last node."""
+    layout, problem = compiled.layout, compiled.problem
+    keys = [_at_node(layout, key, node) for key in compiled.keys]
+    jacobian = end.jacobian.copy()
     if layout.sizes[3] and (layout.node[layout.at(keys)] <= 0).all():
         # The first node is among the shared unknowns, and has no numbers beside these.
-        jacobian = end.jacobian.copy()
         jacobian[:, : layout.sizes[3]] = 0.0
-        end = replace(end, jacobian=jacobian)
     known = layout.to_gtsam(values, keys)
     here = np.concatenate([p.coordinates(known, key)[0] for p, key in zip(problem.parameters, keys, strict=True)])
-    found = end.root(root)
-    now, directions = constrained(replace(end, numbers=here), found.R, found.d)
-    return now.numbers, end.covariance(directions.covariance())
+    return replace(end, numbers=here, jacobian=jacobian)
+
+
+def _known(reported: Reported, root: Array) -> tuple[Array, Array]:
+    """Filtered numbers (n,) and covariance (n, n) at a moment that has the square-root information `root`."""
+    found = reported.root(root)
+    now, directions = constrained(reported, found.R, found.d)
+    return now.numbers, reported.covariance(directions.covariance())
 
 
 def _at_node(layout: Layout, variable: int, node: int) -> int:

@@ -105,6 +105,8 @@ class WeakDirections:
         _, sizes, axes = np.linalg.svd(R)
         wide = axes[min(int(np.count_nonzero(sizes * MAX_SIGMA >= 1.0)), len(R) - at_least) :].T
         weak = _calibrated(wide, calibrated, at_least)
+        if not weak.shape[1]:
+            return cls(axes.T, weak, 1.0 / np.maximum(sizes, UNDETERMINED), precision, calibrated)
         return cls.given(R, weak, precision, calibrated)
 
     @classmethod
@@ -207,7 +209,7 @@ def constrained_step(directions: WeakDirections, R: Array, d: Array, u: Array) -
         u: (m,) where the system is linearised.
     """
     strong, weak, there = directions.strong, directions.weak, u
-    for _ in range(2):  # to where the weak ones go the others follow
+    for _ in range(2 if weak.shape[1] else 1):  # to where the weak ones go the others follow
         move = directions.prior_mean(there) - weak.T @ u
         own, *_ = np.linalg.lstsq(R @ strong, d - R @ weak @ move, rcond=None)
         there = u + strong @ own + weak @ move

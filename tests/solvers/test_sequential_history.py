@@ -31,13 +31,13 @@ def test_history_agrees_with_solving_the_past_alone(
     # Every keyframe is a moment, so that both have the same ones.
     monkeypatch.setattr(chain, "SEQUENTIAL_STATES", 10_000)
     problem = make()
-    whole = solve_batch(problem)
+    whole = solve_batch(problem, history=True)
     history = whole.history
     assert history is not None
     assert (np.abs(history.values[-1] - whole.values) <= 1e-3 * whole.sigmas).all()
     np.testing.assert_allclose(history.sigmas[-1], whole.sigmas, rtol=1e-6)
     middle = len(history.time) // 2
-    past = solve_batch(_until(problem, float(history.time[middle])))
+    past = solve_batch(_until(problem, float(history.time[middle])), history=True)
     assert past.history is not None
     # The last step of a session reports the mean of a bias that walks, so the moment before is compared.
     (then,) = np.flatnonzero(history.time == past.history.time[-2])
@@ -52,7 +52,7 @@ def test_history_where_sigmas_are_below_what_gtsam_takes_for_a_constraint() -> N
     noise = ideal.noise.model_copy(update={"gyro_density": 1e-8, "gyro_bias_walk": 1e-12})
     scenario = ideal.model_copy(update={"noise": noise, "sensors": IDEAL})
     data, _ = simulate_indexer(scenario, 1)
-    whole = solve_batch(indexer.problem(data, load_config(indexer_config(scenario).encode())))
+    whole = solve_batch(indexer.problem(data, load_config(indexer_config(scenario).encode())), history=True)
     assert whole.history is not None
     np.testing.assert_allclose(whole.history.values[-1], whole.values, atol=1e-3 * whole.sigmas.min())
     np.testing.assert_allclose(whole.history.sigmas[-1], whole.sigmas, rtol=1e-6)
