@@ -121,7 +121,10 @@ def test_gaps_have_no_windows() -> None:
 def test_validate_on_another_recording_writes_a_page(tmp_path: Path) -> None:
     for name, seed in (("a", 1), ("b", 1)):
         settings = scenario(
-            time_offset_s=0.012 if name == "a" else 0.0120001, sensors="ideal", vision_rate_hz=10, gyro_rate_hz=100
+            time_offset_s=0.012 if name == "a" else 0.0120001,
+            sensors="ideal",
+            vision_rate_hz=10,
+            gyro_rate_hz=100,
         )
         data, truth = simulate_head(settings, seed)
         method("head").write_data(tmp_path / f"{name}.mcap", data, truth, head_config(settings))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.pipelines.applications.session import Session, open_session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import DEAD_BAND
@@ -18,7 +19,6 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, head_config,
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
-from tests.support.solved import calibrate
 
 
 def scenario(**changes: object) -> HeadScenario:
@@ -36,9 +36,9 @@ def read(path: Path) -> HeadData:
     return read_head(recording, load_config(recording.attachment("alidade.yaml")))
 
 
-def sigmas_off(path: Path) -> tuple[np.ndarray, str]:
+def sigmas_off(session: Session) -> tuple[np.ndarray, str]:
     """Errors of all parameters in sigmas, and the verdict."""
-    (calibration,) = calibrate(path, ["batch"])
+    calibration = session.calibrate(report=False)
     assert calibration.truth is not None
     truth = np.array([calibration.truth[name] for name in calibration.estimate.names], dtype=float)
     off = (calibration.estimate.values - truth) / calibration.estimate.sigmas
@@ -46,13 +46,14 @@ def sigmas_off(path: Path) -> tuple[np.ndarray, str]:
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     settings = scenario(duration_s=8, vision_rate_hz=4)
-    return written(tmp_path_factory.mktemp("pictures") / "s.mcap", settings, 1)
+    return open_session(written(tmp_path_factory.mktemp("pictures") / "s.mcap", settings, 1))
 
 
-def test_every_parameter_from_pictures_alone(session: Path) -> None:
-    recording = open_recording(session)
+def test_every_parameter_from_pictures_alone(session: Session) -> None:
+    recording = session.recording
+    assert recording is not None
     assert "/vision/attitude" not in recording.topics
     assert {"/camera/image/compressed", "/camera/camera_info"} <= set(recording.topics)
     off, status = sigmas_off(session)
@@ -62,12 +63,12 @@ def test_every_parameter_from_pictures_alone(session: Path) -> None:
     assert status == "calibrated"
 
 
-def test_attitudes_seen_in_pictures_are_the_boards(session: Path) -> None:
+def test_attitudes_seen_in_pictures_are_the_boards(session: Session) -> None:
     """Mounts and time offset included; their errors fit the covariance that came with them."""
     settings = scenario(duration_s=8, vision_rate_hz=4)
     exact = settings.model_copy(update={"noise": settings.noise.model_copy(update={"vision_attitude": 0.0})})
     expected, _ = simulate_head(exact, 1)
-    data = read(session)
+    data = session.data
     assert len(data.vision_t) > 0.95 * len(expected.vision_t)
     at = np.searchsorted(expected.vision_t, data.vision_t)
     np.testing.assert_array_equal(data.vision_t, expected.vision_t[at])
@@ -94,7 +95,7 @@ def test_outages_have_no_pictures_and_png_is_read(tmp_path: Path) -> None:
 
 
 def test_same_seed_same_pictures() -> None:
-    settings = scenario(duration_s=1, vision_rate_hz=2)
+    settings = scenario(duration_s=1, vision_rate_hz=1)
     (_, a), (_, b), (_, c) = (simulate_pictures(settings, seed) for seed in (1, 1, 2))
     assert list(a.data) == list(b.data)
     first = next(iter(simulate_pictures(settings, 1)[1].data))
@@ -109,6 +110,7 @@ def test_outliers_cannot_be_drawn() -> None:
 @pytest.mark.slow
 def test_errors_over_seeds_are_as_large_as_their_sigmas(tmp_path: Path) -> None:
     """Ten parameters, eight seeds; the corners' stated noise is a little too large rather than too small."""
-    off = np.concatenate([sigmas_off(written(tmp_path / f"{seed}.mcap", scenario(), seed))[0] for seed in range(8)])
+    sessions = [open_session(written(tmp_path / f"{seed}.mcap", scenario(), seed)) for seed in range(8)]
+    off = np.concatenate([sigmas_off(each)[0] for each in sessions])
     assert 0.5 < np.sqrt((off**2).mean()) < 1.2
     assert np.abs(off).max() < 4.0

@@ -28,7 +28,7 @@ FAST = {axis: [{"amplitude_deg": 25, "frequency_hz": f}] for axis, f in {"yaw": 
 def made(**changes: object) -> tuple[HeadScenario, HeadData, dict[str, float]]:
     """A moving platform, mounts, 5 attitudes a second of a head that is shaken."""
     known = load_scenario(HeadScenario, "head_mounts").model_dump()
-    given = {"duration_s": 20, "gyro_rate_hz": 200, "vision_rate_hz": 5, "head": FAST, **changes}
+    given = {"duration_s": 14, "gyro_rate_hz": 200, "vision_rate_hz": 5, "head": FAST, **changes}
     scenario = HeadScenario.model_validate(known | given)
     return scenario, *simulate_head(scenario, 1)
 

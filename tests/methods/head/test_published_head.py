@@ -69,7 +69,7 @@ def test_analytic_derivatives_are_the_numerical_ones() -> None:
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_published_test_on_the_turntable(seed: int) -> None:
     """Static error within 0.35 deg, bias settled within 2 s, better than vision alone."""
-    scenario = load_scenario(HeadScenario, "head_turntable")
+    scenario = load_scenario(HeadScenario, "head_turntable").model_copy(update={"gyro_rate_hz": 200.0})
     data, truth = simulate_head(scenario, seed)
     result = run(scenario, data)
     true = scenario.head.attitude(result.t)
@@ -106,7 +106,7 @@ def test_sigma_of_the_bias_is_that_of_its_error() -> None:
         }
     )
     normalized = []
-    for seed in range(60):
+    for seed in range(40):
         data, truth = simulate_head(scenario, seed)
         result = run(scenario, data)
         normalized.append((result.bias[-1] - bias(truth)) / result.bias_sigma[-1])

@@ -67,7 +67,8 @@ def test_disturbed_interval_is_named_and_the_rest_is_calibrated(kind: str, gyro:
 @pytest.mark.parametrize(
     ("kind", "gyro", "seeds"),
     [
-        ("motor", False, 8),
+        ("motor", False, 4),
+        pytest.param("motor", False, 8, marks=pytest.mark.slow),
         pytest.param("motor", True, 4, marks=pytest.mark.slow),
         pytest.param("ring", True, 4, marks=pytest.mark.slow),
     ],

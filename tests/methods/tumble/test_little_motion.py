@@ -132,7 +132,7 @@ def _about(field: Array) -> Array:
     ("latitude", "gyro", "seeds"),
     [
         (40.0, {}, 4),
-        (None, {}, 4),
+        pytest.param(None, {}, 4, marks=pytest.mark.slow),
         pytest.param(40.0, {"gyro": {}}, 8, marks=pytest.mark.slow),
         pytest.param(None, {"gyro": {}}, 8, marks=pytest.mark.slow),
     ],
