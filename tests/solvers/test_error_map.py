@@ -105,8 +105,9 @@ def test_map_is_drawn_over_where_measurements_were_made() -> None:
     assert any("los_map" in title for title in titles)
 
 
-def test_a_map_moves_nothing_that_the_recording_does_not_determine() -> None:
+def test_a_map_moves_nothing_that_the_recording_does_not_determine(monkeypatch: pytest.MonkeyPatch) -> None:
     """A carrier that only yaws leaves delta_px to its prior; freed with a map it went to -0.17 rad."""
+    monkeypatch.setattr("alidade.pipelines.applications.session.find_hypotheses", lambda *_: ())  # takes long
     carrier = methods.method("los").settings("los_nominal").model_dump()["carrier"]
     yawing = {"carrier": carrier | {"pitch": [], "roll": []}, **FEW["los"], "image_rate_hz": 10.0}
     found = _session("los", 2e-4, 2, 12.0, **yawing).calibrate("batch", report=False)

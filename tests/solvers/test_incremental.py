@@ -165,13 +165,13 @@ def test_a_second_axis_after_45_s_of_one() -> None:
     assert np.abs((incremental.values - truth) / np.maximum(incremental.sigmas, 1e-12))[MOUNT].max() < 4.0
 
 
-@pytest.mark.parametrize(("seed", "rates", "systems"), [(27, {}, 60), (3, FEW, 80)])
+@pytest.mark.parametrize(("seed", "rates", "systems"), [pytest.param(27, {}, 60, marks=pytest.mark.slow), (3, FEW, 80)])
 def test_a_valley_that_bends_between_bias_and_mount_is_followed_to_its_end(
     seed: int, rates: dict[str, float], systems: int
 ) -> None:
     """At rest a gimbal's bias is known by its mount alone: from the mount of the motion to come to that of the rest.
 
-    The second took 127 linear systems before steps along the floor were lengthened.
+    With few pictures it took 127 linear systems before steps along the floor were lengthened.
     """
     settings, _ = CASES["los"]["rest"](seed)
     problem, _ = made("los", settings.model_copy(update=rates), seed)

@@ -23,11 +23,8 @@ RECORDINGS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-QUICK = ("los", "a bias that walks")
-
-
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in RECORDINGS]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "a bias that walks")) for name in RECORDINGS]
 )
 def test_parts_give_what_the_whole_gives(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     method, scenario = RECORDINGS[name]

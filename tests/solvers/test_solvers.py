@@ -148,7 +148,7 @@ def test_undetermined_state_is_named() -> None:
         solve_batch(replace(walk.problem(), steps=steps))
 
 
-@pytest.mark.parametrize("window", [0.35, 1.0, Keyframes(3), None])
+@pytest.mark.parametrize("window", [0.35, pytest.param(1.0, marks=pytest.mark.slow), Keyframes(3), None])
 def test_incremental_is_batch(window: float | None) -> None:
     """A linear problem loses nothing when states are marginalised out of the window."""
     walk, _ = Walk.random(4)
@@ -156,7 +156,7 @@ def test_incremental_is_batch(window: float | None) -> None:
     assert_same(incremental, batch.values, batch.covariance, 1e-7)
 
 
-@pytest.mark.parametrize("window", [1.0, None])
+@pytest.mark.parametrize("window", [1.0, pytest.param(None, marks=pytest.mark.slow)])
 def test_history_is_what_batch_finds_on_the_data_so_far(window: float | None) -> None:
     walk, _ = Walk.random(5)
     history = solve_incremental(walk.problem(), window).history
@@ -237,7 +237,7 @@ def test_a_lengthened_step_that_goes_too_far_proves_no_minimum(monkeypatch: pyte
     assert found.cost - least < 1e-6
 
 
-@pytest.mark.parametrize("pictures_hz", [5.0, 10.0])
+@pytest.mark.parametrize("pictures_hz", [5.0, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_where_measurements_do_not_fit_steps_get_the_right_length(pictures_hz: float) -> None:
     """A gyro warms up and nobody says so: residuals are tens of sigmas, and bend the error as much as Jacobians do.
 

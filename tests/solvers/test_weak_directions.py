@@ -60,7 +60,12 @@ def errors(method: str, case: str, share: float, seeds: range) -> tuple[list[flo
 
 
 @pytest.mark.parametrize(
-    ("method", "case", "share"), [("indexer", "rest", 0.1), ("indexer", "one axis", 0.5), ("tumble", "one axis", 0.2)]
+    ("method", "case", "share"),
+    [
+        ("indexer", "rest", 0.1),
+        pytest.param("indexer", "one axis", 0.5, marks=pytest.mark.slow),
+        ("tumble", "one axis", 0.2),
+    ],
 )
 def test_errors_fit_their_covariance_while_little_is_known(method: str, case: str, share: float) -> None:
     found, numbers, bounded = errors(method, case, share, range(3))

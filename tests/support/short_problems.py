@@ -20,7 +20,7 @@ SWAY = EulerMotion(
     roll=[Swing(amplitude_deg=12, frequency_hz=0.07)],
 )
 HEAD = HeadScenario(
-    duration_s=15.0, platform=SWAY, helmet_mount_deg=(3.0, -4.0, 2.0), gyro_rate_hz=100.0, vision_rate_hz=20.0
+    duration_s=15.0, platform=SWAY, helmet_mount_deg=(3.0, -4.0, 2.0), gyro_rate_hz=100.0, vision_rate_hz=10.0
 )
 # An indexer that turns about either axis at two attitudes of the other, a third of its usual schedule; and with few
 # samples, a tenth of the usual time of the processor.
