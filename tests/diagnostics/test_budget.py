@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import pytest
 
 import alidade
@@ -16,12 +18,17 @@ from tests.support.pages import Page
 SHORT = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 10.0}
 
 
+@cache
+def usual() -> Calibration:
+    return calibration()
+
+
 def calibration(**sensors: object) -> Calibration:
     return alidade.open(alidade.simulate("head", {**SHORT, "sensors": sensors}, 1)).calibrate()
 
 
 def test_shares_of_every_parameter_sum_to_one_and_assumptions_have_none() -> None:
-    budget = result(calibration()).budget
+    budget = result(usual()).budget
     assert budget is not None
     assert "gyro_scale_x" not in budget
     for name in ("gyro_bias_x", "helmet_mount_x", "time_offset"):
@@ -55,7 +62,7 @@ def test_sources_are_told_in_words_the_small_ones_together() -> None:
 
 
 def test_the_report_has_the_shares() -> None:
-    page = Page(report_html(calibration()))
+    page = Page(report_html(usual()))
     assert "Error budget" in page.text
     assert "vision noise" in page.text
 

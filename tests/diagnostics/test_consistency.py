@@ -391,10 +391,11 @@ def test_corners_of_a_pose_held_out_are_predicted_by_the_turn_to_it(seed: int) -
     assert held_out_residuals(session.problem())["tags"] == pytest.approx(1.0, abs=0.3)
 
 
-def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows() -> None:
+def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows(head: Case) -> None:
     # A fifth of 900 pictures: the robust sigma of their 540 numbers is known to 5 %.
     find, data, config = head_of(60.0)
     assert held_out_residuals(find.graph(data, config))["vision"] == pytest.approx(1.0, abs=0.15)
+    find, data, config = head
     wrong = with_noise(config, vision_attitude=0.2)
     assert held_out_residuals(find.graph(replace(data, vision_cov=data.vision_cov / 25.0), wrong))["vision"] > 3.0
 

@@ -43,7 +43,7 @@ def simulated(arcsec: float) -> Simulated:
     return simulate("indexer", {**COARSE, "mounting_deg": [0.5, -0.3 + arcsec / 3600.0, 0.4]}, seed=2)
 
 
-@pytest.mark.parametrize("file", ["calibration.yaml", "result.json"])
+@pytest.mark.parametrize("file", ["calibration.yaml", pytest.param("result.json", marks=pytest.mark.slow)])
 def test_it_holds_with_another_bias(calibrated: Path, file: str, tmp_path: Path, alidade: Command) -> None:
     """The bias is the recording's own: that it is another one is no change of the device."""
     recording = written(tmp_path / "june.mcap", simulated(0.0))

@@ -75,7 +75,10 @@ def moves(of: Session, name: str) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize(
     ("name", "exact"),
-    [("indexer", "latitude_deg"), ("cube", "latitude_deg"), pytest.param("cube", "tag_size", marks=pytest.mark.slow)],
+    [
+        ("indexer", "latitude_deg"),
+        *(pytest.param("cube", name, marks=pytest.mark.slow) for name in ("latitude_deg", "tag_size")),
+    ],
 )
 def test_an_input_that_is_off_moves_what_is_foretold(name: str, exact: str) -> None:
     foretold, found = moves(session(name), exact)

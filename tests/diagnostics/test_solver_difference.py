@@ -35,7 +35,7 @@ def test_the_largest_difference_is_told() -> None:
 
 
 @pytest.mark.usefixtures("few_solutions")
-@pytest.mark.parametrize("option", [[], ["--no-check"]])
+@pytest.mark.parametrize("option", [[], pytest.param(["--no-check"], marks=pytest.mark.slow)])
 def test_the_result_has_it_unless_it_is_not_wanted(option: list[str], tmp_path: Path) -> None:
     data, truth = simulate_los(SCENARIO, 1)
     method("los").write_data(tmp_path / "s.mcap", data, truth, los_config(SCENARIO))

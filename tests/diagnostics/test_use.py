@@ -94,7 +94,9 @@ def _smith(K: Array, b: Array, field: float, dip: float, h: Array) -> Array:
     return np.arctan2(across, along)
 
 
-@pytest.mark.parametrize("beside", [{}, {"gyro": {"rate_hz": 50.0, "mounting_deg": 4.0}}])
+@pytest.mark.parametrize(
+    "beside", [pytest.param({}, marks=pytest.mark.slow), {"gyro": {"rate_hz": 25.0, "mounting_deg": 4.0}}]
+)
 def test_deviation_coefficients_are_those_of_smiths_formula_integrated(beside: dict[str, object]) -> None:
     """Values by quadrature over 360 headings, sigmas by draws from the joint posterior; a gyro makes K whole."""
     scenario = {"attitudes": 15, "magnetometer": {"rate_hz": 20.0, "hard_iron": 1e-5}, **beside}

@@ -73,7 +73,7 @@ def _assert_sigma_of_scale(name: str, measured: float | None, seeds: range, solv
     ],
 )
 def test_sigma_of_the_scale_is_true(name: str, measured: float | None) -> None:
-    _assert_sigma_of_scale(name, measured, range(8 if name == "tumble" else 3))
+    _assert_sigma_of_scale(name, measured, range(8 if name == "tumble" else 2))
 
 
 @pytest.mark.parametrize("seed", [19, pytest.param(32, marks=pytest.mark.slow)])

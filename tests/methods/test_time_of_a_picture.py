@@ -71,7 +71,7 @@ def test_of_a_head_graph(skew: float) -> None:
     np.testing.assert_allclose(of_trajectory, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("skew", [0.0, 2e-3])
+@pytest.mark.parametrize("skew", [pytest.param(0.0, marks=pytest.mark.slow), 2e-3])
 def test_of_a_los_graph(skew: float) -> None:
     rates = {"gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0, "image_rate_hz": 5.0}
     scenario = LosScenario.model_validate({"duration_s": 60.0, **rates, "effects": {"clock_skew": skew}})

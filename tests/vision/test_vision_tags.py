@@ -129,7 +129,7 @@ def test_small_dark_and_blurred_tags_are_found_once(side: float, blur: float, li
     pinhole = Camera(640, 480, np.array([[600.0, 0, 320], [0, 600.0, 240], [0, 0, 1]]))
     places, numbers = [(x, y) for y in (-120.0, 120.0) for x in (-210.0, 0.0, 210.0)], [1, 2, 3, 4, 5, 1]
     found = 0
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         z = 600.0 * SIZE / side
         turns = so3.compose(so3.exp(np.append(rng.normal(scale=0.2, size=(6, 2)), np.zeros((6, 1)), axis=1)), FACING)
@@ -144,7 +144,7 @@ def test_small_dark_and_blurred_tags_are_found_once(side: float, blur: float, li
         assert not set(seen.ids.tolist()) - set(numbers)
         assert np.bincount(seen.ids, minlength=6).max() <= 2
         found += len(seen)
-    assert found >= 16, "of 18"
+    assert found >= 11, "of 12"
 
 
 def test_empty_pictures_and_wrong_questions() -> None:

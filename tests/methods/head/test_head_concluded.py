@@ -52,6 +52,7 @@ def test_numbers_noise_and_verdicts_are_those_of_batch_and_the_course_is_that_of
     np.testing.assert_array_equal(history.values[:-1], of_run.values[:-1])
     np.testing.assert_array_equal(history.sigmas[-1], concluded.estimate.sigmas)
     assert concluded.solver_difference is not None
+    assert online.solver_difference is None
     assert not online.estimate.concluded
     assert online.innovations
     assert not concluded.innovations
