@@ -25,7 +25,7 @@ from tests.support.command import Command, Run
 
 @pytest.fixture(scope="module")
 def scenario() -> HeadScenario:
-    short = {"duration_s": 15.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 10.0}
+    short = {"duration_s": 8.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 10.0}
     return load_scenario(HeadScenario, "head_mounts").model_copy(update=short)
 
 
@@ -266,7 +266,7 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
 
 @pytest.mark.parametrize("where", ["reading", "importing", "writing"])
 def test_ctrl_c_is_silent_and_leaves_nothing(
-    alidade: Command, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+    alidade: Command, brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     def interrupted(*_: object, **__: object) -> None:
         if where == "importing":
@@ -279,7 +279,7 @@ def test_ctrl_c_is_silent_and_leaves_nothing(
         else "alidade.pipelines.applications.session.open_recording"
     )
     monkeypatch.setattr(target, interrupted)
-    run = alidade("calibrate", session, "--out", tmp_path / "out")
+    run = alidade("calibrate", brief, "--out", tmp_path / "out")
     assert (run.code, run.out, run.err) == (130, "", "")
     assert not list(tmp_path.iterdir())
 

@@ -36,7 +36,7 @@ SWAY = EulerMotion(
     pitch=[Swing(amplitude_deg=8, frequency_hz=0.31)],
     roll=[Swing(amplitude_deg=12, frequency_hz=0.21)],
 )
-LOS = LosScenario(duration_s=30.0, carrier=SWAY, image_rate_hz=10.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+LOS = LosScenario(duration_s=30.0, carrier=SWAY, image_rate_hz=6.0, gyro_rate_hz=100.0, gimbal_rate_hz=50.0)
 HEAD = HeadScenario(
     duration_s=30.0, platform=SWAY, helmet_mount_deg=(3.0, -4.0, 2.0), gyro_rate_hz=200.0, vision_rate_hz=20.0
 )

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass
-class Run:
+class Run(NamedTuple):
     code: int
     out: str
     err: str

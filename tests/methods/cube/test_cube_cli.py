@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,33 +14,14 @@ import pytest
 from ruamel.yaml import YAML
 
 from alidade.factors import so3
-from alidade.pipelines.applications import cli
 from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.cube.recording import CubeData, Sightings
 from alidade.pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.vision.camera import Camera
+from tests.support.command import Command
 
 SCENARIO = CubeScenario(poses=8, static_s=1.5, turn_rad_s=1.5, camera=CubeCamera(rate_hz=5.0))
 CONFIG = cube_config(SCENARIO)
-Command = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def alidade(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process; its exit code and what it printed."""
-
-    def run(*arguments: str | Path) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["alidade", *map(str, arguments)])
-        capsys.readouterr()
-        try:
-            cli.main()
-            code: Any = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        captured = capsys.readouterr()
-        return int(code), captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

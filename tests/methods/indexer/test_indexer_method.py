@@ -30,6 +30,7 @@ from tests.support.builders import IDEAL
 
 # The whole claim of the publication, and the tenth part of it that the graph must hold.
 MILLIDEGREE = np.deg2rad(1e-3)
+RATES = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
 
 
 def _solve(scenario: IndexerScenario, seed: int) -> tuple[Estimate, np.ndarray]:
@@ -41,8 +42,7 @@ def _solve(scenario: IndexerScenario, seed: int) -> tuple[Estimate, np.ndarray]:
 
 def _scenario(name: str) -> IndexerScenario:
     """Of ideal sensors, and no more samples than it takes."""
-    coarse = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
-    return load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": IDEAL, **coarse})
+    return load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": IDEAL, **RATES})
 
 
 def _assert_consistent(estimate: Estimate, probability: float = 1e-3) -> None:
@@ -185,9 +185,7 @@ def _reported(estimate: Estimate) -> list[tuple[Quantity, float, float]]:
 @pytest.mark.parametrize(("runs", "name"), [(2, "nominal"), pytest.param(50, "nominal", marks=pytest.mark.slow)])
 def test_errors_of_real_sensors_agree_with_the_covariance(runs: int, name: str) -> None:
     """Mean NEES over the runs inside its 99 % interval, with effects drawn from what is assumed of them."""
-    scenario = load_scenario(IndexerScenario, f"indexer_{name}").model_copy(
-        update={"sensors": Sensors(), "gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
-    )
+    scenario = load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": Sensors(), **RATES})
     nees = []
     for seed in range(runs):
         estimate, error = _solve(scenario, seed)
@@ -281,7 +279,7 @@ def test_real_turns_by_hand_against_imucal(shared_data: Path) -> None:
 
 def test_families_account_for_every_degree_of_freedom() -> None:
     """A bias that hardly walks leaves nothing over: its tight rows take no freedom from the turns."""
-    scenario = load_scenario(IndexerScenario, "indexer_nominal")
+    scenario = load_scenario(IndexerScenario, "indexer_nominal").model_copy(update=RATES)
     data, _ = simulate_indexer(scenario, 0)
     estimate = solve_batch(problem(data, load_config(indexer_config(scenario).encode())))
     assert estimate.chi_square is not None

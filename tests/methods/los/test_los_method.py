@@ -130,7 +130,8 @@ def _drifting(duration_s: float, skew: float) -> LosScenario:
 
 
 def test_pictures_whose_clock_drifts_are_looked_for_where_they_were_taken() -> None:
-    scenario = _drifting(400.0, 1e-3)
+    rates = {"image_rate_hz": 2.5, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0}
+    scenario = _drifting(400.0, 1e-3).model_copy(update=rates)
     data, truth = simulate_los(scenario, 2)
     estimate = solve_batch(problem(data, _config(scenario)))
     assert _nees(estimate, truth) < quantile(1 - 1e-3, len(estimate.values))
