@@ -67,6 +67,7 @@ TURNING = TumbleScenario(
     accelerometer=TumbledAccelerometer(rate_hz=25.0),
     gyro=TumbledGyro(rate_hz=25.0),
 )
+AT_50 = {"gyro": {"rate_hz": 50.0}, "accelerometer": {"rate_hz": 50.0}}
 RESTING = TumbleScenario(attitudes=25, rest_s=1.5, accelerometer=TumbledAccelerometer(rate_hz=50.0))
 
 
@@ -260,14 +261,14 @@ def test_compass_of_any_grade_and_motion_is_consistent(
 
 @pytest.mark.slow
 def test_tumbling_with_rests_and_a_gyro_is_consistent_over_many_seeds() -> None:
-    _assert_consistent(replace_scenario(TURNING, rest_s=1.5), range(24))
+    _assert_consistent(replace_scenario(TURNING, rest_s=1.5, **AT_50), range(24))
 
 
 @pytest.mark.slow
 def test_offsets_that_follow_the_temperature_are_consistent() -> None:
     """Of the accelerometer and of the gyro beside it."""
     warming = TURNING.model_copy(update={"temperature": Warming(rise_k=15.0, time_constant_s=30.0)})
-    _assert_consistent(replace_scenario(warming, rest_s=1.5), range(24))
+    _assert_consistent(replace_scenario(warming, rest_s=1.5, **AT_50), range(24))
 
 
 def _counted(rests: int, seed: int) -> tuple[float, int]:
@@ -670,9 +671,7 @@ def test_the_mean_of_points_of_an_ellipsoid_lies_inside_it() -> None:
     np.testing.assert_allclose(sagitta(means, scatter, numbers), inside, rtol=0.03)
 
 
-SECOND = TumbleScenario(
-    attitudes=20, rest_s=1.0, gyro=TumbledGyro(rate_hz=50.0), accelerometer=TumbledAccelerometer(rate_hz=50.0)
-)
+SECOND = TumbleScenario(attitudes=20, rest_s=1.0, gyro=TumbledGyro(), accelerometer=TumbledAccelerometer())
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
@@ -686,7 +685,7 @@ def test_rests_of_a_second_are_found_and_turning_points_are_none(seed: int) -> N
 
 @pytest.mark.parametrize("seed", [3, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_nothing_changed_in_a_clean_recording_with_rests_of_a_second(seed: int) -> None:
-    simulated = _simulated(SECOND, seed)
+    simulated = _simulated(replace_scenario(SECOND, **AT_50), seed)
     calibration = Session.of(TUMBLE, simulated).calibrate(report=False)
     assert calibration.status == "calibrated"
     found = {name: each for name, each in calibration.parameters.items() if each.sigma}
@@ -696,7 +695,7 @@ def test_nothing_changed_in_a_clean_recording_with_rests_of_a_second(seed: int) 
 
 def test_gyro_clipped_at_its_range_is_noticed(tmp_path: Path) -> None:
     """Scale errors of -7.7 % were blamed."""
-    simulated = _simulated(SECOND, 2)
+    simulated = _simulated(replace_scenario(SECOND, **AT_50), 2)
     clipped = replace(simulated.data, gyro=np.clip(simulated.data.gyro, -2.0, 2.0))
     TUMBLE.write(tmp_path / "s.mcap", replace(simulated, data=clipped))
     calibration = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None).calibrate(report=False)
