@@ -80,7 +80,10 @@ def _factor(
 @pytest.mark.parametrize(
     ("names", "width", "size", "off"),
     [
-        ((CORE, ALL)[i], (2, 3)[j], (0.5, 1e-6)[k], (0.3, 1e-7)[(i + j + k) % 2])
+        pytest.param(
+            *((CORE, ALL)[i], (2, 3)[j], (0.5, 1e-6)[k], (0.3, 1e-7)[(i + j + k) % 2]),
+            marks=[pytest.mark.slow] * (j != k),
+        )
         for i, j, k in product(range(2), repeat=3)
     ],
 )
