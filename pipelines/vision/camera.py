@@ -5,6 +5,7 @@ Optical frame: x right, y down, z forward. Integer pixel coordinates are pixel c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -125,16 +126,7 @@ class Camera:
 
     def project(self, points: ArrayLike) -> Array:
         """Project points (..., 3) in the optical frame, any unit, to pixels (..., 2); NaN behind the camera."""
-        points = np.asarray(points, dtype=float)
-        if self.distortion_model == "equidistant":
-            rho = np.hypot(points[..., 0], points[..., 1])
-            distorted, _ = self._angle(np.arctan2(rho, points[..., 2]))
-            scale = np.where(rho > 0, distorted / np.where(rho > 0, rho, 1.0), 1.0)
-            flat = points[..., :2] * scale[..., None]
-        else:
-            z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-            flat, _ = self._distort(points[..., :2] / z)
-        return np.asarray(flat * self.focal + self.centre)
+        return np.asarray(self._distorted(np.asarray(points, dtype=float))[0] * self.focal + self.centre)
 
     @property
     def intrinsics(self) -> Array:
@@ -149,57 +141,48 @@ class Camera:
 
     def project_with_jacobian(self, points: Array) -> tuple[Array, Array]:
         """Pixels (..., 2) as `project`, with their Jacobian (..., 2, 3) by the points; NaN behind the camera."""
+        flat, jacobian = self._distorted(points)
+        return flat * self.focal + self.centre, self.focal[:, None] * jacobian()
+
+    def _distorted(self, points: Array) -> tuple[Array, Callable[[], Array]]:
+        """Distorted z = 1 coordinates (..., 2) of points, and a function that gives their Jacobian (..., 2, 3)."""
         z = points[..., 2]
-        if self.distortion_model == "equidistant":
-            flat = points[..., :2]
-            rho = np.hypot(flat[..., 0], flat[..., 1])
-            distorted, slope = self._angle(np.arctan2(rho, z))
-            # On the axis the limit of both terms is that of a pinhole.
-            scale = np.where(rho > 0, distorted / np.where(rho > 0, rho, 1.0), 1.0 / z)
-            out = flat / np.where(rho > 0, rho, 1.0)[..., None]
-            square = rho**2 + z**2
-            J = np.zeros((*points.shape[:-1], 2, 3))
-            J[..., :2] = scale[..., None, None] * np.eye(2)
-            J[..., :2] += ((slope * z / square) - scale)[..., None, None] * out[..., :, None] * out[..., None, :]
-            J[..., 2] = -(slope * rho / square)[..., None] * out
-            distorted = scale[..., None] * flat
-        else:
-            z = np.where(z > 0, z, np.nan)
-            flat = points[..., :2] / z[..., None]
+        J = np.empty((*points.shape[:-1], 2, 3))
+        if self.distortion_model != "equidistant":
+            z = np.where(z > 0, z, np.nan)[..., None]
+            flat = points[..., :2] / z
             distorted, by_flat = self._distort(flat)
-            J = np.empty((*points.shape[:-1], 2, 3))
-            J[..., :2] = by_flat / z[..., None, None]
-            J[..., 2] = -(J[..., :2] @ flat[..., None])[..., 0]
-        return distorted * self.focal + self.centre, self.focal[:, None] * J
+
+            def pinhole() -> Array:
+                J[..., :2] = by_flat / z[..., None]
+                J[..., 2] = -(J[..., :2] @ flat[..., None])[..., 0]
+                return J
+
+            return distorted, pinhole
+        rho = np.hypot(points[..., 0], points[..., 1])
+        angle, slope = self._angle(np.arctan2(rho, z))
+        # On the axis the limits are those of a pinhole.
+        scale = np.where(rho > 0, angle, 1.0) / np.where(rho > 0, rho, z)
+
+        def equidistant() -> Array:
+            out, square = points[..., :2] / np.where(rho > 0, rho, 1.0)[..., None], rho**2 + z**2
+            radial = (slope * z / square - scale)[..., None, None] * out[..., :, None] * out[..., None, :]
+            J[..., :2] = scale[..., None, None] * np.eye(2) + radial
+            J[..., 2] = -(slope * rho / square)[..., None] * out
+            return J
+
+        return scale[..., None] * points[..., :2], equidistant
 
     def by_intrinsics(self, points: Array) -> Array:
-        """Jacobian (..., 2, 4 + n) of projected points (..., 3) by the `intrinsics`; NaN behind the camera."""
-        flat = (self.project(points) - self.centre) / self.focal
-        J = np.zeros((*flat.shape, 4 + len(self.coefficients)))
-        J[..., 0, 0], J[..., 1, 1] = flat[..., 0], flat[..., 1]
-        J[..., 0, 2] = J[..., 1, 3] = 1.0
-        J[..., 4:] = self.focal[:, None] * self._by_coefficients(points)
-        return J
+        """Jacobian (..., 2, 4 + n) of projected points (..., 3) by the `intrinsics`, by OpenCV; NaN behind it."""
+        import cv2
 
-    def _by_coefficients(self, points: Array) -> Array:
-        """Jacobian (..., 2, n) of the distorted z = 1 coordinates by the distortion coefficients."""
-        x, y, z = points[..., 0], points[..., 1], points[..., 2]
-        if self.distortion_model == "equidistant":
-            rho = np.hypot(x, y)
-            theta = np.arctan2(rho, z)
-            out = points[..., :2] / np.where(rho > 0, rho, 1.0)[..., None]
-            return np.stack([out * (theta ** (2 * i + 3))[..., None] for i in range(4)], axis=-1)
-        z = np.where(z > 0, z, np.nan)
-        x, y = x / z, y / z
-        u, r2 = np.stack([x, y], axis=-1), x * x + y * y
-        k1, k2, _, _, k3, k4, k5, k6 = [*self.coefficients.tolist(), 0.0, 0.0, 0.0][:8]
-        over, under = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        up, down = 1 / under, -over / under**2
-        p1 = np.stack([2 * x * y, r2 + 2 * y * y], axis=-1)
-        p2 = np.stack([r2 + 2 * x * x, 2 * x * y], axis=-1)
-        radial = [u * (factor * r2**i)[..., None] for factor in (up, down) for i in (1, 2, 3)]
-        columns = [radial[0], radial[1], p1, p2, *radial[2:]]
-        return np.stack(columns[: len(self.coefficients)], axis=-1)
+        flat, still = np.where(points[..., 2:] > 0, points, np.nan).reshape(-1, 1, 3), np.zeros(3)
+        project = cv2.fisheye.projectPoints if self.distortion_model == "equidistant" else cv2.projectPoints
+        J = project(flat, still, still, self.K, self.coefficients)[1]
+        # Fisheye: f, c, k, turn, ...; else: turn, shift, f, c, k.
+        first = 0 if self.distortion_model == "equidistant" else 6
+        return np.asarray(J[:, first : first + len(self.intrinsics)].reshape(*points.shape[:-1], 2, -1))
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit directions (..., 3) in the optical frame of pixels (..., 2).

@@ -17,15 +17,7 @@ from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.layout.bundle import (
-    LINE_TIME,
-    Fit,
-    fitted,
-    moved,
-    refined_pictures,
-    shutters,
-    with_intrinsics,
-)
+from alidade.pipelines.vision.layout.bundle import LINE_TIME, Additional, Fit, fitted, moved, refined_pictures
 from alidade.pipelines.vision.layout.covariance import Covariance, covariance
 from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_resolved, joint
 from alidade.pipelines.vision.layout.sights import Gathered, Shots, Sights, gathered, linearized
@@ -114,10 +106,8 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
         if int(given.ids[0]) in wrong:
             raise InputError(f"tag {given.ids[0]}, which defines the body's frame: {wrong[int(given.ids[0])]}")
         unplaced, body = unplaced | wrong, fit.bundle.body
-    bundle, whole = fit.bundle, fit.whole
-    additional = with_intrinsics(bundle) if refine_camera else shutters(bundle)
-    fit = replace(fitted(bundle, views.sights[whole], 0, additional), whole=whole)
-    return _layout(views, fit, unplaced)
+    additional = Additional.of(fit.bundle, shutters=True, intrinsics=refine_camera)
+    return _layout(views, fitted(fit.bundle, views.sights, fit.whole, additional), unplaced)
 
 
 def _unconnected(views: Gathered, given: TagBody) -> dict[int, str]:
@@ -174,13 +164,13 @@ def _unusable(views: Gathered, fit: Fit) -> dict[int, str]:
 
 
 def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
-    known = covariance(fit, 0, views.view)
+    known = covariance(fit, views.view)
     if known.correction is not None:
         stay = np.zeros((len(fit.bundle.cRb), 6))
         there = moved(fit.bundle, known.correction, stay, fit.additional)
         bundle, *_ = refined_pictures(there, fit.sights)
         fit = replace(fit, bundle=bundle, rows=linearized(bundle, fit.sights))
-    body = fit.bundle.body
+    body, tags = fit.bundle.body, 6 * (len(fit.bundle.body.ids) - 1)
     seen = {}
     for k, tag in enumerate(body.ids.tolist()):
         mine = fit.sights.tag == k
@@ -188,7 +178,7 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
         seen[tag] = TagSeen(int(mine.sum()), fit.rms_px(mine), rejected, float(known.inflation[k]))
     return Layout(
         body=body,
-        covariance=known.tags,
+        covariance=known.whole[:tags, :tags],
         sigma_px=fit.sigma_px,
         rms_px=fit.rms_px(),
         frames=len(np.unique(fit.sights.picture)),
@@ -196,20 +186,19 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
         unplaced=dict(sorted(unplaced.items())),
         cameras=fit.bundle.cameras,
         given_cameras=views.start.cameras,
-        camera_sigma=fit.additional.parts(known.sigma)[0] if fit.additional.intrinsics.any() else None,
-        with_camera=_with_camera(known, fit),
+        camera_sigma=known.sigma[:, :-1] if known.sigma[:, :-1].any() else None,
+        with_camera=_with_camera(known, fit, tags),
         line_time=fit.bundle.line_time,
-        line_time_sigma=fit.additional.parts(known.sigma)[1],
+        line_time_sigma=known.sigma[:, -1],
         bend=known.bend,
     )
 
 
-def _with_camera(known: Covariance, fit: Fit) -> Array | None:
+def _with_camera(known: Covariance, fit: Fit, tags: int) -> Array | None:
     """Covariance of tags and camera in a layout's form; focal share as the mean of both focal lengths' shares."""
     cameras = fit.bundle.cameras
-    if not fit.additional.intrinsics.any() or len(cameras) > 1:
+    if not fit.additional.sigmas[:, :-1].any() or len(cameras) > 1:
         return None
-    tags = len(known.tags)
     pick = np.zeros((tags + 3, len(known.whole)))
     pick[:tags, :tags] = np.eye(tags)
     pick[tags, tags : tags + 2] = 0.5 / cameras[0].focal

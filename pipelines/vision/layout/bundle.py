@@ -12,11 +12,9 @@ the body moves in each picture, for shutters that roll, follows from its poses i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from alidade.factors import so3
 from alidade.factors.array import Array
@@ -35,90 +33,72 @@ class Additional:
 
     Attributes:
         given: the cameras that the priors are about; their shutters are taken not to roll.
-        intrinsics: (c, n) of fx, fy, cx, cy, px, and of the distortion coefficients; with cameras of fewer coefficients
-            the last columns are 0.
-        line_time: (c,) s.
+        sigmas: (c, n + 1) of fx, fy, cx, cy, px, of the distortion coefficients, and of the line time, s; with cameras
+            of fewer coefficients the columns before the last are 0.
     """
 
     given: tuple[Camera, ...]
-    intrinsics: Array
-    line_time: Array
+    sigmas: Array
 
-    @property
-    def sigma(self) -> Array:
-        """Prior sigmas (k,) of all additional parameters, the intrinsics first."""
-        return np.concatenate([self.intrinsics.ravel(), self.line_time])
+    @classmethod
+    def of(cls, bundle: Bundle, shutters: bool = False, intrinsics: bool = False) -> Additional:
+        """Free line times, sigma 30 us about zero, and intrinsics, near their calibration: focal 0.5 %, centre 5 px.
+
+        Each coefficient of the distortion has the sigma that moves the picture's farthest corner by a pixel.
+        """
+        out = np.zeros((len(bundle.cameras), max(len(camera.intrinsics) for camera in bundle.cameras) + 1))
+        out[:, -1] = LINE_TIME if shutters else 0.0
+        for row, camera in zip(out, bundle.cameras if intrinsics else (), strict=False):
+            frame = np.array([[x, y] for x in (0.0, camera.width - 1.0) for y in (0.0, camera.height - 1.0)])
+            rays = camera.rays(frame)
+            # Where distortion turns back before the corner, the half way there serves.
+            rays = np.where(np.isfinite(rays), rays, camera.rays(0.5 * (frame + camera.centre)))
+            moves = np.linalg.norm(camera.by_intrinsics(rays), axis=-2).max(axis=0)
+            row[:2], row[2:4] = _FOCAL * camera.focal, _CENTRE_PX
+            row[4 : len(moves)] = _DISTORTION_PX / np.maximum(moves[4:], 1e-9)
+        return cls(bundle.cameras, out)
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """Mask (k,) of the additional parameters that are estimated."""
-        return np.asarray(self.sigma > 0.0)
+        return np.asarray(self.sigmas.ravel() > 0.0)
 
-    def parts(self, numbers: Array) -> tuple[Array, Array]:
-        """Split numbers (..., k) into intrinsics (..., c, n) and line times (..., c)."""
-        c, n = self.intrinsics.shape
-        return numbers[..., : c * n].reshape(*numbers.shape[:-1], c, n), numbers[..., c * n :]
+    @property
+    def precision(self) -> Array:
+        """Prior information of those that are estimated."""
+        return np.asarray(self.sigmas.ravel()[self.free] ** -2.0)
 
     def off(self, bundle: Bundle) -> Array:
-        """Deviation (k,) of a bundle's intrinsics and line times from their prior means."""
-        out = np.zeros_like(self.intrinsics)
+        """Deviation of a bundle's estimated parameters from their prior means."""
+        out = np.zeros_like(self.sigmas)
         for row, now, given in zip(out, bundle.cameras, self.given, strict=True):
             row[: len(now.intrinsics)] = now.intrinsics - given.intrinsics
-        return np.concatenate([out.ravel(), bundle.line_time])
+        out[:, -1] = bundle.line_time
+        return out.ravel()[self.free]
 
     def moved(self, bundle: Bundle, step: Array) -> Bundle:
         """Add a step (k,) to the bundle's additional parameters."""
-        intrinsics, line_time = self.parts(step)
+        rows = step.reshape(self.sigmas.shape)
         cameras = tuple(
-            camera.with_intrinsics(camera.intrinsics + row[: len(camera.intrinsics)]) if row.any() else camera
-            for camera, row in zip(bundle.cameras, intrinsics, strict=True)
+            camera.with_intrinsics(camera.intrinsics + row[: len(camera.intrinsics)]) if row[:-1].any() else camera
+            for camera, row in zip(bundle.cameras, rows, strict=True)
         )
-        return replace(bundle, cameras=cameras, line_time=bundle.line_time + line_time)
+        return replace(bundle, cameras=cameras, line_time=bundle.line_time + rows[:, -1])
 
     def rows(self, bundle: Bundle, sights: Sights, rows: Rows) -> Array:
         """Jacobian (m, 8, k) of the reprojection errors by the additional parameters."""
         m = len(sights)
-        out = np.zeros((m, 4, 2, len(self.sigma)))
-        intrinsics, line_time = self.parts(out)
+        out = np.zeros((m, 4, 2, *self.sigmas.shape))
         by_time = (rows.by_point @ rows.velocity[..., None])[..., 0] * bundle.lines(sights)[..., None]
-        for k, camera in enumerate(bundle.cameras):
+        for k in np.unique(bundle.camera[sights.picture]).tolist():
             mine = bundle.camera[sights.picture] == k
-            by = camera.by_intrinsics(rows.points[mine])
-            intrinsics[mine, :, :, k, : by.shape[-1]] = np.nan_to_num(by) / sights.sigma[mine, None, None, None]
-            line_time[mine, :, :, k] = by_time[mine]
+            by = bundle.cameras[k].by_intrinsics(rows.points[mine])
+            out[mine, :, :, k, : by.shape[-1]] = np.nan_to_num(by) / sights.sigma[mine, None, None, None]
+            out[mine, :, :, k, -1] = by_time[mine]
         return out.reshape(m, 8, -1)
 
 
-def nothing(bundle: Bundle) -> Additional:
-    """Return additional parameters of a bundle, all fixed."""
-    cameras = bundle.cameras
-    widest = max(len(camera.intrinsics) for camera in cameras)
-    return Additional(cameras, np.zeros((len(cameras), widest)), np.zeros(len(cameras)))
-
-
-def shutters(bundle: Bundle) -> Additional:
-    """Return free line times, with a prior of 30 us about zero, as for a phone's rolling shutter."""
-    return replace(nothing(bundle), line_time=np.full(len(bundle.cameras), LINE_TIME))
-
-
-def with_intrinsics(bundle: Bundle) -> Additional:
-    """Return free line times and intrinsics, near their calibration: focal lengths 0.5 %, centre 5 px.
-
-    Each coefficient of the distortion has the sigma that moves the picture's farthest corner by a pixel.
-    """
-    out = shutters(bundle)
-    for row, camera in zip(out.intrinsics, bundle.cameras, strict=True):
-        frame = np.array([[x, y] for x in (0.0, camera.width - 1.0) for y in (0.0, camera.height - 1.0)])
-        rays = camera.rays(frame)
-        # Where distortion turns back before the corner, the half way there serves.
-        rays = np.where(np.isfinite(rays), rays, camera.rays(0.5 * (frame + camera.centre)))
-        moves = np.linalg.norm(camera.by_intrinsics(rays), axis=-2).max(axis=0)
-        row[:2], row[2:4] = _FOCAL * camera.focal, _CENTRE_PX
-        row[4 : len(moves)] = _DISTORTION_PX / np.maximum(moves[4:], 1e-9)
-    return out
-
-
-_STEPS = 40
+_STEPS, _POSE_STEPS = 40, 15
 _DIAGONAL = np.arange(6)
 # A step that changes the cost by less than this share ends the adjustment.
 _SETTLED = 1e-10
@@ -126,86 +106,57 @@ _SETTLED = 1e-10
 _STEADY = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Normal:
-    """Normal equations of a bundle, reduced to the shared unknowns by elimination of the pictures' poses.
-
-    Attributes:
-        free: (p,) which of the numbers shared by pictures are adjusted: six a tag, then the additional ones.
-        information: (q, q) of those that are free.
-        projection: (q,) their gradient.
-        across: (f, 6, q) picture's poses against them.
-        inverse: (f, 6, 6) of the pictures' own blocks.
-        gradient: (f, 6) of the pictures.
-    """
-
-    free: NDArray[np.bool_]
-    information: Array
-    projection: Array
-    across: Array
-    inverse: Array
-    gradient: Array
-
-    def step(self) -> tuple[Array, Array]:
-        """Solve for the step of the shared unknowns (p,), zero where fixed, and of the pictures' poses (f, 6)."""
-        moved = -np.linalg.solve(self.information, self.projection)
-        pictures = -np.einsum("fij,fj->fi", self.inverse, self.gradient + self.across @ moved)
-        shared = np.zeros(len(self.free))
-        shared[self.free] = moved
-        return shared, pictures
+def free_columns(bundle: Bundle, fixed: int, additional: Additional) -> NDArray[np.bool_]:
+    """Mask (p,) of the shared unknowns, six a tag, then the additional ones, that are estimated."""
+    return np.concatenate([np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6), additional.free])
 
 
 def shared_rows(bundle: Bundle, sights: Sights, rows: Rows, additional: Additional) -> Array:
     """Jacobian (m, 8, p) of the errors by the shared unknowns: the tags' poses, then additional parameters."""
-    m, tags = len(sights), len(bundle.body.ids)
-    out = np.zeros((m, 8, 6 * tags))
+    m, tags, k = len(sights), len(bundle.body.ids), additional.sigmas.size
+    out = np.zeros((m, 8, 6 * tags + k))
     columns = 6 * sights.tag[:, None] + np.arange(6)
     np.put_along_axis(out, np.broadcast_to(columns[:, None], (m, 8, 6)), rows.by_tag, axis=2)
-    return np.concatenate([out, additional.rows(bundle, sights, rows)], axis=2) if additional.free.any() else out
-
-
-def normal_equations(
-    bundle: Bundle, sights: Sights, rows: Rows, weights: Array, fixed: int, additional: Additional, damping: float = 0.0
-) -> Normal:
-    """Build normal equations of weighted errors; tag `fixed` stays, the damping is relative (Levenberg)."""
-    f = len(bundle.cRb)
-    own, gradient = of_pictures(sights, rows, weights, f)
-    A, J = _blocks(rows.by_picture, sights.picture, f), _blocks(rows.by_tag, sights.tag, len(bundle.body.ids))
     if additional.free.any():
-        J = sparse.hstack([J, additional.rows(bundle, sights, rows).reshape(J.shape[0], -1)], "csr")
-    free = np.concatenate([np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6), additional.free])[: J.shape[1]]
-    J = J[:, free]
-    weighted = sparse.diags_array(np.repeat(weights, 8)) @ J
-    information, vector = (J.T @ weighted).toarray(), weighted.T @ rows.miss.ravel()
-    across = (A.T @ weighted).toarray().reshape(f, 6, -1)
-    priors = np.arange(J.shape[1] - additional.free.sum(), J.shape[1])
-    precision = additional.sigma[additional.free] ** -2.0
-    information[priors, priors] += precision
-    vector[priors] += precision * additional.off(bundle)[additional.free]
-    own[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping
-    diagonal = np.diag_indices_from(information)
-    # A tag of which nothing is left stays where it is.
-    information[diagonal] = np.where(information[diagonal] > 0.0, (1.0 + damping) * information[diagonal], 1.0)
-    inverse = np.zeros_like(own)
-    seen = own[:, 0, 0] > 0.0
-    inverse[seen] = np.linalg.inv(own[seen])
-    flat = (inverse @ across).reshape(6 * f, -1)
-    information = information - across.reshape(6 * f, -1).T @ flat
-    vector = vector - flat.T @ gradient.ravel()
-    return Normal(free, np.asarray(information, dtype=float), vector, across, inverse, gradient)
+        out[..., 6 * tags :] = additional.rows(bundle, sights, rows)
+    return out
 
 
-def _blocks(values: Array, columns: Index, count: int) -> Any:
-    """Sparse matrix (8 m, 6 count) from each sight's Jacobian (m, 8, 6) by its picture's or tag's pose."""
-    m = len(values)
-    return sparse.bsr_array((values, columns, np.arange(m + 1)), shape=(8 * m, 6 * count)).tocsr()
-
-
-def of_pictures(sights: Sights, rows: Rows, weights: Array, f: int) -> tuple[Array, Array]:
-    """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses, the tags fixed."""
+def of_pictures(sights: Sights, rows: Rows, columns: Array, weights: Array, f: int) -> tuple[Array, Array]:
+    """Information (f, 6, 6) of the pictures' poses, and their products (f, 6, p) with columns (m, 8, p) of errors."""
     At = np.swapaxes(rows.by_picture, 1, 2) * weights[:, None, None]
-    gradient = sights.by_picture((At @ rows.miss[..., None])[..., 0], f)
-    return sights.by_picture(At @ rows.by_picture, f), gradient
+    return sights.by_picture(At @ rows.by_picture, f), sights.by_picture(At @ columns, f)
+
+
+def pose_steps(
+    bundle: Bundle, sights: Sights, rows: Rows, columns: Array, weights: Array, damping: float = 0.0
+) -> tuple[Array, Array]:
+    """Least-squares pose changes (f, 6, p) of the pictures for columns (m, 8, p) of errors, and their right sides."""
+    own, across = of_pictures(sights, rows, columns, weights, len(bundle.cRb))
+    own[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping
+    own[own[:, 0, 0] == 0.0] = np.eye(6)
+    return np.asarray(np.linalg.solve(own, across), dtype=float), across
+
+
+def _step(
+    bundle: Bundle, sights: Sights, rows: Rows, weights: Array, fixed: int, additional: Additional, damping: float
+) -> tuple[Array, Array]:
+    """Step of the shared unknowns (p,) and the pictures' poses (f, 6); the damping is relative (Levenberg)."""
+    free = free_columns(bundle, fixed, additional)
+    J = shared_rows(bundle, sights, rows, additional)[..., free]
+    q, columns = J.shape[2], np.concatenate([J, rows.miss[..., None]], axis=2)
+    poses, across = pose_steps(bundle, sights, rows, columns, weights, damping)
+    system = (weights[:, None, None] * J).reshape(-1, q).T @ columns.reshape(-1, q + 1)
+    priors, diagonal = np.arange(q - additional.free.sum(), q), np.arange(q)
+    system[priors, priors] += additional.precision
+    system[priors, -1] += additional.precision * additional.off(bundle)
+    # A tag of which nothing is left stays where it is.
+    own = system[diagonal, diagonal]
+    system[diagonal, diagonal] = np.where(own > 0.0, (1.0 + damping) * own, 1.0)
+    system -= across[..., :-1].reshape(-1, q).T @ poses.reshape(-1, q + 1)
+    shared = np.zeros(len(free))
+    shared[free] = step = -np.linalg.solve(system[:, :-1], system[:, -1])
+    return shared, -(poses[..., -1] + poses[..., :-1] @ step)
 
 
 def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional) -> Bundle:
@@ -217,13 +168,13 @@ def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional
         bRt=so3.multiply(bundle.body.bRt, so3.exp(step[:, :3])),
         position=bundle.body.position + step[:, 3:],
     )
-    there = replace(
-        bundle,
-        body=body,
-        cRb=so3.multiply(bundle.cRb, so3.exp(pictures[:, :3])),
-        position=bundle.position + pictures[:, 3:],
-    )
-    return additional.moved(there, shared[6 * tags :]) if len(shared) > 6 * tags else there
+    return additional.moved(replace(with_poses_moved(bundle, pictures), body=body), shared[6 * tags :])
+
+
+def with_poses_moved(bundle: Bundle, step: Array) -> Bundle:
+    """Apply a step (f, 6) to the pictures' poses."""
+    turned = so3.multiply(bundle.cRb, so3.exp(step[:, :3]))
+    return replace(bundle, cRb=turned, position=bundle.position + step[:, 3:])
 
 
 def adjusted(
@@ -242,8 +193,8 @@ def adjusted(
     rows, damping = linearized(bundle, sights), 1e-4
     cost = _cost(rows, bundle, additional, far)
     for _ in range(steps):
-        normal = normal_equations(bundle, sights, rows, weights(rows, far), fixed, additional, damping)
-        after = moved(bundle, *normal.step(), additional)
+        step = _step(bundle, sights, rows, weights(rows, far), fixed, additional, damping)
+        after = moved(bundle, *step, additional)
         there = linearized(after, sights)
         now = _cost(there, after, additional, far)
         if not now < cost:
@@ -269,52 +220,37 @@ def loss(squares: Array, far: float) -> Array:
 
 
 def _cost(rows: Rows, bundle: Bundle, additional: Additional, far: float) -> float:
-    free = additional.free
-    priors = (additional.off(bundle)[free] / additional.sigma[free]) ** 2
+    priors = additional.precision * additional.off(bundle) ** 2
     return float(loss(rows.squares, far).sum() + priors.sum())
 
 
-def refined_pictures(
-    bundle: Bundle, sights: Sights, far: float = np.inf, steps: int = 15
-) -> tuple[Bundle, Array, Array]:
+def refined_pictures(bundle: Bundle, sights: Sights, far: float = np.inf) -> tuple[Bundle, Array, Array]:
     """Refine each picture's pose with fixed tags; also return costs (f,) and pose information (f, 6, 6)."""
     f = len(bundle.cRb)
-    rows = linearized(bundle, sights)
-    cost, damping = _costs(rows, sights, far, f), np.full(f, 1e-3)
-    own, gradient = of_pictures(sights, rows, weights(rows, far), f)
+
+    def evaluated(there: Bundle, seen: Sights) -> tuple[Array, Array, Array]:
+        rows = linearized(there, seen)
+        costs = np.bincount(seen.picture, loss(rows.squares, far), f)
+        return np.asarray(costs, dtype=float), *of_pictures(seen, rows, rows.miss[..., None], weights(rows, far), f)
+
+    (cost, own, gradient), damping = evaluated(bundle, sights), np.full(f, 1e-3)
     going = own[:, 0, 0] > 0.0
-    for _ in range(steps):
+    for _ in range(_POSE_STEPS):
         seen = sights[going[sights.picture]]
         if not len(seen):
             break
         damped = own[going]
         damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[going, None]
         step = np.zeros((f, 6))
-        step[going] = -np.linalg.solve(damped, gradient[going, :, None])[..., 0]
-        after = replace(
-            bundle,
-            cRb=so3.multiply(bundle.cRb, so3.exp(step[:, :3])),
-            position=bundle.position + step[:, 3:],
-        )
-        there = linearized(after, seen)
-        now = _costs(there, seen, far, f)
+        step[going] = -np.linalg.solve(damped, gradient[going])[..., 0]
+        now, new, slope = evaluated(with_poses_moved(bundle, step), seen)
         better = going & (now < cost)
-        bundle = replace(
-            bundle,
-            cRb=np.where(better[:, None], after.cRb, bundle.cRb),
-            position=np.where(better[:, None], after.position, bundle.position),
-        )
-        new, slope = of_pictures(seen, there, weights(there, far), f)
+        bundle = with_poses_moved(bundle, np.where(better[:, None], step, 0.0))
         own[better], gradient[better] = new[better], slope[better]
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         going &= np.abs(cost - now) > _STEADY * cost
         cost = np.where(better, now, cost)
     return bundle, cost, own
-
-
-def _costs(rows: Rows, sights: Sights, far: float, f: int) -> Array:
-    """Robust cost (f,) of each picture."""
-    return np.asarray(np.bincount(sights.picture, loss(rows.squares, far), f), dtype=float)
 
 
 # Degrees of freedom of the t distribution.
@@ -361,27 +297,22 @@ class Fit:
         free = np.maximum(freedom(self.sights, len(self.weight)), 1.0)
         return np.asarray(np.maximum(1.0 - 2.0 * squares / ((_NU + free) * free), 0.1))
 
-    @property
-    def errors_px(self) -> Array:
-        """Reprojection errors (m, 4, 2) of the sights used, px."""
-        return self.rows.miss.reshape(-1, 4, 2) * self.sights.sigma[:, None, None]
-
     def rms_px(self, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
         """Weighted root mean square reprojection error of some sights, px per axis."""
-        weight = self.weight[self.sights.picture][keep]
-        return float(np.sqrt((weight * (self.errors_px**2).mean(axis=(1, 2))[keep]).sum() / weight.sum()))
+        weight, squares = self.weight[self.sights.picture], self.sights.sigma**2 * self.rows.squares / 8.0
+        return float(np.sqrt((weight * squares)[keep].sum() / weight[keep].sum()))
 
 
-def fitted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -> Fit:
-    """Adjust the bundle by maximum likelihood and reject false detections.
+def fitted(bundle: Bundle, sights: Sights, whole: Index, additional: Additional) -> Fit:
+    """Adjust the bundle by maximum likelihood and reject false detections; the first tag stays.
 
     Args:
         bundle: a start.
         sights: with sigmas that are right among each other.
-        fixed: index of the tag that stays.
+        whole: which of them are looked at.
         additional: what is adjusted beside poses.
     """
-    used = np.ones(len(sights), dtype=bool)
+    sights, used = sights[whole], np.ones(len(whole), dtype=bool)
     # Where the start is it is not yet drawn to what is false.
     squares, sigma = linearized(bundle, sights).squares, None
     for _ in range(_ROUNDS):
@@ -390,10 +321,10 @@ def fitted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -
             break
         used[np.flatnonzero(used)[false]] = False
         used[np.flatnonzero(used)[~sights[used].together]] = False
-        fit = _reweighted(bundle, sights[used], fixed, additional)
+        fit = _reweighted(bundle, sights[used], whole, additional)
         bundle, sigma = fit.bundle, fit.sigma
         squares = fit.rows.squares * (sigma**2 / fit.weight[fit.sights.picture])
-    return replace(fit, whole=np.arange(len(sights)))
+    return fit
 
 
 def _false(sights: Sights, squares: Array, sigma: float | None) -> NDArray[np.bool_]:
@@ -408,7 +339,7 @@ def _false(sights: Sights, squares: Array, sigma: float | None) -> NDArray[np.bo
     return np.asarray(squares > 8.0 * _FAR**2 * variance)
 
 
-def _reweighted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -> Fit:
+def _reweighted(bundle: Bundle, sights: Sights, whole: Index, additional: Additional) -> Fit:
     f, tags = len(bundle.cRb), len(bundle.body.ids)
     free = freedom(sights, f)
     shared = 6.0 * (tags - 1) + additional.free.sum()
@@ -417,17 +348,17 @@ def _reweighted(bundle: Bundle, sights: Sights, fixed: int, additional: Addition
     sigma, weight = 1.0, np.ones(f)
     for _ in range(_ROUNDS):
         scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
-        if additional.line_time.any():
+        if additional.sigmas[:, -1].any():
             bundle = with_motion(bundle, np.unique(sights.picture))
-        bundle, rows = adjusted(bundle, scaled, fixed, additional)
+        bundle, rows = adjusted(bundle, scaled, 0, additional)
         squares = np.bincount(sights.picture, rows.squares, f) * sigma**2 / weight
         before, (sigma, weight) = sigma, _scale(squares, free)
         if abs(sigma / before - 1.0) < _SIGMA_SETTLED:
             break
     scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
-    bundle, rows = adjusted(bundle, scaled, fixed, additional)
+    bundle, rows = adjusted(bundle, scaled, 0, additional)
     sigma_px = sigma * float(np.median(sights.sigma))
-    return Fit(bundle, scaled, rows, weight, sigma, sigma_px, np.arange(len(sights)), additional)
+    return Fit(bundle, scaled, rows, weight, sigma, sigma_px, whole, additional)
 
 
 def freedom(sights: Sights, pictures: int) -> Array:

@@ -26,7 +26,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.array import Array
-from alidade.pipelines.vision.layout.bundle import Fit, normal_equations, shared_rows
+from alidade.pipelines.vision.layout.bundle import Fit, free_columns, pose_steps, shared_rows
 from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights
 from alidade.pipelines.vision.pose import SQUARE
 
@@ -71,15 +71,13 @@ class Covariance:
     """Covariance of a layout and of its additional parameters.
 
     Attributes:
-        tags: (6 (n - 1), 6 (n - 1)), of all tags but the fixed one, rad and m.
-        whole: (q, q) of these tags and of all additional parameters that are adjusted.
-        sigma: (k,) of the additional parameters, 0 of those that stay as they are.
+        whole: (q, q) of all tags after the first, rad and m, and of all additional parameters that are adjusted.
+        sigma: (c, n + 1) of the additional parameters, 0 of those that stay as they are.
         inflation: (n,) by what each tag's sigmas exceed those of independent corners.
         bend: sigma of a tag's corners against a flat square, as a share of its size.
         correction: (6 n + k,) what priors of these move yet, tags first; None where there are none.
     """
 
-    tags: Array
     whole: Array
     sigma: Array
     inflation: Array
@@ -87,36 +85,40 @@ class Covariance:
     correction: Array | None
 
 
-def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
+def covariance(fit: Fit, view: Index) -> Covariance:
     """Compute the covariance of an adjusted bundle.
 
     Args:
         fit: the bundle.
-        fixed: index of the tag that stays.
         view: (f,) pictures in a row in which nothing moved have the same number, ascending.
     """
-    bundle, sights, rows = fit.bundle, fit.sights, fit.rows
-    curved = fit.curvature[sights.picture]
-    information = normal_equations(bundle, sights, rows, curved, fixed, fit.additional).information
+    bundle, sights, rows, additional = fit.bundle, fit.sights, fit.rows, fit.additional
+    n, of_tags, free = len(bundle.body.ids), bend_rows(bundle, sights, rows), free_columns(bundle, 0, additional)
+    J = shared_rows(bundle, sights, rows, additional)[..., free]
+    deformed = np.zeros((len(sights), 8, n, len(DEFORMATIONS)))
+    deformed[np.arange(len(sights)), :, sights.tag] = of_tags
+    columns = np.concatenate([J, deformed.reshape(len(sights), 8, -1)], axis=2)
+    poses, _ = pose_steps(bundle, sights, rows, columns, np.ones(len(sights)))
+    own, by_deformation = np.split(columns - rows.by_picture @ poses[sights.picture], [J.shape[2]], axis=2)
+    # Weights that a picture's tags have in common leave open what its pose takes up.
+    information = np.tensordot(fit.curvature[sights.picture, None, None] * J, own, ((0, 1), (0, 1)))
+    priors = np.arange(J.shape[2] - additional.free.sum(), J.shape[2])
+    information[priors, priors] += additional.precision
     white: Array = np.asarray(np.linalg.inv(information), dtype=float)
-    own, by_deformation = _eliminated(fit, fixed)
     bend, spread = bending(rows.miss, by_deformation, own, white)
     found = _sandwich(fit, own, view, white) + spread
     correction = None
-    free = fit.additional.free
-    if free.any():
+    if additional.free.any():
         found, step = _with_priors(fit, information, found)
-        correction = np.zeros(6 * len(bundle.body.ids) + len(free))
-        of_tags = np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6)
-        correction[np.concatenate([of_tags, free])] = step
-    n, tags = len(bundle.body.ids), 6 * (len(bundle.body.ids) - 1)
+        correction = np.zeros(len(free))
+        correction[free] = step
     inflation = np.ones(n)
-    for k, tag in enumerate(np.flatnonzero(np.arange(n) != fixed)):
-        at = slice(6 * k, 6 * k + 6)
+    for tag in range(1, n):
+        at = slice(6 * tag - 6, 6 * tag)
         inflation[tag] = np.sqrt(np.trace(np.linalg.solve(white[at, at], found[at, at])) / 6.0)
-    sigma = np.zeros(len(free))
-    sigma[free] = np.sqrt(np.diag(found)[tags:])
-    return Covariance(found[:tags, :tags], found, sigma, inflation, bend, correction)
+    sigma = np.zeros(additional.sigmas.size)
+    sigma[additional.free] = np.sqrt(np.diag(found)[6 * n - 6 :])
+    return Covariance(found, sigma.reshape(additional.sigmas.shape), inflation, bend, correction)
 
 
 def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
@@ -128,9 +130,10 @@ def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Arr
         found: (q, q) covariance of its errors but for what the priors bring, (A + P)^-1 S (A + P)^-1.
     """
     additional = fit.additional
-    q, free = len(information), additional.sigma[additional.free]
-    prior = np.zeros(q)
-    prior[q - len(free) :] = free**-2.0
+    q, precision = len(information), additional.precision
+    prior, right = np.zeros((2, q))
+    prior[q - len(precision) :] = precision
+    right[q - len(precision) :] = precision * additional.off(fit.bundle)
     # In units of A + P, which is positive definite even where pictures alone have no information.
     L = np.linalg.cholesky(information)
     back = np.linalg.inv(L)
@@ -138,26 +141,8 @@ def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Arr
     A, S = np.eye(q) - P, L.T @ found @ L + _LEAST_VARIANCE * np.eye(q)
     weighed = A @ np.linalg.inv(S)
     covariance = np.linalg.inv(weighed @ A + P)
-    right = np.zeros(q)
-    right[q - len(free) :] = prior[q - len(free) :] * additional.off(fit.bundle)[additional.free]
     step = -covariance @ ((np.eye(q) - weighed) @ (back @ right))
     return np.asarray(back.T @ covariance @ back), np.asarray(back.T @ step)
-
-
-def _eliminated(fit: Fit, fixed: int) -> tuple[Array, Array]:
-    """Jacobian (m, 8, q) by shared unknowns and Jacobian by tag deformations, picture poses eliminated."""
-    bundle, sights, rows = fit.bundle, fit.sights, fit.rows
-    normal = normal_equations(bundle, sights, rows, np.ones(len(sights)), fixed, fit.additional)
-    shared = shared_rows(bundle, sights, rows, fit.additional)[..., normal.free]
-    m, tags = len(sights), len(bundle.body.ids)
-    of_tags = np.zeros((m, 8, tags, len(DEFORMATIONS)))
-    of_tags[np.arange(m), :, sights.tag] = bend_rows(bundle, sights, rows)
-    deformed = of_tags.reshape(m, 8, -1)
-    across = sights.by_picture(np.swapaxes(rows.by_picture, 1, 2) @ deformed, len(bundle.cRb))
-    return (
-        shared - rows.by_picture @ (normal.inverse @ normal.across)[sights.picture],
-        deformed - rows.by_picture @ (normal.inverse @ across)[sights.picture],
-    )
 
 
 def _sandwich(fit: Fit, own: Array, view: Index, white: Array) -> Array:
@@ -165,8 +150,8 @@ def _sandwich(fit: Fit, own: Array, view: Index, white: Array) -> Array:
     bundle, sights = fit.bundle, fit.sights
     of, views = view[sights.picture], int(view.max()) + 1
     power, common = _spectrum(_correlations(fit, of, views), views), _common_share(fit, of)
-    free = fit.additional.sigma[fit.additional.free]
-    of_priors = white[:, len(white) - len(free) :]
+    precision = fit.additional.precision
+    of_priors = white[:, len(white) - len(precision) :]
     parts, taken = [], []
     for tag in range(len(bundle.body.ids)):
         mine = sights.tag == tag
@@ -177,7 +162,7 @@ def _sandwich(fit: Fit, own: Array, view: Index, white: Array) -> Array:
         square += (1.0 - common) * np.einsum("mia,mib->ab", own[mine], own[mine], optimize=True)
         parts.append(white @ square @ white)
         taken.append(2.0 * float((white * square).sum()))
-    spread = np.sum(parts, axis=0) + (of_priors * free**-2.0) @ of_priors.T
+    spread = np.sum(parts, axis=0) + (of_priors * precision) @ of_priors.T
     left = np.einsum("mia,ab,mib->m", own, spread, own, optimize=True)
     variance = _variances(fit, np.array(taken) - np.bincount(sights.tag, left, len(taken)))
     return np.asarray(np.einsum("t,tab->ab", variance, np.array(parts)))

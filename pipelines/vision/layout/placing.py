@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.vision.layout.bundle import Fit, adjusted, fitted, loss, nothing, refined_pictures
+from alidade.pipelines.vision.layout.bundle import Additional, Fit, adjusted, fitted, loss, refined_pictures
 from alidade.pipelines.vision.layout.sights import Bundle, Gathered, Index, Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, angles, planar_solutions
 
@@ -79,7 +79,7 @@ def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
             "no picture distinguishes its tags' poses from their planar flips; take pictures from nearer, or that "
             "show more tags on different faces"
         )
-    return replace(fitted(with_pictures(start, poses), sights[whole], 0, nothing(start)), whole=whole)
+    return fitted(with_pictures(start, poses), sights, whole, Additional.of(start))
 
 
 def _decisive(sights: Sights, view: Index) -> Index:
@@ -112,7 +112,7 @@ def _right_side_out(start: Bundle, sights: Sights) -> TagBody:
     for body in (start.body, mirrored(start.body, 0)):
         there = replace(start, body=body)
         there = with_pictures(there, sides(there, sights))
-        after, rows = adjusted(there, seen, 0, nothing(start), FAR)
+        after, rows = adjusted(there, seen, 0, Additional.of(start), FAR)
         bodies.append(after.body)
         costs.append(float(loss(rows.squares, FAR).sum()))
     best = int(np.argmin(costs))
@@ -158,7 +158,7 @@ def grown(bundle: Bundle, sights: Sights) -> TagBody:
         seen = sights[placed[sights.tag]]
         start = with_pictures(bundle, sides(bundle, seen))
         # A few steps; tags that are not placed yet stay where they are.
-        bundle, _ = adjusted(start, seen[seen.together], seed, nothing(start), FAR, _ON_THE_WAY)
+        bundle, _ = adjusted(start, seen[seen.together], seed, Additional.of(start), FAR, _ON_THE_WAY)
         poses = sides(bundle, seen)
     return bundle.body
 

@@ -217,16 +217,16 @@ _Seen = dict[int, tuple[Array, float]]
 
 def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
     """Collect the sights of the body's tags; ids seen twice in one picture are left out there."""
-    cameras: list[Camera] = []
+    cameras: dict[tuple[object, ...], Camera] = {}
     pictures: list[_Seen] = []
     camera: list[int] = []
     view: list[int] = []
     time: list[float] = []
     for each in shots:
-        known = [k for k, other in enumerate(cameras) if _same(other, each.camera)]
-        if not known:
-            cameras.append(each.camera)
-        number = known[0] if known else len(cameras) - 1
+        # Equal calibrations are one camera's.
+        key = each.camera.width, each.camera.height, each.camera.distortion_model, *each.camera.intrinsics.tolist()
+        cameras.setdefault(key, each.camera)
+        number = list(cameras).index(key)
         first: _Seen | None = None
         for k, found in enumerate(each.pictures):
             if not (seen := _usable(each.camera, given, found)):
@@ -245,14 +245,10 @@ def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
         np.array([row[3] for row in rows], dtype=float),
     )
     f = len(pictures)
-    start = Bundle.of(tuple(cameras), np.array(camera, dtype=np.intp), given, so3.identity(f), np.zeros((f, 3)))
+    start = Bundle.of(
+        tuple(cameras.values()), np.array(camera, dtype=np.intp), given, so3.identity(f), np.zeros((f, 3))
+    )
     return Gathered(replace(start, time=np.array(time)), sights, np.array(view, dtype=np.intp))
-
-
-def _same(a: Camera, b: Camera) -> bool:
-    """Whether two cameras have equal calibrations, and so are one camera."""
-    said = [(c.width, c.height, c.distortion_model, *c.intrinsics.tolist()) for c in (a, b)]
-    return said[0] == said[1]
 
 
 def _usable(camera: Camera, given: TagBody, found: Detections) -> _Seen:
