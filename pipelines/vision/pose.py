@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.tags import Detections, edge_lengths
@@ -265,15 +264,17 @@ def estimate_pose(
         expected: (4,) attitude cRb expected beforehand; it settles a flip that the corners leave open if the one pose
             is more than twice as near to it as the other.
     """
-    ids, counts = np.unique(detections.ids, return_counts=True)
-    use = [i for i in ids[counts == 1].tolist() if i in body.ids]
-    tags, pixels, variance = _matched(camera, body, detections, use)
-    if not len(tags.ids):
+    mine, seen = seen_once(camera, body, detections)
+    variances = np.diagonal(detections.covariance[seen], axis1=-2, axis2=-1)
+    worst = variances.max(axis=(1, 2))
+    good = np.isfinite(worst) & ((worst < _POOR_PX**2) | (worst == worst.min(initial=np.inf)))
+    if not good.any():
         return None
-    sigma, is_raised = (float(np.sqrt(variance)), True) if sigma_px is None else (sigma_px, False)
+    tags, pixels = part(body, mine[good]), detections.corners[seen[good]]
+    sigma, is_raised = (float(np.sqrt(variances[good].mean())), True) if sigma_px is None else (sigma_px, False)
     solution = _solve(camera, tags, pixels, sigma, is_raised, expected)
     expected_px = np.hypot(sigma, body.accuracy * float((edge_lengths(pixels) / tags.size).mean()))
-    if solution is None or len(use) < 3 or solution.rms_px < _WRONG_SIGMAS * expected_px:
+    if solution is None or len(tags.ids) < 3 or solution.rms_px < _WRONG_SIGMAS * expected_px:
         return solution
     # One wrong tag spoils the fit of all: it is the one without which the others agree.
     rests = [np.arange(len(tags.ids)) != k for k in range(len(tags.ids))]
@@ -285,16 +286,12 @@ def estimate_pose(
     return replace(best, rejected=rejected)
 
 
-def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequence[int]) -> tuple[TagBody, Array, float]:
-    """Select well-seen tags of the body: tags, corners (n, 4, 2), px, and their mean variance, px^2."""
-    seen = np.array([int(np.flatnonzero(detections.ids == i)[0]) for i in use], dtype=np.intp)
-    variances = np.diagonal(detections.covariance[seen], axis1=-2, axis2=-1)
-    worst = variances.max(axis=(1, 2))
-    good = np.isfinite(worst) & ((worst < _POOR_PX**2) | (worst == worst.min(initial=np.inf)))
-    good &= (camera.rays(detections.corners[seen])[..., 2] > _FORWARD).all(axis=1)
-    seen, variances = seen[good], variances[good]
-    keep = np.array([int(np.flatnonzero(body.ids == i)[0]) for i in detections.ids[seen]], dtype=np.intp)
-    return part(body, keep), detections.corners[seen], float(variances.mean()) if len(seen) else 0.0
+def seen_once(camera: Camera, body: TagBody, detections: Detections) -> tuple[Index, Index]:
+    """Indices, in the body and in the picture, of the body's tags that are seen once, in front of the camera."""
+    ids, first, counts = np.unique(detections.ids, return_index=True, return_counts=True)
+    seen = first[(counts == 1) & np.isin(ids, body.ids)]
+    seen = seen[(camera.rays(detections.corners[seen])[..., 2] > _FORWARD).all(axis=1)]
+    return (body.ids == detections.ids[seen, None]).argmax(axis=1), seen
 
 
 def part(body: TagBody, keep: NDArray[Any]) -> TagBody:

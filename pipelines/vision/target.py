@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,25 +43,22 @@ class LosErrors:
         t_ns: (K,) stamps, Unix ns.
         error: (K, 3) rad: phx, phz, and the camera's roll about its line of sight since the first picture.
         covariance: (K, 3, 3) rad^2, of the errors relative to the first picture's.
-        quality: (K,) share of the target's points that agree, 0 to 1.
         dropped: reason -> number of pictures.
     """
 
     t_ns: NDArray[np.int64]
     error: Array
     covariance: Array
-    quality: Array
     dropped: dict[str, int]
 
 
 @dataclass(frozen=True, eq=False)
 class _Match:
-    """Matched directions (n, 3) in the first and the current picture, with sigma, px, and inlier share."""
+    """Matched directions (n, 3) in the first and the current picture, with sigma, px."""
 
     first: Array
     now: Array
     sigma_px: float
-    quality: float
 
 
 def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors:
@@ -78,7 +76,7 @@ def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors
     """
     target: _Tag | _Texture | None = None
     R = so3.identity()
-    rows: list[tuple[int, Array, Array, float]] = []
+    rows: list[tuple[int, Array, Array]] = []
     dropped: Counter[str] = Counter()
     for t_ns, encoded in images:
         picture = decode(encoded)
@@ -96,13 +94,11 @@ def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors
             dropped[match] += 1
             continue
         R, covariance = _turn(match, camera)
-        rows.append((t_ns, *_los(R, target.middle, covariance), match.quality))
+        rows.append((t_ns, *_los(R, target.middle, covariance)))
     if not rows:
         raise InputError(f"no LOS error from the pictures: {dict(dropped) or 'there are none'}")
-    t, error, covariances, quality = zip(*rows, strict=True)
-    return LosErrors(
-        np.array(t, dtype=np.int64), np.array(error), np.array(covariances), np.array(quality), dict(dropped)
-    )
+    t, error, covariances = zip(*rows, strict=True)
+    return LosErrors(np.array(t, dtype=np.int64), np.array(error), np.array(covariances), dict(dropped))
 
 
 def _target(picture: Picture, camera: Camera) -> _Tag | _Texture:
@@ -128,7 +124,7 @@ class _Tag:
         if len(mine) != 1 or not np.isfinite(found.covariance[mine[0]]).all():
             return LOST
         sigma = float(np.sqrt(np.diagonal(found.covariance[mine[0]], axis1=1, axis2=2).mean()))
-        return _Match(self._first, self._camera.rays(found.corners[mine[0]]), max(sigma, _FLOOR_PX), 1.0)
+        return _Match(self._first, self._camera.rays(found.corners[mine[0]]), max(sigma, _FLOOR_PX))
 
 
 class _Texture:
@@ -167,14 +163,10 @@ class _Texture:
         # The picture as the camera of the first one would have taken it; points then hardly move.
         where = self._camera.project(so3.rotate(ckRc0, self._rays)).astype(np.float32)
         turned = cv2.remap(picture, where[..., 0], where[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        window = (_WINDOW, _WINDOW)
         end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._picture, turned, self._points[:, None], None, winSize=window, maxLevel=3, criteria=end
-        )
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            turned, self._picture, there, None, winSize=window, maxLevel=3, criteria=end
-        )
+        track = partial(cv2.calcOpticalFlowPyrLK, winSize=(_WINDOW, _WINDOW), maxLevel=3, criteria=end)
+        there, found, _ = track(self._picture, turned, self._points[:, None], None)
+        back, returned, _ = track(turned, self._picture, there, None)
         there = there[:, 0].astype(float)
         now = so3.rotate(ckRc0, self._camera.rays(there))
         pixels = self._camera.project(now)
@@ -195,17 +187,16 @@ class _Texture:
         rows = np.flatnonzero(good)
         _, agrees = cv2.estimateAffinePartial2D(self._points[rows], there[rows], ransacReprojThreshold=1.5)
         rows = rows[agrees.ravel() > 0] if agrees is not None else rows[:0]
-        quality = len(rows) / len(self._points)
-        if len(rows) < _FEWEST or quality < _AGREE:
+        if len(rows) < _FEWEST or len(rows) < _AGREE * len(self._points):
             return LOST if len(rows) < _FEWEST else POOR
-        match = _Match(self._first[rows], now[rows], 0.0, quality)
+        match = _Match(self._first[rows], now[rows], 0.0)
         turn, _ = _turn(match, self._camera)
         miss = _miss(match, turn, self._camera)
         scatter = 1.4826 * float(np.median(np.abs(miss)))
         if scatter > _SCATTER_PX:
             return POOR
         near = np.linalg.norm(miss, axis=1) < 4.0 * scatter + 1e-3
-        return _Match(self._first[rows[near]], now[rows[near]], scatter, quality)
+        return _Match(self._first[rows[near]], now[rows[near]], scatter)
 
     def _search(self, picture: Picture) -> Array | None:
         """Rotation (4,) of a picture by matched ORB features, without prediction; None if too few match."""
@@ -225,7 +216,7 @@ class _Texture:
         if keep.sum() < _FEWEST:
             return None
         rays = self._camera.rays(first[keep]), self._camera.rays(now[keep])
-        return _turn(_Match(*rays, 1.0, 1.0), self._camera)[0]
+        return _turn(_Match(*rays, 1.0), self._camera)[0]
 
 
 def _turn(match: _Match, camera: Camera) -> tuple[Array, Array]:

@@ -119,7 +119,6 @@ def test_bad_pictures_are_left_out_and_the_target_is_found_again(renderer: Rende
     found = los_errors([*images[:2], (5 * 10**7 + 1, b"x"), (5 * 10**7 + 2, grey), *images[2:]], CAMERA)
     assert found.dropped == {UNREADABLE: 1, LOST: 1}
     np.testing.assert_allclose(found.error, _expected(cRw, np.array([0, 0, 1.0])), atol=4e-4)
-    assert (found.quality > 0.35).all()
 
 
 def test_nothing_to_look_at() -> None:

@@ -93,11 +93,12 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
         InputError: no picture shows the first tag with another, or the pictures do not distinguish the layout from its
             mirror image.
     """
-    unplaced = _unconnected(gathered(shots, given), given)
+    views = gathered(shots, given)
+    unplaced = _unconnected(views, given)
     body: TagBody | None = None
     while True:
         placed = part(given, ~np.isin(given.ids, list(unplaced)))
-        views = gathered(shots, placed)
+        views = gathered(shots, placed) if unplaced else views
         with progress.doing("placing tags"):
             fit = adjusted_whole(views, None if body is None else part(body, np.isin(body.ids, placed.ids)))
         wrong = _unusable(views, fit)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.pose import SQUARE, TagBody
+from alidade.pipelines.vision.pose import SQUARE, TagBody, seen_once
 from alidade.pipelines.vision.tags import Detections
 
 Index = NDArray[np.intp]
@@ -29,8 +30,6 @@ _BEHIND, _FARTHEST = 1e4, 1e6
 _STILL = 2.0
 # No corner is taken to be better than this, px.
 _LEAST_PX = 0.03
-# Directions this near to the camera's own plane (cosine) are of no use.
-_FORWARD = 0.05
 _LATER: Any = None
 
 
@@ -218,50 +217,37 @@ _Seen = dict[int, tuple[Array, float]]
 def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
     """Collect the sights of the body's tags; ids seen twice in one picture are left out there."""
     cameras: dict[tuple[object, ...], Camera] = {}
-    pictures: list[_Seen] = []
-    camera: list[int] = []
-    view: list[int] = []
-    time: list[float] = []
+    frames: list[tuple[int, float, int, _Seen]] = []
     for each in shots:
         # Equal calibrations are one camera's.
         key = each.camera.width, each.camera.height, each.camera.distortion_model, *each.camera.intrinsics.tolist()
         cameras.setdefault(key, each.camera)
-        number = list(cameras).index(key)
-        first: _Seen | None = None
-        for k, found in enumerate(each.pictures):
-            if not (seen := _usable(each.camera, given, found)):
-                continue
-            moved = first is None or not _still(first, seen)
-            first = seen if moved or first is None else {**seen, **first}
-            view.append((view[-1] if view else -1) + moved)
-            camera.append(number)
-            time.append(np.nan if each.time is None else each.time[k])
-            pictures.append(seen)
-    rows = [(f, tag, *one) for f, seen in enumerate(pictures) for tag, one in sorted(seen.items())]
+        first: _Seen = {}
+        for found, time in zip(each.pictures, repeat(np.nan) if each.time is None else each.time, strict=False):
+            if seen := _usable(each.camera, given, found):
+                still = _still(first, seen)
+                first = {**seen, **first} if still else seen
+                view = (frames[-1][2] if frames else -1) + (not still)
+                frames.append((list(cameras).index(key), time, view, seen))
+    rows = [(f, tag, *one) for f, (*_, seen) in enumerate(frames) for tag, one in sorted(seen.items())]
     sights = Sights(
         np.array([row[0] for row in rows], dtype=np.intp),
         np.array([row[1] for row in rows], dtype=np.intp),
         np.array([row[2] for row in rows], dtype=float).reshape(-1, 4, 2),
         np.array([row[3] for row in rows], dtype=float),
     )
-    f = len(pictures)
-    start = Bundle.of(
-        tuple(cameras.values()), np.array(camera, dtype=np.intp), given, so3.identity(f), np.zeros((f, 3))
-    )
-    return Gathered(replace(start, time=np.array(time)), sights, np.array(view, dtype=np.intp))
+    camera, times, views = np.array([frame[:3] for frame in frames], dtype=float).reshape(-1, 3).T
+    origin = so3.identity(len(frames)), np.zeros((len(frames), 3))
+    start = Bundle.of(tuple(cameras.values()), camera.astype(np.intp), given, *origin)
+    return Gathered(replace(start, time=times), sights, views.astype(np.intp))
 
 
 def _usable(camera: Camera, given: TagBody, found: Detections) -> _Seen:
     """Corners (4, 2) and their sigma, px, of each usable tag, by its index in the body."""
-    ids, counts = np.unique(found.ids, return_counts=True)
-    once = set(ids[counts == 1].tolist()) & set(given.ids.tolist())
-    sigma = np.sqrt(np.diagonal(found.covariance, axis1=-2, axis2=-1).mean(axis=(1, 2)))
-    good = np.isfinite(sigma) & (camera.rays(found.corners)[..., 2] > _FORWARD).all(axis=1)
-    return {
-        int(np.searchsorted(given.ids, tag)): (found.corners[k], float(np.hypot(sigma[k], _LEAST_PX)))
-        for k, tag in enumerate(found.ids.tolist())
-        if tag in once and good[k]
-    }
+    tags, seen = seen_once(camera, given, found)
+    sigma = np.sqrt(np.diagonal(found.covariance[seen], axis1=-2, axis2=-1).mean(axis=(1, 2)))
+    each = zip(tags.tolist(), found.corners[seen], np.hypot(sigma, _LEAST_PX).tolist(), strict=True)
+    return {tag: (corners, px) for tag, corners, px in each if np.isfinite(px)}
 
 
 def _still(first: _Seen, seen: _Seen) -> bool:
