@@ -16,9 +16,16 @@ from alidade.pipelines.methods.cube.layout import cube_layout
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.layout import Layout, Shots, estimate_layout
-from alidade.pipelines.vision.layout.bundle import Additional, free_columns, moved, shared_rows
+from alidade.pipelines.vision.layout.bundle import (
+    Additional,
+    Bundle,
+    Sights,
+    free_columns,
+    linearized,
+    moved,
+    shared_rows,
+)
 from alidade.pipelines.vision.layout.placing import mirrored
-from alidade.pipelines.vision.layout.sights import Bundle, Sights, linearized
 from alidade.pipelines.vision.pose import TagBody, estimate_pose
 from alidade.pipelines.vision.tags import Detections
 from datasets import tagslam_block

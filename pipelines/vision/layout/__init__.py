@@ -9,24 +9,40 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.layout.bundle import LINE_TIME, Additional, Fit, fitted, moved, refined_pictures
-from alidade.pipelines.vision.layout.covariance import Covariance, covariance
+from alidade.pipelines.vision.layout.bundle import (
+    LINE_TIME,
+    Additional,
+    Bundle,
+    Gathered,
+    Sights,
+    free_columns,
+    linearized,
+    moved,
+    refined_pictures,
+)
+from alidade.pipelines.vision.layout.fit import Fit, covariance, fitted
 from alidade.pipelines.vision.layout.placing import adjusted_whole, flip_resolved, joint
-from alidade.pipelines.vision.layout.sights import Gathered, Shots, Sights, gathered, linearized
-from alidade.pipelines.vision.pose import TagBody, part
+from alidade.pipelines.vision.pose import TagBody, part, seen_once
+from alidade.pipelines.vision.tags import Detections
 
 __all__ = ["LINE_TIME", "Layout", "Shots", "TagSeen", "estimate_layout"]
 
 # More sights of a tag than this share left out as false: it is not one rigid tag.
 _MOSTLY_FALSE = 0.5
+# Corners that differ by less than this many sigmas, root mean square, stand still; noise alone makes it 1.4.
+_STILL = 2.0
+# No corner is taken to be better than this, px.
+_LEAST_PX = 0.03
 
 
 @dataclass(frozen=True)
@@ -165,13 +181,14 @@ def _unusable(views: Gathered, fit: Fit) -> dict[int, str]:
 
 
 def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
-    known = covariance(fit, views.view)
-    if known.correction is not None:
-        stay = np.zeros((len(fit.bundle.cRb), 6))
-        there = moved(fit.bundle, known.correction, stay, fit.additional)
-        bundle, *_ = refined_pictures(there, fit.sights)
-        fit = replace(fit, bundle=bundle, rows=linearized(bundle, fit.sights))
-    body, tags = fit.bundle.body, 6 * (len(fit.bundle.body.ids) - 1)
+    known, additional = covariance(fit, views.view), fit.additional
+    free = free_columns(fit.bundle, 0, additional)
+    step, sigma = np.zeros((2, len(free)))
+    step[free], sigma[free] = known.step, np.sqrt(np.diag(known.whole))
+    bundle, *_ = refined_pictures(moved(fit.bundle, step, np.zeros((len(fit.bundle.cRb), 6)), additional), fit.sights)
+    fit = replace(fit, bundle=bundle, rows=linearized(bundle, fit.sights))
+    body, tags = bundle.body, 6 * (len(bundle.body.ids) - 1)
+    camera_sigma, line_time_sigma = np.split(sigma[tags + 6 :].reshape(additional.sigmas.shape), [-1], axis=1)
     seen = {}
     for k, tag in enumerate(body.ids.tolist()):
         mine = fit.sights.tag == k
@@ -185,23 +202,78 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
         frames=len(np.unique(fit.sights.picture)),
         seen=seen,
         unplaced=dict(sorted(unplaced.items())),
-        cameras=fit.bundle.cameras,
+        cameras=bundle.cameras,
         given_cameras=views.start.cameras,
-        camera_sigma=known.sigma[:, :-1] if known.sigma[:, :-1].any() else None,
-        with_camera=_with_camera(known, fit, tags),
-        line_time=fit.bundle.line_time,
-        line_time_sigma=known.sigma[:, -1],
+        camera_sigma=camera_sigma if camera_sigma.any() else None,
+        with_camera=_with_camera(known.whole, bundle.cameras, tags) if camera_sigma.any() else None,
+        line_time=bundle.line_time,
+        line_time_sigma=line_time_sigma[:, 0],
         bend=known.bend,
     )
 
 
-def _with_camera(known: Covariance, fit: Fit, tags: int) -> Array | None:
-    """Covariance of tags and camera in a layout's form; focal share as the mean of both focal lengths' shares."""
-    cameras = fit.bundle.cameras
-    if not fit.additional.sigmas[:, :-1].any() or len(cameras) > 1:
+def _with_camera(whole: Array, cameras: Sequence[Camera], tags: int) -> Array | None:
+    """Covariance of tags and one camera in a layout's form; focal share as the mean of both focal lengths' shares."""
+    if len(cameras) > 1:
         return None
-    pick = np.zeros((tags + 3, len(known.whole)))
+    pick = np.zeros((tags + 3, len(whole)))
     pick[:tags, :tags] = np.eye(tags)
     pick[tags, tags : tags + 2] = 0.5 / cameras[0].focal
     pick[tags + 1, tags + 2] = pick[tags + 2, tags + 3] = 1.0
-    return np.asarray(pick @ known.whole @ pick.T)
+    return np.asarray(pick @ whole @ pick.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """A camera with the tags found in each of its pictures, in time order, and times, s, if known."""
+
+    camera: Camera
+    pictures: Sequence[Detections]
+    time: Sequence[float] | None = None
+
+
+_Seen = dict[int, tuple[Array, float]]
+
+
+def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
+    """Collect the sights of the body's tags; ids seen twice in one picture are left out there."""
+    cameras: dict[tuple[object, ...], Camera] = {}
+    frames: list[tuple[int, float, int, _Seen]] = []
+    for each in shots:
+        # Equal calibrations are one camera's.
+        key = each.camera.width, each.camera.height, each.camera.distortion_model, *each.camera.intrinsics.tolist()
+        cameras.setdefault(key, each.camera)
+        first: _Seen = {}
+        for found, time in zip(each.pictures, repeat(np.nan) if each.time is None else each.time, strict=False):
+            if seen := _usable(each.camera, given, found):
+                still = _still(first, seen)
+                first = {**seen, **first} if still else seen
+                view = (frames[-1][2] if frames else -1) + (not still)
+                frames.append((list(cameras).index(key), time, view, seen))
+    rows = [(f, tag, *one) for f, (*_, seen) in enumerate(frames) for tag, one in sorted(seen.items())]
+    sights = Sights(
+        np.array([row[0] for row in rows], dtype=np.intp),
+        np.array([row[1] for row in rows], dtype=np.intp),
+        np.array([row[2] for row in rows], dtype=float).reshape(-1, 4, 2),
+        np.array([row[3] for row in rows], dtype=float),
+    )
+    camera, times, views = np.array([frame[:3] for frame in frames], dtype=float).reshape(-1, 3).T
+    origin = so3.identity(len(frames)), np.zeros((len(frames), 3))
+    start = Bundle.of(tuple(cameras.values()), camera.astype(np.intp), given, *origin)
+    return Gathered(replace(start, time=times), sights, views.astype(np.intp))
+
+
+def _usable(camera: Camera, given: TagBody, found: Detections) -> _Seen:
+    """Corners (4, 2) and their sigma, px, of each usable tag, by its index in the body."""
+    tags, seen = seen_once(camera, given, found)
+    sigma = np.sqrt(np.diagonal(found.covariance[seen], axis1=-2, axis2=-1).mean(axis=(1, 2)))
+    each = zip(tags.tolist(), found.corners[seen], np.hypot(sigma, _LEAST_PX).tolist(), strict=True)
+    return {tag: (corners, px) for tag, corners, px in each if np.isfinite(px)}
+
+
+def _still(first: _Seen, seen: _Seen) -> bool:
+    both = first.keys() & seen.keys()
+    if not both:
+        return False
+    moved = [(seen[tag][0] - first[tag][0]) / first[tag][1] for tag in both]
+    return float(np.sqrt(np.mean(np.square(moved)))) < _STILL

@@ -15,10 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.vision.layout.bundle import Additional, Fit, adjusted, fitted, loss, refined_pictures
-from alidade.pipelines.vision.layout.sights import Bundle, Gathered, Index, Sights, linearized
+from alidade.pipelines.vision.layout.bundle import (
+    Additional,
+    Bundle,
+    Gathered,
+    Sights,
+    adjusted,
+    linearized,
+    loss,
+    refined_pictures,
+)
+from alidade.pipelines.vision.layout.fit import Fit, fitted
 from alidade.pipelines.vision.pose import TagBody, angles, planar_solutions
 
 # Sum of squares of a tag in a picture, eight numbers in sigmas, beyond which it counts less and less.

@@ -1,4 +1,9 @@
-"""Covariance of an adjusted layout whose errors are correlated from picture to picture.
+"""The most likely layout of a body of tags and its covariance.
+
+A hand-held body is sharp in some pictures and blurred in others. Each picture has a variance of its own, distributed
+about a common one, which makes the errors of a picture one draw of a multivariate t distribution (K. Lange, R. Little,
+J. Taylor, "Robust statistical modeling using the t distribution", JASA 1989); its weights are found by iteration. How
+the body moves in each picture, for shutters that roll, follows from its poses in the pictures before and after.
 
 A tag's corners err by what its print, its blur and the camera's model have wrong: nearly the same in the next picture,
 and the more so in one in which nothing has moved. The layout errs by L r, L the influence of the whitened errors r, so
@@ -14,22 +19,42 @@ layout: adjusted, it takes up errors of another kind too, and halves of real rec
 
 Priors of additional parameters are weighed against such errors, not against independent ones: with the information A
 of independent errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has
-the information A S^-1 A + P. The adjustment, whose information is A + P, takes pictures for better than they are;
-`correction` is the step from there.
+the information A S^-1 A + P. The adjustment, whose information is A + P, takes pictures for better than they are.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
-from alidade.pipelines.vision.layout.bundle import Fit, free_columns, pose_steps, shared_rows
-from alidade.pipelines.vision.layout.sights import Bundle, Index, Rows, Sights
+from alidade.factors.array import Array, Index
+from alidade.pipelines.vision.layout.bundle import (
+    Additional,
+    Bundle,
+    Rows,
+    Sights,
+    adjusted,
+    free_columns,
+    linearized,
+    pose_steps,
+    shared_rows,
+)
 from alidade.pipelines.vision.pose import SQUARE
 
+# Degrees of freedom of the t distribution.
+_NU = 4.0
+_ROUNDS, _SIGMA_SETTLED = 12, 1e-3
+# A tag in a picture whose corners miss by this many times the picture's sigma is a false detection.
+_FAR = 4.0
+_MEDIAN_OF_SEVEN = 6.35
+# Pictures farther apart than this, s, have no information about each other's motion.
+_APART = 0.25
+# A polynomial is laid through so many pictures before and after, and through all within this time, s.
+_BESIDE, _NEAR = 2, 0.12
+_DEGREE = 4
 # A correlation within this many of its sigmas of zero has died out; the first one is asked to be beyond more of them.
 _DIED_OUT, _COLOURED = 2.0, 4.0
 # Numbers seen again where nothing moved, from which on their common error is estimated.
@@ -47,6 +72,148 @@ _PAPER, _ROUGHLY = 2e-3, 2.0
 _LEVELS = np.geomspace(1e-5, 3e-2, 400)
 # Information below this share of the largest is rounding.
 _ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Adjusted bundle with its residuals.
+
+    Attributes:
+        bundle: with all poses.
+        sights: those used; sigma is that of the picture.
+        rows: their errors, in these sigmas.
+        weight: (f,) of the pictures, about 1; the inverse of their variance over the common one.
+        sigma: of a corner in a common picture, in the sigmas given.
+        sigma_px: of a corner in a common picture, per axis.
+        whole: indices of the sights that were looked at, used or not, in a table of the caller's.
+        additional: what was adjusted beside poses.
+    """
+
+    bundle: Bundle
+    sights: Sights
+    rows: Rows
+    weight: Array
+    sigma: float
+    sigma_px: float
+    whole: Index
+    additional: Additional
+
+    @property
+    def curvature(self) -> Array:
+        """Ratio (f,) of a picture's true to its weighted information: below 1, as weights depend on errors."""
+        squares = np.bincount(self.sights.picture, self.rows.squares, len(self.weight))
+        free = np.maximum(freedom(self.sights, len(self.weight)), 1.0)
+        return np.asarray(np.maximum(1.0 - 2.0 * squares / ((_NU + free) * free), 0.1))
+
+    def rms_px(self, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
+        """Weighted root mean square reprojection error of some sights, px per axis."""
+        weight, squares = self.weight[self.sights.picture], self.sights.sigma**2 * self.rows.squares / 8.0
+        return float(np.sqrt((weight * squares)[keep].sum() / weight[keep].sum()))
+
+
+def fitted(bundle: Bundle, sights: Sights, whole: Index, additional: Additional) -> Fit:
+    """Adjust the bundle by maximum likelihood and reject false detections; the first tag stays.
+
+    Args:
+        bundle: a start.
+        sights: with sigmas that are right among each other.
+        whole: which of them are looked at.
+        additional: what is adjusted beside poses.
+    """
+    sights, used = sights[whole], np.ones(len(whole), dtype=bool)
+    # Where the start is it is not yet drawn to what is false.
+    squares, sigma = linearized(bundle, sights).squares, None
+    for _ in range(_ROUNDS):
+        false = _false(sights[used], squares, sigma)
+        if sigma is not None and not false.any():
+            break
+        used[np.flatnonzero(used)[false]] = False
+        used[np.flatnonzero(used)[~sights[used].together]] = False
+        fit = _reweighted(bundle, sights[used], whole, additional)
+        bundle, sigma = fit.bundle, fit.sigma
+        squares = fit.rows.squares * (sigma**2 / fit.weight[fit.sights.picture])
+    return fit
+
+
+def _false(sights: Sights, squares: Array, sigma: float | None) -> NDArray[np.bool_]:
+    """Mask (m,) of false detections: sights with far larger errors than the others in the same picture."""
+    if sigma is None:
+        # The median of a chi-square of seven degrees of freedom; a picture's pose takes one or so of a tag's eight.
+        sigma = float(np.sqrt(np.median(squares) / _MEDIAN_OF_SEVEN))
+    count = np.bincount(sights.picture)[sights.picture]
+    others = np.bincount(sights.picture, squares)[sights.picture] - squares
+    # Of the picture without this tag, with what is known of pictures beforehand.
+    variance = (_NU * sigma**2 + others) / (_NU + np.maximum(8.0 * (count - 1) - 6.0, 0.0))
+    return np.asarray(squares > 8.0 * _FAR**2 * variance)
+
+
+def _reweighted(bundle: Bundle, sights: Sights, whole: Index, additional: Additional) -> Fit:
+    f, tags = len(bundle.cRb), len(bundle.body.ids)
+    free = freedom(sights, f)
+    shared = 6.0 * (tags - 1) + additional.free.sum()
+    # The share of the tags in what a picture determines is theirs, not the noise's.
+    free *= 1.0 - shared / max(free.sum(), shared + 1.0)
+    sigma, weight = 1.0, np.ones(f)
+    for _ in range(_ROUNDS):
+        scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
+        if additional.sigmas[:, -1].any():
+            bundle = with_motion(bundle, np.unique(sights.picture))
+        bundle, rows = adjusted(bundle, scaled, 0, additional)
+        squares = np.bincount(sights.picture, rows.squares, f) * sigma**2 / weight
+        before, (sigma, weight) = sigma, _scale(squares, free)
+        if abs(sigma / before - 1.0) < _SIGMA_SETTLED:
+            break
+    scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
+    bundle, rows = adjusted(bundle, scaled, 0, additional)
+    sigma_px = sigma * float(np.median(sights.sigma))
+    return Fit(bundle, scaled, rows, weight, sigma, sigma_px, whole, additional)
+
+
+def freedom(sights: Sights, pictures: int) -> Array:
+    """Degrees of freedom (f,) of each picture: eight per tag minus six for the pose, at least 0."""
+    return np.asarray(np.maximum(8.0 * np.bincount(sights.picture, minlength=pictures) - 6.0, 0.0))
+
+
+def _scale(squares: Array, freedom: Array) -> tuple[float, Array]:
+    """Common sigma and picture weights (f,) by Student's t, from sums of squares and degrees of freedom."""
+    variance = float(squares.sum() / freedom.sum())
+    for _ in range(200):
+        weight = (_NU + freedom) / (_NU + squares / variance)
+        before, variance = variance, float((weight * squares).sum() / freedom.sum())
+        if abs(variance / before - 1.0) < 1e-6:
+            break
+    return float(np.sqrt(variance)), np.asarray((_NU + freedom) / (_NU + squares / variance))
+
+
+def with_motion(bundle: Bundle, pictures: Index) -> Bundle:
+    """Estimate the motion during given pictures (in ascending time) from their neighbours; others get zero."""
+    motion = np.zeros_like(bundle.motion)
+    for run in _runs(bundle, pictures):
+        time = bundle.time[run]
+        place = np.arange(len(run))
+        first = np.minimum(place - _BESIDE, np.searchsorted(time, time - _NEAR)).clip(0)
+        last = np.maximum(place + _BESIDE, np.searchsorted(time, time + _NEAR) - 1).clip(max=len(run) - 1)
+        for k, a, b in zip(place, first, last, strict=True):
+            about = run[a : b + 1]
+            turned = so3.local(bundle.cRb[run[k]], bundle.cRb[about])
+            away = np.concatenate([turned, bundle.position[about]], axis=1)
+            motion[run[k]] = _slope(time[a : b + 1] - time[k], away)
+    return replace(bundle, motion=motion)
+
+
+def _runs(bundle: Bundle, pictures: Index) -> list[Index]:
+    """Runs of consecutive pictures of one camera with short gaps in time."""
+    gap, camera = np.diff(bundle.time[pictures]), bundle.camera[pictures]
+    # Where a time is unknown, NaN, no comparison holds.
+    close = (gap > 0.0) & (gap < _APART) & (camera[1:] == camera[:-1])
+    return [run for run in np.split(pictures, np.flatnonzero(~close) + 1) if len(run) > 1]
+
+
+def _slope(t: Array, values: Array) -> Array:
+    """Derivative (6,) at t = 0 of the polynomials, of degree four at most, that fit values (n, 6)."""
+    scale = np.abs(t).max()
+    powers = (t / scale)[:, None] ** np.arange(min(_DEGREE + 1, len(t)))
+    return np.asarray(np.linalg.lstsq(powers, values)[0][1] / scale)
 
 
 def _deformations() -> Array:
@@ -72,17 +239,15 @@ class Covariance:
 
     Attributes:
         whole: (q, q) of all tags after the first, rad and m, and of all additional parameters that are adjusted.
-        sigma: (c, n + 1) of the additional parameters, 0 of those that stay as they are.
         inflation: (n,) by what each tag's sigmas exceed those of independent corners.
         bend: sigma of a tag's corners against a flat square, as a share of its size.
-        correction: (6 n + k,) what priors of these move yet, tags first; None where there are none.
+        step: (q,) from the adjustment to the best linear estimate.
     """
 
     whole: Array
-    sigma: Array
     inflation: Array
     bend: float
-    correction: Array | None
+    step: Array
 
 
 def covariance(fit: Fit, view: Index) -> Covariance:
@@ -106,19 +271,12 @@ def covariance(fit: Fit, view: Index) -> Covariance:
     information[priors, priors] += additional.precision
     white: Array = np.asarray(np.linalg.inv(information), dtype=float)
     bend, spread = bending(rows.miss, by_deformation, own, white)
-    found = _sandwich(fit, own, view, white) + spread
-    correction = None
-    if additional.free.any():
-        found, step = _with_priors(fit, information, found)
-        correction = np.zeros(len(free))
-        correction[free] = step
+    found, step = _with_priors(fit, information, _sandwich(fit, own, view, white) + spread)
     inflation = np.ones(n)
     for tag in range(1, n):
         at = slice(6 * tag - 6, 6 * tag)
         inflation[tag] = np.sqrt(np.trace(np.linalg.solve(white[at, at], found[at, at])) / 6.0)
-    sigma = np.zeros(additional.sigmas.size)
-    sigma[additional.free] = np.sqrt(np.diag(found)[6 * n - 6 :])
-    return Covariance(found, sigma.reshape(additional.sigmas.shape), inflation, bend, correction)
+    return Covariance(found, inflation, bend, step)
 
 
 def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
