@@ -171,7 +171,7 @@ def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Arra
 
 def _limit(plain: Array) -> Array:
     """Largest shift (n, 1), px, of a corner by the edge refinement: half a cell, within 2 to 5 px."""
-    side = np.linalg.norm(plain - np.roll(plain, 1, axis=1), axis=-1).mean(axis=1, keepdims=True)
+    side = edge_lengths(plain)[:, None]
     return np.asarray(np.clip(0.5 * side / _CELLS, 2.0, 5.0))
 
 

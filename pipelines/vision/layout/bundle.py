@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from alidade.factors import so3
 from alidade.factors.array import Array, Index
@@ -291,17 +292,21 @@ def shared_rows(bundle: Bundle, sights: Sights, rows: Rows, additional: Addition
     return out
 
 
-def of_pictures(sights: Sights, rows: Rows, columns: Array, weights: Array, f: int) -> tuple[Array, Array]:
-    """Information (f, 6, 6) of the pictures' poses, and their products (f, 6, p) with columns (m, 8, p) of errors."""
+def of_pictures(sights: Sights, rows: Rows, weights: Array, f: int) -> tuple[Array, Array]:
+    """Information (f, 6, 6) and gradient (f, 6, 1) of the pictures' poses, the tags fixed."""
     At = np.swapaxes(rows.by_picture, 1, 2) * weights[:, None, None]
-    return sights.by_picture(At @ rows.by_picture, f), sights.by_picture(At @ columns, f)
+    return sights.by_picture(At @ rows.by_picture, f), sights.by_picture(At @ rows.miss[..., None], f)
 
 
 def pose_steps(
     bundle: Bundle, sights: Sights, rows: Rows, columns: Array, weights: Array, damping: float = 0.0
 ) -> tuple[Array, Array]:
     """Least-squares pose changes (f, 6, p) of the pictures for columns (m, 8, p) of errors, and their right sides."""
-    own, across = of_pictures(sights, rows, columns, weights, len(bundle.cRb))
+    m, f = len(sights), len(bundle.cRb)
+    own, _ = of_pictures(sights, rows, weights, f)
+    weighted = weights[:, None, None] * rows.by_picture
+    A = sparse.bsr_array((weighted, sights.picture, np.arange(m + 1)), shape=(8 * m, 6 * f)).tocsr()
+    across = (A.T @ columns.reshape(8 * m, -1)).reshape(f, 6, -1)
     own[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping
     own[own[:, 0, 0] == 0.0] = np.eye(6)
     return np.asarray(np.linalg.solve(own, across), dtype=float), across
@@ -400,7 +405,7 @@ def refined_pictures(bundle: Bundle, sights: Sights, far: float = np.inf) -> tup
     def evaluated(there: Bundle, seen: Sights) -> tuple[Array, Array, Array]:
         rows = linearized(there, seen)
         costs = np.bincount(seen.picture, loss(rows.squares, far), f)
-        return np.asarray(costs, dtype=float), *of_pictures(seen, rows, rows.miss[..., None], weights(rows, far), f)
+        return np.asarray(costs, dtype=float), *of_pictures(seen, rows, weights(rows, far), f)
 
     (cost, own, gradient), damping = evaluated(bundle, sights), np.full(f, 1e-3)
     going = own[:, 0, 0] > 0.0

@@ -361,11 +361,9 @@ def pairs(picture: Index) -> tuple[Index, Index]:
 
 def _best(picture: Index, costs: Array, f: int) -> Index:
     """Index (f,) of the cheapest start in each picture; -1 where there is none."""
-    order = np.lexsort((costs, picture))
-    order = order[np.isfinite(costs[order])]
-    out = np.full(f, -1)
-    which, first = np.unique(picture[order], return_index=True)
-    out[which] = order[first]
+    out, dearest_first = np.full(f, -1), np.argsort(-costs, kind="stable")
+    order = dearest_first[np.isfinite(costs[dearest_first])]
+    out[picture[order]] = order  # the last of a picture stays
     return out
 
 
