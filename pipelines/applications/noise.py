@@ -69,7 +69,6 @@ class NoiseStudy:
     """Noise of all sensors of a recording; `notes` are sentences about lost and unusable data."""
 
     recording: str
-    epoch_ns: int
     duration_s: float
     sensors: tuple[SensorNoise, ...]
     notes: tuple[str, ...]
@@ -133,7 +132,7 @@ def noise(
             "; ".join([*troubles, *notes]) or f"{path}: {', '.join(names)}: no sensor, all values are zero or NaN"
         )
     notes = [*opened.notes, *troubles, *notes]
-    return NoiseStudy(path.name, opened.epoch_ns, opened.duration_s, tuple(found), tuple(notes))
+    return NoiseStudy(path.name, opened.duration_s, tuple(found), tuple(notes))
 
 
 def _rates_alone(settings: Config) -> set[str]:
