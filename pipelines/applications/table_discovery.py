@@ -49,6 +49,8 @@ _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
 }
 # Without names these alone are taken: others are counts as often as not.
 _UNNAMED = {"accel": ("m/s^2", "g"), "field": ("uT",)}
+_ANGLES = (r"yaw(?!.*rate)|^heading$", r"pitch(?!.*rate)", r"roll(?!.*rate)")
+_OTHERS = ("wxyz", "yaw_pitch_roll", "joints", "latitude_deg")
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
 _QUATERNION = "q|quat|orientation|rot|attitude"
 # Unix time of the years 1985 to 2128, s.
@@ -175,10 +177,12 @@ class _Table:
         if "field" in named:
             unit = units["field"]
             add("/mag", field=self._names(named["field"]), units={"field": unit} if unit and UNITS[unit] != 1.0 else {})
-        wxyz = self._quaternion()
-        if wxyz:
-            is_vision = _VISION.search(self.path.stem.lower())
-            add("/vision/attitude" if is_vision else "/attitude", wxyz=wxyz)
+        attitude = "/vision/attitude" if _VISION.search(self.path.stem.lower()) else "/attitude"
+        if wxyz := self._quaternion():
+            add(attitude, wxyz=wxyz)
+        elif angles := self._angles():
+            unit = self._unit("yaw_pitch_roll", angles)
+            add(attitude, yaw_pitch_roll=self._names(angles), units={"yaw_pitch_roll": unit} if unit == "deg" else {})
         for topic, joints in _JOINTS.items():
             there = {joint: column for joint in joints if (column := self._called(rf"^{joint}")) is not None}
             if len(there) == len(joints):
@@ -188,7 +192,7 @@ class _Table:
         if all(place.values()):
             add("/fix", **place, height=self._called(r"^(alt|height|elev)") or "")
         for topic, table in out.items():
-            kinds = [kind for kind in (*_WORDS, "wxyz", "joints", "latitude_deg") if getattr(table, kind)]
+            kinds = [kind for kind in (*_WORDS, *_OTHERS) if getattr(table, kind)]
             self.reasons.append(f"{self._where}{topic} has {' and '.join(kinds)}")
         if not out:
             self.doubts.append(f"{self._where}nothing known in {', '.join(self._form.names[:20])}")
@@ -314,9 +318,11 @@ class _Table:
         if kind != "gyro" and any("adc" in self._form.names[i].lower() for i in columns):
             self.reasons.append(f"{self._where}{kind} is in counts by its name")  # Betaflight's magADC
             return ""
-        if kind == "gyro":
-            norms = self._norms(columns)
-            most = float(norms.max()) if len(norms) else 0.0
+        norms = self._norms(columns)
+        most = float(norms.max()) if len(norms) else 0.0
+        if kind == "yaw_pitch_roll":
+            found = "rad" if most < 2.0 * np.pi else "deg"
+        elif kind == "gyro":
             found = "rad/s" if most < MAX_RATE_RAD_S else "deg/s" if most < _MOST_DEG_S else ""
         else:
             found = self._size(kind, columns)
@@ -338,6 +344,16 @@ class _Table:
                         self.doubts.append(f"{self._where}{', '.join(found)} are taken as w, x, y, z")
                     return found
         return []
+
+    def _angles(self) -> list[int]:
+        """Return the columns of yaw, pitch and roll; empty without all of them."""
+        names = [_bare(name) for name in self._form.names]
+        found = [next((i for i, name in enumerate(names) if re.search(word, name)), None) for word in _ANGLES]
+        columns = [i for i in found if i is not None]
+        if len(columns) < len(_ANGLES):
+            return []
+        self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are turns about z, the new y and the new x")
+        return columns
 
 
 def _kind(name: str) -> str:

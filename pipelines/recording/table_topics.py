@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
@@ -43,6 +45,8 @@ _KINDS: dict[str, type[series.Series]] = {
     "gyro": series.ImuSeries,
     "accel": series.ImuSeries,
     "wxyz": series.PoseSeries,
+    "yaw_pitch_roll": series.PoseSeries,
+    "rotation_vector": series.PoseSeries,
     "field": series.MagneticSeries,
     "vector": series.VectorSeries,
     "latitude_deg": series.FixSeries,
@@ -50,6 +54,7 @@ _KINDS: dict[str, type[series.Series]] = {
 }
 # Quantities that have units, and their SI units.
 _QUANTITIES = {"gyro": "rad/s", "accel": "m/s^2", "field": "T", "joints": "rad", "position": "m", "vector": "rad"}
+_QUANTITIES |= {"yaw_pitch_roll": "rad", "rotation_vector": "rad"}
 # Quantities along the axes of a device.
 _VECTORS = ("gyro", "accel", "field")
 # What may be as slow as it likes.
@@ -66,6 +71,8 @@ class TableTopic(BaseModel):
         rate: Hz, of rows without a time.
         gyro, accel: columns of an IMU's rates and accelerations, or of one of them.
         wxyz, position: columns of a pose.
+        yaw_pitch_roll: columns of its attitude as turns about z, the new y and the new x; in place of wxyz.
+        rotation_vector: columns of the same as axis times angle.
         field: columns of a magnetometer.
         vector: columns of a LOS error.
         latitude_deg, longitude_deg, height: columns of a fix.
@@ -86,6 +93,8 @@ class TableTopic(BaseModel):
     gyro: _Three | None = None
     accel: _Three | None = None
     wxyz: _Four | None = None
+    yaw_pitch_roll: _Three | None = None
+    rotation_vector: _Three | None = None
     position: _Three | None = None
     field: _Three | None = None
     vector: _Three | None = None
@@ -160,6 +169,10 @@ class TableTopic(BaseModel):
         values = {
             name: (along(self.axes, one) if name in _VECTORS else one) * scales[name] for name, one in values.items()
         }
+        if self.yaw_pitch_roll is not None:
+            values["wxyz"] = of_yaw_pitch_roll(values["yaw_pitch_roll"])
+        if self.rotation_vector is not None:
+            values["wxyz"] = so3.exp(values["rotation_vector"])
         if self.video is not None:
             pictures = VideoFile(path.with_name(Path(self.video).name), len(t_ns))
             return series.ImageSeries(t_ns, pictures, "netpbm"), notes
@@ -219,6 +232,12 @@ class TableTopic(BaseModel):
         return UNITS[unit]
 
 
+def of_yaw_pitch_roll(angles: Array) -> Array:
+    """Quaternions (n, 4) of turns (n, 3) about z, the new y and the new x, rad."""
+    about_z, about_y, about_x = (so3.exp(angles[:, [i]] * axis) for i, axis in enumerate(np.eye(3)[::-1]))
+    return so3.multiply(so3.multiply(about_z, about_y), about_x)
+
+
 def _absent(names: set[str]) -> dict[str, Any]:
     """Values of an IMU's missing sensor: zeros with covariance -1, the ROS convention."""
     found: dict[str, Any] = {}
@@ -257,7 +276,8 @@ def _without_erased(
 
 
 _NUMBERS = (
-    *("gyro", "accel", "wxyz", "position", "field", "vector", "latitude_deg", "longitude_deg", "height", "celsius"),
+    *("gyro", "accel", "wxyz", "yaw_pitch_roll", "rotation_vector", "position", "field", "vector"),
+    *("latitude_deg", "longitude_deg", "height", "celsius"),
 )
 
 

@@ -150,6 +150,18 @@ CASES = {
         (1e4 * np.arange(N), np.full((N, 4), 0.5), np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))),
         {"/attitude": {"time": "timestamp", "unit": "us", "wxyz": [f"q[{i}]" for i in range(4)]}},
     ),
+    "a head tracker's angles": (
+        "t (ms),Yaw,Pitch,Roll,Yaw rate,Pitch rate,Roll rate",
+        (10 * np.arange(N), 40.0 * RATES, RATES),
+        {
+            "/attitude": {
+                "time": "t (ms)",
+                "unit": "ms",
+                "yaw_pitch_roll": ["Yaw", "Pitch", "Roll"],
+                "units": {"yaw_pitch_roll": "deg"},
+            }
+        },
+    ),
     "a pose": (
         "timestamp,qw,qx,qy,qz",
         (1.79e9 + SECONDS, np.tile([0.5, 0.5, 0.5, 0.5], (N, 1))),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
@@ -162,6 +163,18 @@ def test_units_in_a_header_are_those_of_a_config_that_says_none(tmp_path: Path) 
     np.testing.assert_allclose(imu.gyro, np.deg2rad(FIELD), rtol=1e-15)
     np.testing.assert_allclose(imu.accel, 9.80665 * FIELD, rtol=1e-15)
     assert any("gyro is in deg/s by its header" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize("key", ["yaw_pitch_roll", "rotation_vector"])
+def test_attitudes_as_angles_or_as_rotation_vectors(key: str, tmp_path: Path) -> None:
+    numbers = FIELD * [1.0, 0.5, 1.0]
+    lines = [",".join([T[i], *(f"{x:.17g}" for x in numbers[i])]) for i in range(N)]
+    (tmp_path / "x.csv").write_text("\n".join(["t,a,b,c", *lines]), encoding="utf-8")
+    config = f"columns: {{/pose: {{time: t, {key}: [a, b, c], units: {{{key}: deg}}}}}}"
+    wxyz = described(tmp_path / "x.csv", config).poses("/pose").wxyz
+    radians = np.deg2rad(numbers)
+    angles = Rotation.from_euler("ZYX", radians) if key == "yaw_pitch_roll" else Rotation.from_rotvec(radians)
+    np.testing.assert_allclose(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), angles.as_matrix(), atol=1e-12)
 
 
 def test_rows_of_one_device_of_two_and_axes_of_another_frame(tmp_path: Path) -> None:
