@@ -265,6 +265,8 @@ class _Search:
             way = ", inverted" if found.inverted else ""
             offset = f", time offset {1e3 * found.offset_s:+.0f} ms" if abs(found.offset_s) > _DELAY else ""
             self._reasons.append(f"{a.name} matches {g.name}: rate correlation {found.correlation:.2f}{offset}{way}")
+            if found.at_its_stamps:
+                self._reasons.append(f"{a.name} has the stamps of {g.name}: an attitude made of it is no reference")
         return to_choose
 
     def _twin(self, gyro: str) -> str | None:

@@ -32,6 +32,8 @@ MAX_MOUNT = 3.0 * 0.35
 # Other orders of a quaternion's components: x, y, z, w given as w, x, y, z, and the other way round; each fits as well
 # as an inverse up to so much.
 _ORDERS, _AS_WELL = ((3, 0, 1, 2), (1, 2, 3, 0)), 0.98
+# Share of the stamps that an attitude made of the gyro has in common with it; others do by chance.
+_TOGETHER = 0.99
 # An interval of an attitude so many times the usual one is a gap.
 _GAP = 3.0
 
@@ -49,6 +51,7 @@ class Pairing:
         order: of the quaternions' components, w, x, y, z, as recorded; another one where an inverse that fits is beyond
             MAX_MOUNT and another order, which fits as well, is not.
         ratio: of the gyro's rates to those of the attitude: that of their units.
+        at_its_stamps: whether the attitude has the stamps of the gyro, as one that is made of it.
     """
 
     correlation: float
@@ -58,6 +61,7 @@ class Pairing:
     angle: float = 0.0
     order: tuple[int, int, int, int] = (0, 1, 2, 3)
     ratio: float = 1.0
+    at_its_stamps: bool = False
 
 
 class _Gyro:
@@ -131,7 +135,8 @@ def pair(
         for components, (share, turned, _) in zip(_ORDERS, fits(offset, turns), strict=True):
             if share > _AS_WELL * fit and turned < MAX_MOUNT:
                 return Pairing(correlation, offset, False, share, turned, components, ratio)
-    return Pairing(correlation, offset, way == 1, fit, angle, ratio=ratio)
+    together = float(np.isin(attitude_t, gyro_t).mean()) > _TOGETHER
+    return Pairing(correlation, offset, way == 1, fit, angle, ratio=ratio, at_its_stamps=together)
 
 
 class _Seen(NamedTuple):

@@ -288,6 +288,7 @@ def test_the_parts_of_an_imu_are_no_gyros_beside_it(tmp_path: Path, alidade: Com
     write(folder / "Orientation.csv", "seconds_elapsed,qw,qx,qy,qz", t, wxyz)
     out = alidade("info", str(folder)).out
     assert "head_imu: {gyro: /imu/gyro, accel: /imu/accel}" in out
+    assert "an attitude made of it is no reference" in " ".join(out.split())
     assert "vision_attitude: /attitude" in out
 
 
