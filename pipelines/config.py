@@ -74,7 +74,7 @@ def _override(given: object) -> tuple[str, Mapping[Any, Any]]:
     if given is None:
         return "", {}
     if isinstance(given, Mapping):
-        given = validated(model(), dict(given), "config")
+        given = validated(model(), {key: value for key, value in given.items() if value is not None}, "config")
     if isinstance(given, Config):
         return "config", given.model_dump(exclude_unset=True)
     if not isinstance(given, str | Path):

@@ -294,7 +294,7 @@ class _Search:
         recording, own = self._recording, self._config.topic(topic)
         if own in recording.topics:
             return [self._config.topics.get(topic.key, TopicSource(topic=own))]
-        made = {source.name: source for source in self._config.topics.values() if source.parts}
+        made = {source.name: source for source in self._config.topics.values() if source.gyro is not None}
         taken = self._taken.union(*(source.parts for source in made.values()))
         there = [(n, t) for n, t in recording.topics.items() if t.count and t.is_readable and n not in taken]
         found = [made.get(n, TopicSource(topic=n)) for n, t in there if t.type in topic.types]

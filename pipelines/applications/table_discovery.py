@@ -57,6 +57,8 @@ _QUATERNION = "q|quat|orientation|rot|attitude"
 _UNIX_S = (0.5e9, 5e9)
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
 _TURNED = 0.1
+# Rates by steps and by a preamble are alike up to this power of ten, 5 %.
+_ALIKE = 0.02
 # Rows looked at.
 _ROWS = 20_000
 # Rates beyond a gyro's in rad/s are in deg/s up to what a gyro of 4000 deg/s may read on three axes; beyond, counts.
@@ -232,10 +234,11 @@ class _Table:
         stated = self._stated(chosen) or _unit_word(_bare(full))
         unit = stated if stated in TIME_UNITS else _time_unit(self._values[chosen])
         by = "header" if stated == unit else "steps"
-        step = 1e-9 * TIME_UNITS[unit] * _median_step(self._values[chosen])
-        # Units differ by ten and more: those of Xsens's SampleTimeFine are 0.1 ms.
-        if step > 0.0 and self._rate and abs(np.log10(step * self._rate)) > 0.5:
-            self.doubts.append(f"{self._where}{name} : no unit makes its steps {self._rate:g} Hz: not used")
+        # Another unit than these, as the 0.1 ms of Xsens's SampleTimeFine: other numbers are of something else.
+        steps = 1e-9 * TIME_UNITS[unit] * _median_step(self._values[chosen]) * self._rate
+        power = float(np.log10(steps)) if steps > 0.0 and by == "steps" else 0.0
+        if round(power) != 0 and abs(power - round(power)) < _ALIKE:
+            self.doubts.append(f"{self._where}{name} is in no known unit by the preamble's {self._rate:g} Hz: not used")
             return {}
         self.reasons.append(f"{self._where}{name} is the time, in {unit} by its {by}")
         return {"time": name} if unit == "s" else {"time": name, "unit": unit}

@@ -593,8 +593,8 @@ class Estimate:
         residuals: family -> residuals of measurements at the estimate; innovations if `has_innovations`.
         innovations: family -> those of a batch solution, predicted from what was measured before by its noise levels.
         chi_square: None for solvers that have none.
-        history: values and sigmas from what was recorded until each moment.
-        posterior_history: joint posterior at moments; None where noise levels differ between moments.
+        history: values and sigmas from what was recorded until each moment; None: not asked for.
+        posterior_history: joint posterior at moments; None: not asked for, or noise levels differ between moments.
         smoothed: values and sigmas at each moment from the whole recording, where parameters move along; the others
             are as they are at the end.
         attitudes: the trajectory, if the method has one.

@@ -21,10 +21,11 @@ _JUMP, _SPIKE = 10.0, 10.0
 # A reading at the end of the range for so many samples is clipped, if the range is more than so many quanta.
 _CLIPPED, _QUANTA = 3, 20.0
 # The end of a range may wander, as a gyro's from 7.2346 to 7.2653 rad/s: readings this near to the largest, as a share,
-# for no longer than so many s (rests and steady turns are longer) are a plateau if a quartic through them and as many
-# on either side misses by so many times their height (RMS), as it does on 92 % of plateaus of simulated motion, on none
-# of 1,300 peaks. Off three samples of a noisy peak it may: the longest plateau has so many.
-_NEAR_END, _BRIEFLY, _MISSED, _PLATEAU = 0.02, 1.0, 2.0, 6
+# for no longer than so many s (rests and steady turns are longer) are a plateau if they fall by more than a parabola,
+# so many times their height within their length before and after, and a quartic through all that misses by so many
+# times their height (RMS). So do 90 % of the plateaus of simulated swings, and none of 1,300 of their peaks. Off three
+# samples of a noisy peak they may: the longest plateau has so many.
+_NEAR_END, _BRIEFLY, _FALL, _MISSED, _PLATEAU = 0.02, 1.0, 8.0, 2.0, 6
 # Ranges begin at 2 g and .8 gauss. Gravity, or the earth's field, that lingers along an axis is at the end of none.
 _SMALLEST_RANGE = {"m/s^2": 15.0, "T": 8e-5}
 # Readings of two devices in turn: one differs from the next by so many times what it does from the next but one. Of
@@ -183,8 +184,9 @@ def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
         low, middle = np.quantile(above[first:stop], [0.25, 0.5])
         level = middle - 3.0 * (middle - low)  # what is on its way there is not on the plateau
         flat = np.flatnonzero(above[first:stop] >= level) + first
-        around = above[first - count : stop + count]
-        if _off_quartic(around) > _MISSED * np.ptp(above[flat]) and around[0] < level > around[-1]:
+        around, height = above[first - count : stop + count], np.ptp(above[flat])
+        fall = above[flat].min() - np.fmax(around[0], around[-1])
+        if fall > _FALL * height and _off_quartic(around) > _MISSED * height:
             out[flat] = True
             longest = max(longest, len(flat))
     return out & (longest >= _PLATEAU)

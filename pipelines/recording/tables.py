@@ -32,6 +32,8 @@ _LONGEST_LINE, _MOST_COLUMNS = 1 << 16, 1000
 _HEAD, _SAMPLE = 1 << 18, 200
 # Numbers of a row that begins with a word, at least: a vector.
 _LEAST_LABELLED = 3
+# Names of times, and the least share of rows that are numbered, one after the other: some are lost.
+_TIME_NAME, _COUNTED = re.compile(r"time|stamp|date|sec|^t(\W|_|$)"), 0.8
 # Rows whose cells are kept as Python's strings at once.
 _BLOCK = 1 << 16
 # Rows cut short, as by a logger that lost power, are dropped up to this share of all.
@@ -146,10 +148,11 @@ def table_form(path: Path, data: Path) -> TableForm:
     names = (
         [f"column {i + 1}" for i in range(width)] if header is None else _cells(_uncommented(lines[header]), delimiter)
     )
-    if len(names) == width - 1 and _begins_with_row_number(cells[first:]):
-        names = ["row", *names]
-    names = names[:-1] if len(names) > 1 and not names[-1] else names
     stated = [unit_named(cell) for cell in _cells(lines[units], delimiter)] if units is not None else []
+    if header is not None and _lacks_first_name(names, cells[first:], width):
+        names = ["row", *names]
+        stated = ["", *stated] if len(stated) < width else stated
+    names = names[:-1] if len(names) > 1 and not names[-1] else names
     stated += [""] * (len(names) - len(stated))
     return TableForm(
         path,
@@ -165,13 +168,17 @@ def table_form(path: Path, data: Path) -> TableForm:
     )
 
 
-def _begins_with_row_number(rows: Sequence[Sequence[str]]) -> bool:
-    """Whether rows begin with their number, which has no name where a header is one name short, and then the time."""
-    try:
-        number, time = np.array([row[:2] for row in rows[:_SAMPLE]], dtype=float).T
-    except ValueError:
+def _lacks_first_name(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> bool:
+    """Whether a header, which is one name short, has none for the number that rows begin with.
+
+    Its first name is that of a time, and what rows begin with counts them.
+    """
+    whole = [row for row in rows[:_SAMPLE] if len(row) == width]
+    if len(names) != width - 1 or not names[0] or not _TIME_NAME.search(names[0].lower()) or len(whole) < 2:
         return False
-    return len(number) > 1 and bool((np.diff(number) == 1.0).all() and (np.diff(time) > 0.0).all())
+    if not all(row[0].isdigit() and row[-1] for row in whole):
+        return False
+    return bool(np.mean(np.diff([int(row[0]) for row in whole]) == 1) > _COUNTED)
 
 
 def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:

@@ -174,15 +174,21 @@ class Camera:
         return scale[..., None] * points[..., :2], equidistant
 
     def by_intrinsics(self, points: Array) -> Array:
-        """Jacobian (..., 2, 4 + n) of projected points (..., 3) by the `intrinsics`, by OpenCV; NaN behind it."""
+        """Jacobian (..., 2, 4 + n) of projected points (..., 3) by the `intrinsics`; NaN where there are none."""
         import cv2
 
+        if self.distortion_model == "equidistant":  # that of OpenCV ends at 90 deg from the axis
+            J = np.zeros((*points.shape[:-1], 2, len(self.intrinsics)))
+            J[..., [0, 1], [0, 1]], J[..., [0, 1], [2, 3]] = self._distorted(points)[0], 1.0
+            rho = np.hypot(points[..., 0], points[..., 1])
+            powers = np.arctan2(rho, points[..., 2])[..., None] ** [3, 5, 7, 9]
+            out = points[..., :2] / np.where(rho > 0, rho, 1.0)[..., None]
+            J[..., 4:] = (self.focal * out)[..., None] * powers[..., None, :]
+            return J
         flat, still = np.where(points[..., 2:] > 0, points, np.nan).reshape(-1, 1, 3), np.zeros(3)
-        project = cv2.fisheye.projectPoints if self.distortion_model == "equidistant" else cv2.projectPoints
-        J = project(flat, still, still, self.K, self.coefficients)[1]
-        # Fisheye: f, c, k, turn, ...; else: turn, shift, f, c, k.
-        first = 0 if self.distortion_model == "equidistant" else 6
-        return np.asarray(J[:, first : first + len(self.intrinsics)].reshape(*points.shape[:-1], 2, -1))
+        J = cv2.projectPoints(flat, still, still, self.K, self.coefficients)[1]
+        # By the turn, the shift, f, c, k.
+        return np.asarray(J[:, 6 : 6 + len(self.intrinsics)].reshape(*points.shape[:-1], 2, -1))
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit directions (..., 3) in the optical frame of pixels (..., 2).

@@ -274,7 +274,7 @@ def estimate_pose(
     sigma, is_raised = (float(np.sqrt(variances[good].mean())), True) if sigma_px is None else (sigma_px, False)
     solution = _solve(camera, tags, pixels, sigma, is_raised, expected)
     expected_px = np.hypot(sigma, body.accuracy * float((edge_lengths(pixels) / tags.size).mean()))
-    if solution is None or len(tags.ids) < 3 or solution.rms_px < _WRONG_SIGMAS * expected_px:
+    if solution is None or len(mine) < 3 or solution.rms_px < _WRONG_SIGMAS * expected_px:
         return solution
     # One wrong tag spoils the fit of all: it is the one without which the others agree.
     rests = [np.arange(len(tags.ids)) != k for k in range(len(tags.ids))]

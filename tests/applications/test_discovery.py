@@ -284,6 +284,12 @@ def twins(simulated: Path, path: Path, poses: bool = False) -> Recording:
     return open_recording(path)
 
 
+def test_a_topic_that_is_named_for_another_method_serves_as_well(simulated: Path, tmp_path: Path) -> None:
+    recording = renamed(simulated, tmp_path / "s.mcap")
+    (found,) = suggestions(recording, load_config(b"topics: {imu: /xsens/data}"), ["head"])
+    assert found.topics["head_imu"].name == "/xsens/data"
+
+
 def test_rates_in_another_unit_than_the_attitudes_are_not_taken(simulated: Path, tmp_path: Path) -> None:
     whole = open_recording(simulated)
     poses, imu = whole.poses("/vision/attitude"), whole.imu("/platform/imu")

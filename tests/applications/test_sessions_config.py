@@ -43,6 +43,10 @@ def test_a_config_as_override_keeps_what_an_earlier_calibration_knows() -> None:
     assert (gaussian_prior.names, gaussian_prior.mean.tolist()) == (("delta_px",), [0.01])
 
 
+def test_a_section_without_anything_is_none_in_a_mapping_too() -> None:
+    assert load_config(None, {"noise": None, "method": "los"}).method == "los"
+
+
 def test_every_key_of_the_format() -> None:
     config = load_config(FULL)
     assert config.method == "los"

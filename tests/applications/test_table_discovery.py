@@ -110,6 +110,21 @@ CASES = {
         (np.arange(N), 1.5e9 + SECONDS, RATES),
         {"/imu": {"time": "timestamp", "gyro": [f"ang_vel_{axis}" for axis in "xyz"]}},
     ),
+    "units below such a header": (
+        "time,gx,gy,gz\ns,deg/s,deg/s,deg/s",
+        (np.delete(np.arange(N), 7), np.delete(SECONDS, 7), np.delete(RATES, 7, axis=0)),
+        {"/imu": {"time": "time", "gyro": ["gx", "gy", "gz"], "units": {"gyro": "deg/s"}}},
+    ),
+    "a frame's number and a last column without a name": (
+        "frame,time,wx,wy,wz",
+        (np.arange(N), SECONDS, RATES, np.ones(N)),
+        {"/imu": {"time": "time", "gyro": ["wx", "wy", "wz"]}},
+    ),
+    "a rate that is another one's": (
+        "# baud rate: 115200\ntime,wx,wy,wz",
+        (SECONDS, RATES),
+        {"/imu": {"time": "time", "gyro": ["wx", "wy", "wz"]}},
+    ),
     "a pose as rostopic writes it": (
         "%time,field.header.seq,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
         + ",".join(f"field.pose.orientation.{axis}" for axis in "xyzw"),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
@@ -25,6 +26,7 @@ from alidade.pipelines.methods.los.simulation import LosScenario, los_config, si
 from alidade.pipelines.methods.tumble.simulation import TumbledAccelerometer, TumbledGyro
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.recording import Recording, open_recording
+from alidade.pipelines.recording.table_topics import of_yaw_pitch_roll
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
@@ -208,6 +210,20 @@ def test_what_is_dropped_is_what_was_spoilt() -> None:
         assert np.isin(lost, spoilt).mean() >= (0.99 if fault is _clipped_where_the_end_wanders else 1.0)
         assert len(lost) > 0.8 * len(spoilt)
     assert len(drop_faults("/imu", data.gyro_t, data.gyro, {}, "rad/s")) == len(data.gyro)
+
+
+def test_a_flat_top_of_smooth_motion_is_no_saturation() -> None:
+    t = np.arange(0.0, 40.0, 0.005)
+
+    def attitude(t: Array) -> Array:
+        yaw = 0.8 * np.sin(2.0 * np.pi * 0.31 * t) + 0.3 * np.sin(2.0 * np.pi * 0.83 * t)
+        pitch, roll = 0.5 * np.sin(2.0 * np.pi * 0.43 * t + 1.0), 0.4 * np.sin(2.0 * np.pi * 0.57 * t + 2.0)
+        return of_yaw_pitch_roll(np.stack([yaw, pitch, roll], axis=1))
+
+    rate = so3.local(attitude(t - 1e-4), attitude(t + 1e-4)) / 2e-4
+    for seed in (186, 195):
+        noisy = rate + 0.002 * np.random.default_rng(seed).normal(size=len(t))[:, None]
+        assert len(drop_faults("/imu", t, noisy, {}, "rad/s")) == len(t)
 
 
 def test_gravity_that_lingers_along_an_axis_for_less_than_a_second_is_no_plateau() -> None:

@@ -269,6 +269,9 @@ def covariance(fit: Fit, view: Index) -> Covariance:
     information = np.tensordot(fit.curvature[sights.picture, None, None] * J, own, ((0, 1), (0, 1)))
     priors = np.arange(J.shape[2] - additional.free.sum(), J.shape[2])
     information[priors, priors] += additional.precision
+    diagonal = np.arange(len(information))
+    # A tag of which nothing is left is where it was, as in the adjustment.
+    information[diagonal, diagonal] += information[diagonal, diagonal] == 0.0
     white: Array = np.asarray(np.linalg.inv(information), dtype=float)
     bend, spread = bending(rows.miss, by_deformation, own, white)
     found, step = _with_priors(fit, information, _sandwich(fit, own, view, white) + spread)
