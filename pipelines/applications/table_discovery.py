@@ -40,7 +40,8 @@ _TIME = re.compile(
     r"^t_|^(t|ts|time|timestamp|stamp|sec|secs|seconds|s|ms|us|ns|millis|micros|clock|epoch|datetime|date)$"
     r"|time|stamp|elapsed|utc|millis|micros"
 )
-_RATE = re.compile(r"(?:rate|\bfs\b|freq\w*|sampling)\W*([0-9]+(?:\.[0-9]+)?)\s*(?:hz)?", re.IGNORECASE)
+# In a preamble: a rate by name, or, as Vicon's, a number alone in its line.
+_RATE = re.compile(r"(?:rate|\bfs\b|freq\w*|sampling)\W*(\d+(?:\.\d+)?)|^(\d+(?:\.\d+)?)\W*$", re.IGNORECASE)
 _VISION = re.compile(r"vision|pose|mocap|vicon|optitrack|tracker|ground|trajectory")
 # Median norms, in a unit; of an accelerometer gravity, of a magnetometer the earth's field and some iron.
 _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -50,7 +51,9 @@ _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
 # Without names these alone are taken: others are counts as often as not.
 _UNNAMED = {"accel": ("m/s^2", "g"), "field": ("uT",)}
 _ANGLES = (r"yaw(?!.*rate)|^heading$", r"pitch(?!.*rate)", r"roll(?!.*rate)")
-_OTHERS = ("wxyz", "yaw_pitch_roll", "joints", "latitude_deg")
+_ROTATION_VECTOR = re.compile(r"^r$|rot\w*.?vec|helical|axis.?angle")
+_TURNS = ("yaw_pitch_roll", "rotation_vector")
+_OTHERS = ("wxyz", *_TURNS, "joints", "latitude_deg")
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
 _QUATERNION = "q|quat|orientation|rot|attitude"
 # Unix time of the years 1985 to 2128, s.
@@ -144,8 +147,8 @@ class _Table:
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
-        rate = next((found[1] for line in self._form.preamble if (found := _RATE.search(line))), None)
-        self._rate = float(rate or 0.0)  # Hz, by its preamble
+        rate = next((found for line in self._form.preamble if (found := _RATE.search(line))), None)
+        self._rate = float(rate[rate.lastindex or 0]) if rate else 0.0  # Hz, by its preamble
         texts, _ = read_columns(self._form, names, _ROWS)
         self._texts = list(texts.values())
         self._values = [self._numbers(i) for i in range(len(names))]
@@ -182,9 +185,9 @@ class _Table:
         attitude = "/vision/attitude" if _VISION.search(self.path.stem.lower()) else "/attitude"
         if wxyz := self._quaternion():
             add(attitude, wxyz=wxyz)
-        elif angles := self._angles():
-            unit = self._unit("yaw_pitch_roll", angles)
-            add(attitude, yaw_pitch_roll=self._names(angles), units={"yaw_pitch_roll": unit} if unit == "deg" else {})
+        for key, angles in self._angles().items() if not wxyz else ():
+            unit = self._unit(key, angles)
+            add(attitude, **{key: self._names(angles)}, units={key: unit} if unit == "deg" else {})
         for topic, joints in _JOINTS.items():
             there = {joint: column for joint in joints if (column := self._called(rf"^{joint}")) is not None}
             if len(there) == len(joints):
@@ -212,8 +215,8 @@ class _Table:
         return [names[i] if names.count(names[i]) == 1 else f"column {i + 1}" for i in columns]
 
     def _called(self, word: str) -> str | None:
-        found = [i for i, name in enumerate(self._form.names) if re.search(word, name.strip().lower())]
-        return self._names(found[:1])[0] if found else None
+        found = self._matching(word)[:1]
+        return self._names(found)[0] if found else None
 
     def _time(self) -> dict[str, Any]:
         """Return column and unit of the time: an increasing column, by its name; without names the first column."""
@@ -323,7 +326,7 @@ class _Table:
             return ""
         norms = self._norms(columns)
         most = float(norms.max()) if len(norms) else 0.0
-        if kind == "yaw_pitch_roll":
+        if kind in _TURNS:
             found = "rad" if most < 2.0 * np.pi else "deg"
         elif kind == "gyro":
             found = "rad/s" if most < MAX_RATE_RAD_S else "deg/s" if most < _MOST_DEG_S else ""
@@ -337,7 +340,7 @@ class _Table:
         names = [re.sub(r"\W", "", _bare(name)) for name in self._form.names]
         for axes in ("wxyz", "0123", "1234"):
             last = re.compile(rf"({_QUATERNION})\w*{axes[0]}$")
-            for stem in [name[:-1] for name in names if last.search(name) or name == axes[0] == "w"]:
+            for stem in [name[:-1] for name in names if last.search(name) or (axes == "wxyz" and name in ("w", "rw"))]:
                 if not all(f"{stem}{axis}" in names for axis in axes):
                     continue
                 columns = [names.index(f"{stem}{axis}") for axis in axes]
@@ -348,15 +351,21 @@ class _Table:
                     return found
         return []
 
-    def _angles(self) -> list[int]:
-        """Return the columns of yaw, pitch and roll; empty without all of them."""
-        names = [_bare(name) for name in self._form.names]
-        found = [next((i for i, name in enumerate(names) if re.search(word, name)), None) for word in _ANGLES]
-        columns = [i for i in found if i is not None]
+    def _angles(self) -> dict[str, Sequence[int]]:
+        """Return the columns of yaw, pitch and roll, or of a rotation vector in rad or deg, by their key."""
+        columns: Sequence[int] = [i for word in _ANGLES for i in self._matching(word)[:1]]
+        key, how = "yaw_pitch_roll", "turns about z, the new y and the new x"
         if len(columns) < len(_ANGLES):
-            return []
-        self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are turns about z, the new y and the new x")
-        return columns
+            triads = [triad for name, triad in _along_axes(self._form.names) if _ROTATION_VECTOR.search(name)]
+            columns = next((triad for triad in triads if {self._stated(i) for i in triad} <= {"rad", "deg"}), ())
+            key, how = "rotation_vector", "axis times angle"
+        if not columns:
+            return {}
+        self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are {how}")
+        return {key: columns}
+
+    def _matching(self, word: str) -> list[int]:
+        return [i for i, name in enumerate(self._form.names) if re.search(word, _bare(name))]
 
 
 def _kind(name: str) -> str:

@@ -165,6 +165,11 @@ CASES = {
         (1e4 * np.arange(N), np.full((N, 4), 0.5), np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))),
         {"/attitude": {"time": "timestamp", "unit": "us", "wxyz": [f"q[{i}]" for i in range(4)]}},
     ),
+    "a segment as Vicon exports it": (
+        "Segments\n200\n,,Head:Head,,,,,\nFrame,Sub Frame,RX,RY,RZ,TX,TY,TZ\n,,rad,rad,rad,mm,mm,mm",
+        (np.arange(N), np.zeros(N), 0.5 * DIRECTIONS, 900.0 * DIRECTIONS),
+        {"/attitude": {"rate": 200.0, "rotation_vector": ["RX", "RY", "RZ"]}},
+    ),
     "a head tracker's angles": (
         "t (ms),Yaw,Pitch,Roll,Yaw rate,Pitch rate,Roll rate",
         (10 * np.arange(N), 40.0 * RATES, RATES),
