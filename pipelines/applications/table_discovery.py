@@ -279,6 +279,8 @@ class _Table:
             return out
         for name, columns in along:
             name = name or self.path.stem.lower()  # x, y, z alone: the file is named after the sensor
+            if "covariance" in name:
+                continue
             kind = _kind(name) or self._kind_of_units(columns)
             # ROS calls linear acceleration what has gravity in it.
             is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
@@ -375,7 +377,7 @@ def _kind(name: str) -> str:
 
 def _bare(name: str) -> str:
     """A column's name without its unit and the `field.` that `rostopic echo -p` begins all names with, lower case."""
-    plain = re.sub(r"^field\.(?=\w+\.)", "", name.strip().lower())
+    plain = re.sub(r"^field\.(?=\w\w)", "", name.strip().lower())
     return re.sub(r"\s*[(\[{][^()\[\]{}]*[)\]}]$", "", plain) if unit_hinted(name) else plain
 
 

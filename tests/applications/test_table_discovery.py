@@ -131,6 +131,14 @@ CASES = {
         (1.5e18 + 1e7 * np.arange(N), np.arange(N), 0.5 * DIRECTIONS, np.full((N, 4), 0.5)),
         {"/attitude": {"time": "time", "unit": "ns", "wxyz": [f"field.pose.orientation.{axis}" for axis in "wxyz"]}},
     ),
+    "an IMU as rostopic writes it": (
+        "%time,"
+        + ",".join(f"field.angular_velocity.{axis}" for axis in "xyz")
+        + ","
+        + ",".join(f"field.{of}_covariance{i}" for of in ("orientation", "angular_velocity") for i in range(9)),
+        (1.5e18 + 1e7 * np.arange(N), RATES, np.ones((N, 18))),
+        {"/imu": {"time": "time", "unit": "ns", "gyro": [f"field.angular_velocity.{axis}" for axis in "xyz"]}},
+    ),
     "a rigid body as Motive exports it": (
         "Format Version,1.23,Take Name,Take,Capture Frame Rate,100.000000,Rotation Type,Quaternion\n\n"
         f",Type{8 * ',Rigid Body'}\n,Name{8 * ',Head'}\n,ID{8 * ',1'}\n"
