@@ -115,6 +115,8 @@ def flow_yaml(value: object) -> str:
         return f"{{{', '.join(f'{flow_yaml(str(key))}: {flow_yaml(one)}' for key, one in value.items())}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(flow_yaml, value))}]"
+    if value is None:
+        return "null"
     if not isinstance(value, str):
         return f"{value:g}" if isinstance(value, float) else str(value).lower()
     plain = re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_/. ^-]*", value) and value.lower() not in _YAML_WORDS

@@ -53,7 +53,9 @@ _UNNAMED = {"accel": ("m/s^2", "g"), "field": ("uT",)}
 _ANGLES = (r"yaw(?!.*rate)|^heading$", r"pitch(?!.*rate)", r"roll(?!.*rate)")
 _ROTATION_VECTOR = re.compile(r"^r$|rot\w*.?vec|helical|axis.?angle")
 _TURNS = ("yaw_pitch_roll", "rotation_vector")
-_OTHERS = ("wxyz", *_TURNS, "joints", "latitude_deg")
+_OTHERS = ("wxyz", *_TURNS, "vector", "joints", "latitude_deg")
+# Errors of a tracker in elevation, about x, and in azimuth, about z.
+_LOS_ERRORS = (r"^el\w*err|^err\w*_el", r"^az\w*err|^err\w*_az")
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
 _QUATERNION = "q|quat|orientation|rot|attitude"
 # Unix time of the years 1985 to 2128, s.
@@ -188,6 +190,17 @@ class _Table:
         for key, angles in self._angles().items() if not wxyz else ():
             unit = self._unit(key, angles)
             add(attitude, **{key: self._names(angles)}, units={key: unit} if unit == "deg" else {})
+        if all(errors := [self._called(word) for word in _LOS_ERRORS]):
+            stated = {unit_hinted(str(name)) for name in errors}
+            (unit,) = stated if len(stated) == 1 else ("",)
+            self.doubts.append(
+                f"{self._where}{' and '.join(map(str, errors))} are angles, in {unit or 'rad'}, about x and z"
+            )
+            add(
+                "/los/error",
+                vector=[errors[0], None, errors[1]],
+                units={"vector": unit} if unit in ("deg", "mrad") else {},
+            )
         for topic, joints in _JOINTS.items():
             there = {joint: column for joint in joints if (column := self._called(rf"^{joint}")) is not None}
             if len(there) == len(joints):

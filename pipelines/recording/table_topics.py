@@ -39,6 +39,7 @@ from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numb
 from alidade.pipelines.recording.topics import Axes, along
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
+_ThreeOrNone = Annotated[tuple[str | None, str | None, str | None], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]
 
 _KINDS: dict[str, type[series.Series]] = {
@@ -74,7 +75,7 @@ class TableTopic(BaseModel):
         yaw_pitch_roll: columns of its attitude as turns about z, the new y and the new x; in place of wxyz.
         rotation_vector: columns of the same as axis times angle.
         field: columns of a magnetometer.
-        vector: columns of a LOS error.
+        vector: columns of a LOS error; null for one that is not measured.
         latitude_deg, longitude_deg, height: columns of a fix.
         celsius: column of a temperature.
         joints: name of a joint and its column.
@@ -97,7 +98,7 @@ class TableTopic(BaseModel):
     rotation_vector: _Three | None = None
     position: _Three | None = None
     field: _Three | None = None
-    vector: _Three | None = None
+    vector: _ThreeOrNone | None = None
     latitude_deg: str | None = None
     longitude_deg: str | None = None
     height: str | None = None
@@ -169,6 +170,10 @@ class TableTopic(BaseModel):
         values = {
             name: (along(self.axes, one) if name in _VECTORS else one) * scales[name] for name, one in values.items()
         }
+        if self.vector is not None:
+            measured = np.full((len(t_ns), 3), np.nan)
+            measured[:, [column is not None for column in self.vector]] = values["vector"]
+            values["vector"] = measured
         if self.yaw_pitch_roll is not None:
             values["wxyz"] = of_yaw_pitch_roll(values["yaw_pitch_roll"])
         if self.rotation_vector is not None:
@@ -209,7 +214,8 @@ class TableTopic(BaseModel):
 
     def _columns(self, name: str) -> list[str]:
         value = getattr(self, name)
-        return [value] if isinstance(value, str) else list(value.values() if isinstance(value, dict) else value)
+        each = [value] if isinstance(value, str) else value.values() if isinstance(value, dict) else value
+        return [column for column in each if column is not None]
 
     def _time_unit(self, form: TableForm, notes: list[str]) -> str:
         """Unit of time by the config, else by the header, else s."""

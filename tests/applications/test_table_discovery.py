@@ -12,6 +12,7 @@ from alidade import export
 from alidade.factors import so3
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
+from alidade.pipelines.config import load_config
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
@@ -178,6 +179,18 @@ CASES = {
         (np.arange(N), np.zeros(N), 0.5 * DIRECTIONS, 900.0 * DIRECTIONS),
         {"/attitude": {"rate": 200.0, "rotation_vector": ["RX", "RY", "RZ"]}},
     ),
+    "a tracker's errors": (
+        "t_ns,az_error (mrad),el_error (mrad)",
+        (1e7 * np.arange(N), 3.0 * RATES[:, :2]),
+        {
+            "/los/error": {
+                "time": "t_ns",
+                "unit": "ns",
+                "vector": ["el_error (mrad)", None, "az_error (mrad)"],
+                "units": {"vector": "mrad"},
+            }
+        },
+    ),
     "a head tracker's angles": (
         "t (ms),Yaw,Pitch,Roll,Yaw rate,Pitch rate,Roll rate",
         (10 * np.arange(N), 40.0 * RATES, RATES),
@@ -211,6 +224,7 @@ def test_columns_are_concluded(name: str, tmp_path: Path) -> None:
     plain = {topic: json.loads(table.model_dump_json(exclude_defaults=True)) for topic, table in found.columns.items()}
     assert plain == expected
     assert found.reasons or found.doubts
+    assert not expected or load_config(found.yaml.encode()).columns == found.columns, "as pasted"
 
 
 def test_a_file_is_named_after_its_sensor(tmp_path: Path) -> None:

@@ -177,6 +177,14 @@ def test_attitudes_as_angles_or_as_rotation_vectors(key: str, tmp_path: Path) ->
     np.testing.assert_allclose(Rotation.from_quat(wxyz, scalar_first=True).as_matrix(), angles.as_matrix(), atol=1e-12)
 
 
+def test_an_error_about_an_axis_that_is_not_measured_is_none(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("\n".join([HEADER, *rows()]), encoding="utf-8")
+    config = "columns: {/los/error: {time: t, vector: [mx, null, mz], units: {vector: mrad}}}"
+    found = described(tmp_path / "x.csv", config).vector("/los/error").vector
+    np.testing.assert_allclose(found[:, [0, 2]], 1e-3 * FIELD[:, [0, 2]], rtol=1e-12)
+    assert np.isnan(found[:, 1]).all()
+
+
 def test_rows_of_one_device_of_two_and_axes_of_another_frame(tmp_path: Path) -> None:
     lines = [f"{row},{i % 2}" for i, row in enumerate(rows())]
     (tmp_path / "x.csv").write_text("\n".join([f"{HEADER},I", *lines]))
