@@ -22,7 +22,16 @@ from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import TableTopic, tables_of
-from alidade.pipelines.recording.table_values import COMPATIBLE, TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
+from alidade.pipelines.recording.table_values import (
+    COMPATIBLE,
+    TIME_NAME,
+    TIME_UNITS,
+    UNITS,
+    bare_name,
+    unit_hinted,
+    unit_named,
+    unit_of,
+)
 from alidade.pipelines.recording.tables import CsvFile, numbers, read_columns
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
@@ -36,10 +45,6 @@ _WORDS = {
 # SI units of the sensors.
 _SI = {"gyro": "rad/s", "accel": "m/s^2", "field": "T"}
 _LINEAR = re.compile(r"lin|free|user|without.?g|gravity|acceleration.?no.?g")
-_TIME = re.compile(
-    r"^t_|^(t|ts|time|timestamp|stamp|sec|secs|seconds|s|ms|us|ns|millis|micros|clock|epoch|datetime|date)$"
-    r"|time|stamp|elapsed|utc|millis|micros"
-)
 # In a preamble: a rate by name, or, as Vicon's, a number alone in its line.
 _RATE = re.compile(r"(?:rate|\bfs\b|freq\w*|sampling)\W*(\d+(?:\.\d+)?)|^(\d+(?:\.\d+)?)\W*$", re.IGNORECASE)
 _VISION = re.compile(r"vision|pose|mocap|vicon|optitrack|tracker|ground|trajectory")
@@ -50,6 +55,7 @@ _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
 }
 # Without names these alone are taken: others are counts as often as not.
 _UNNAMED = {"accel": ("m/s^2", "g"), "field": ("uT",)}
+# Names of yaw, pitch and roll, of a rotation vector, and the keys of both.
 _ANGLES = (r"yaw(?!.*rate)|^heading$", r"pitch(?!.*rate)", r"roll(?!.*rate)")
 _ROTATION_VECTOR = re.compile(r"^r$|rot\w*.?vec|helical|axis.?angle")
 _TURNS = ("yaw_pitch_roll", "rotation_vector")
@@ -190,22 +196,16 @@ class _Table:
         for key, angles in self._angles().items() if not wxyz else ():
             unit = self._unit(key, angles)
             add(attitude, **{key: self._names(angles)}, units={key: unit} if unit == "deg" else {})
-        if all(errors := [self._called(word) for word in _LOS_ERRORS]):
-            stated = {unit_hinted(str(name)) for name in errors}
-            (unit,) = stated if len(stated) == 1 else ("",)
-            self.doubts.append(
-                f"{self._where}{' and '.join(map(str, errors))} are angles, in {unit or 'rad'}, about x and z"
-            )
-            add(
-                "/los/error",
-                vector=[errors[0], None, errors[1]],
-                units={"vector": unit} if unit in ("deg", "mrad") else {},
-            )
+        errors = self._first_of(_LOS_ERRORS)
+        if len(errors) == len(_LOS_ERRORS):
+            (x, z), unit = self._names(errors), self._common_unit(errors)
+            self.doubts.append(f"{self._where}{x} and {z} are angles, in {unit or 'rad'}, about x and z")
+            add("/los/error", vector=[x, None, z], units={"vector": unit} if unit in ("deg", "mrad") else {})
         for topic, joints in _JOINTS.items():
-            there = {joint: column for joint in joints if (column := self._called(rf"^{joint}")) is not None}
+            there = self._first_of([rf"^{joint}" for joint in joints])
             if len(there) == len(joints):
-                stated = {unit_hinted(name) for name in there.values()}
-                add(topic, joints=there, units={"joints": "deg"} if stated == {"deg"} else {})
+                named_so = dict(zip(joints, self._names(there), strict=True))
+                add(topic, joints=named_so, units={"joints": "deg"} if self._common_unit(there) == "deg" else {})
         place = {key: self._called(word) for key, word in (("latitude_deg", r"^lat"), ("longitude_deg", r"^lon|^lng"))}
         if all(place.values()):
             add("/fix", **place, height=self._called(r"^(alt|height|elev)") or "")
@@ -228,18 +228,23 @@ class _Table:
         return [names[i] if names.count(names[i]) == 1 else f"column {i + 1}" for i in columns]
 
     def _called(self, word: str) -> str | None:
-        found = self._matching(word)[:1]
-        return self._names(found)[0] if found else None
+        return next(iter(self._names(self._first_of([word]))), None)
+
+    def _first_of(self, words: Sequence[str]) -> list[int]:
+        """Return the first column that each word is in the name of, without those that are in none."""
+        names = [bare_name(name) for name in self._form.names]
+        found = (next((i for i, name in enumerate(names) if re.search(word, name)), None) for word in words)
+        return [i for i in found if i is not None]
 
     def _time(self) -> dict[str, Any]:
         """Return column and unit of the time: an increasing column, by its name; without names the first column."""
         increasing = [i for i in range(len(self._values)) if self._increases(i)]
-        called = [i for i in increasing if _TIME.search(_bare(self._form.names[i]))]
+        called = [i for i in increasing if TIME_NAME.search(bare_name(self._form.names[i]))]
         called += [i for i in increasing if self._stated(i) in TIME_UNITS]
         unnamed = self._form.names[0] == "column 1"
         chosen: int | None = next(iter(called), 0 if unnamed and increasing[:1] == [0] else None)
         if chosen is None:
-            still = [name for name in self._form.names if _TIME.search(_bare(name))]
+            still = [name for name in self._form.names if TIME_NAME.search(bare_name(name))]
             self.doubts += [f"{self._where}{name} is no time: it does not increase from row to row" for name in still]
             return {}
         name = self._names([chosen])[0]
@@ -247,7 +252,7 @@ class _Table:
             self.reasons.append(f"{self._where}{name} is the time, as a date or clock time")
             return {"time": name}
         full = self._form.names[chosen]
-        stated = self._stated(chosen) or _unit_word(_bare(full))
+        stated = self._stated(chosen) or _unit_word(bare_name(full))
         unit = stated if stated in TIME_UNITS else _time_unit(self._values[chosen])
         by = "header" if stated == unit else "steps"
         # Another unit than these, as the 0.1 ms of Xsens's SampleTimeFine: other numbers are of something else.
@@ -262,6 +267,11 @@ class _Table:
     def _stated(self, i: int) -> str:
         """Return the unit of column `i` by its header; empty where there is none."""
         return self._form.units[i] or unit_hinted(self._form.names[i])
+
+    def _common_unit(self, columns: Sequence[int], kind: str = "") -> str:
+        """Return the unit that all columns have by their header, as a kind of sensor's; empty where they differ."""
+        stated = {unit_of(kind, self._stated(i)) for i in columns}
+        return stated.pop() if len(stated) == 1 else ""
 
     def _increases(self, i: int) -> bool:
         if ":" in str(self._texts[i][0] if len(self._texts[i]) else ""):
@@ -309,8 +319,7 @@ class _Table:
 
     def _kind_of_units(self, columns: Sequence[int]) -> str:
         """Return the kind of sensor that measures in the unit of three columns; empty for none."""
-        stated = {self._stated(i) for i in columns}
-        units = next(iter(stated)) if len(stated) == 1 else ""
+        units = self._common_unit(columns)
         return next((kind for kind, si in _SI.items() if units in COMPATIBLE[si]), "")
 
     def _norms(self, columns: Sequence[int]) -> Array:
@@ -331,8 +340,7 @@ class _Table:
 
     def _unit(self, kind: str, columns: Sequence[int]) -> str:
         """Return the unit of three columns: by their header, else by their numbers; empty for counts."""
-        stated = {unit_of(kind, self._stated(i)) for i in columns}
-        (unit,) = stated if len(stated) == 1 else ("",)
+        unit = self._common_unit(columns, kind)
         if unit in UNITS:
             self.reasons.append(f"{self._where}{kind} is in {unit} by its header")
             return unit
@@ -352,7 +360,7 @@ class _Table:
 
     def _quaternion(self) -> list[str]:
         """Return the columns w, x, y, z of a quaternion of unit norm, or those numbered so; empty without one."""
-        names = [re.sub(r"\W", "", _bare(name)) for name in self._form.names]
+        names = [re.sub(r"\W", "", bare_name(name)) for name in self._form.names]
         for axes in ("wxyz", "0123", "1234"):
             last = re.compile(rf"({_QUATERNION})\w*{axes[0]}$")
             for stem in [name[:-1] for name in names if last.search(name) or (axes == "wxyz" and name in ("w", "rw"))]:
@@ -367,31 +375,22 @@ class _Table:
         return []
 
     def _angles(self) -> dict[str, Sequence[int]]:
-        """Return the columns of yaw, pitch and roll, or of a rotation vector in rad or deg, by their key."""
-        columns: Sequence[int] = [i for word in _ANGLES for i in self._matching(word)[:1]]
+        """Return the columns of yaw, pitch and roll, or of a rotation vector in rad or deg, by their config key."""
+        columns: Sequence[int] = self._first_of(_ANGLES)
         key, how = "yaw_pitch_roll", "turns about z, the new y and the new x"
         if len(columns) < len(_ANGLES):
             triads = [triad for name, triad in _along_axes(self._form.names) if _ROTATION_VECTOR.search(name)]
-            columns = next((triad for triad in triads if {self._stated(i) for i in triad} <= {"rad", "deg"}), ())
+            columns = next((triad for triad in triads if self._common_unit(triad) in ("rad", "deg")), ())
             key, how = "rotation_vector", "axis times angle"
         if not columns:
             return {}
         self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are {how}")
         return {key: columns}
 
-    def _matching(self, word: str) -> list[int]:
-        return [i for i, name in enumerate(self._form.names) if re.search(word, _bare(name))]
-
 
 def _kind(name: str) -> str:
     """Return the kind of sensor that a lower-case name mentions; empty for none."""
     return next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
-
-
-def _bare(name: str) -> str:
-    """A column's name without its unit and the `field.` that `rostopic echo -p` begins all names with, lower case."""
-    plain = re.sub(r"^field\.(?=\w\w)", "", name.strip().lower())
-    return re.sub(r"\s*[(\[{][^()\[\]{}]*[)\]}]$", "", plain) if unit_hinted(name) else plain
 
 
 def _unit_word(name: str) -> str:
@@ -432,7 +431,7 @@ def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
             # Of a quaternion the last three are no vector.
             if all(one in there for one in three) and fourth not in there:
                 stem = f"{name[:at]}{name[at + 1 :]}"
-                found.append((_bare(stem).strip(" _.-[]"), tuple(there[one] for one in three)))
+                found.append((bare_name(stem).strip(" _.-[]"), tuple(there[one] for one in three)))
                 break
     return found
 

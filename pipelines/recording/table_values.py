@@ -54,6 +54,11 @@ _SPELLINGS = {
 _KNOWN = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings.split()}
 # Of a quantity, for units whose letters another quantity has as well.
 _OF_QUANTITY = {("accel", "G"): "g", ("accel", "mG"): "mg", ("field", "g"): "G", ("field", "mg"): "mG"}
+# What columns of times are called, by `bare_name`.
+TIME_NAME = re.compile(
+    r"^t_|^(t|ts|time|timestamp|stamp|sec|secs|seconds|s|ms|us|ns|millis|micros|clock|epoch|datetime|date)$"
+    r"|time|stamp|elapsed|utc|millis|micros"
+)
 # Endings of names that say a unit without brackets.
 _ENDINGS = ("dps", "mdps", "rads", "radps", "mps2", "ms2", "mg", "g", "ut", "nt", "mgauss", "gauss", "ns", "us", "ms")
 
@@ -77,6 +82,12 @@ def unit_hinted(name: str) -> str:
     words = re.split(r"[_\s.]+", name.strip().lower())
     last = words[-1] if len(words) > 1 and words[-1] in _ENDINGS else ""
     return unit_in(name) or unit_named(last)
+
+
+def bare_name(name: str) -> str:
+    """A column's name without its unit and the `field.` that `rostopic echo -p` begins all names with, lower case."""
+    plain = re.sub(r"^field\.(?=\w\w)", "", name.strip().lower())
+    return re.sub(r"\s*[(\[{][^()\[\]{}]*[)\]}]$", "", plain) if unit_hinted(name) else plain
 
 
 def unit_of(quantity: str, unit: str) -> str:

@@ -23,7 +23,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
-from alidade.pipelines.recording.table_values import nanoseconds, unit_in, unit_named
+from alidade.pipelines.recording.table_values import TIME_NAME, bare_name, nanoseconds, unit_in, unit_named
 
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 # A line of a table of sensors is shorter, and has fewer columns.
@@ -32,8 +32,8 @@ _LONGEST_LINE, _MOST_COLUMNS = 1 << 16, 1000
 _HEAD, _SAMPLE = 1 << 18, 200
 # Numbers of a row that begins with a word, at least: a vector.
 _LEAST_LABELLED = 3
-# Names of times, and the least share of rows that are numbered, one after the other: some are lost.
-_TIME_NAME, _COUNTED = re.compile(r"time|stamp|date|sec|^t(\W|_|$)"), 0.8
+# Least share of rows that are numbered one after the other where rows are numbered: some are lost.
+_COUNTED = 0.8
 # Rows whose cells are kept as Python's strings at once.
 _BLOCK = 1 << 16
 # Rows cut short, as by a logger that lost power, are dropped up to this share of all.
@@ -169,12 +169,12 @@ def table_form(path: Path, data: Path) -> TableForm:
 
 
 def _lacks_first_name(names: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> bool:
-    """Whether a header, which is one name short, has none for the number that rows begin with.
+    """Whether the header of a table lacks the name of its first column, which numbers the rows.
 
-    Its first name is that of a time, and what rows begin with counts them.
+    It is one name short then, and its first name is that of a time.
     """
     whole = [row for row in rows[:_SAMPLE] if len(row) == width]
-    if len(names) != width - 1 or not names[0] or not _TIME_NAME.search(names[0].lower()) or len(whole) < 2:
+    if len(names) != width - 1 or len(whole) < 2 or not TIME_NAME.search(bare_name(names[0])):
         return False
     if not all(row[0].isdigit() and row[-1] for row in whole):
         return False
