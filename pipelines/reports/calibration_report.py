@@ -433,7 +433,7 @@ def _parameters(c: Calibration, nuisance: bool = False) -> tuple[Block, ...]:
 
 
 def _error(found: TruthResult | None, factor: float, sigma: float) -> str:
-    """Return an error with its size in sigmas, in the unit of the factor; empty without one."""
+    """Write the error of a simulated parameter, SI times `factor`, and its size in sigmas; empty without one."""
     if found is None:
         return ""
     in_sigmas = "" if found.error_sigmas is None else f" ({signed(found.error_sigmas)} σ)"

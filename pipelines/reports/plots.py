@@ -278,7 +278,7 @@ def _common_name(names: Sequence[str]) -> str:
 
 
 def _correlations(calibration: Calibration) -> Iterator[Plot]:
-    """Yield a map of the correlations, and ellipses of the strongest ones, each in units of its own two sigmas."""
+    """Yield a map of the parameters' correlations and ellipses of the strongest pairs, axes in units of two sigmas."""
     sigmas = calibration.estimate.sigmas
     free: NDArray[np.intp] = np.flatnonzero(sigmas > 0.0)
     if len(free) < 2:

@@ -54,7 +54,7 @@ def _reported_at(compiled: Compiled, values: Values, node: int, end: Reported) -
 
 
 def _known(reported: Reported, root: Array) -> tuple[Array, Array]:
-    """Filtered numbers (n,) and covariance (n, n) at a moment that has the square-root information `root`."""
+    """Reported numbers (n,) and their covariance (n, n) from the square-root information until a moment."""
     found = reported.root(root)
     now, directions = constrained(reported, found.R, found.d)
     return now.numbers, reported.covariance(directions.covariance())

@@ -147,13 +147,13 @@ class Camera:
     def _distorted(self, points: Array) -> tuple[Array, Callable[[], Array]]:
         """Distorted z = 1 coordinates (..., 2) of points, and a function that gives their Jacobian (..., 2, 3)."""
         z = points[..., 2]
-        J = np.empty((*points.shape[:-1], 2, 3))
         if self.distortion_model != "equidistant":
             z = np.where(z > 0, z, np.nan)[..., None]
             flat = points[..., :2] / z
             distorted, by_flat = self._distort(flat)
 
             def pinhole() -> Array:
+                J = np.empty((*flat.shape, 3))
                 J[..., :2] = by_flat / z[..., None]
                 J[..., 2] = -(J[..., :2] @ flat[..., None])[..., 0]
                 return J
@@ -166,6 +166,7 @@ class Camera:
 
         def equidistant() -> Array:
             out, square = points[..., :2] / np.where(rho > 0, rho, 1.0)[..., None], rho**2 + z**2
+            J = np.empty((*out.shape, 3))
             radial = (slope * z / square - scale)[..., None, None] * out[..., :, None] * out[..., None, :]
             J[..., :2] = scale[..., None, None] * np.eye(2) + radial
             J[..., 2] = -(slope * rho / square)[..., None] * out

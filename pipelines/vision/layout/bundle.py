@@ -130,7 +130,7 @@ class Gathered:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Reprojection errors in sigmas, with Jacobians computed on demand.
+    """Reprojection errors of tag corners in sigmas; their Jacobians are computed on demand.
 
     Attributes:
         miss: (m, 8) predicted - seen.
