@@ -3,7 +3,8 @@
 Every assumption of a method in turn, from a third of its prior to ten times that, with a random sign for each of its
 numbers, and nothing at all; what the calibration's status was, how far the worst of the parameters that matter was off
 in its sigmas and in what is required of it, what the headline named first, and whether something was said to change.
-`several` draws three to six effects at once from their priors, with rates, duration, grade, motion and mounts.
+`several` draws three to six effects at once from their priors, with rates, duration, grade, motion and mounts. `every`
+draws all of them: the sigmas cover every prior, so only there do the errors have a Gaussian's shares.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import kind
 
-NOTHING, SEVERAL = "nothing", "several"
+NOTHING, SEVERAL, EVERY = "nothing", "several", "every"
+DRAWN = (SEVERAL, EVERY)
 SIZES = (0.3, 1.0, 3.0, 6.0, 10.0)
 # Errors beyond the first are wrong, up to the second and half of what is required right.
 WRONG, RIGHT = 4.0, 3.0
 # Of a calibration, s: so long that the load of the machine seldom matters.
 LIMIT_S = 300.0
-# Ranges, even in the logarithm, of the settings that `several` draws where a simulator has them.
+# Ranges, even in the logarithm, of the settings that `several` and `every` draw where a simulator has them.
 RANGES = {
     "duration_s": (15.0, 600.0),
     "gyro_rate_hz": (25.0, 1000.0),
@@ -121,7 +123,7 @@ def _simulated(method: str, scenario: str | None, drawn: Mapping[str, Any], seed
 
 
 def several(case: Case) -> tuple[dict[str, Any], dict[str, float]]:
-    """Settings drawn for the seed of a case, three to six effects among them, and the numbers of these with priors."""
+    """Settings drawn for the seed of a case, its effects among them, and the numbers of these with their priors."""
     rng = np.random.default_rng([case.seed, 5])
     settings = methods.method(case.method).settings(case.scenario)
     drawn: dict[str, Any] = {"priors": {}}
@@ -145,7 +147,8 @@ def several(case: Case) -> tuple[dict[str, Any], dict[str, float]]:
         return drawn, {}  # its simulator draws them all
     known = effects(case.method, case.scenario, drawn)
     kinds = sorted(known.keys() - {NOTHING})
-    chosen = rng.choice(kinds, min(len(kinds), int(rng.integers(3, 7))), replace=False)
+    count = len(kinds) if case.effect == EVERY else min(len(kinds), int(rng.integers(3, 7)))
+    chosen = rng.choice(kinds, count, replace=False)
     numbers = {name: prior for one in chosen for name, prior in known[str(one)].items()}
     drawn["effects"] = {name: float(case.size * p * rng.standard_normal()) for name, p in numbers.items()}
     return drawn, numbers
@@ -174,7 +177,7 @@ def _mounted(rng: np.random.Generator, sigma: float | None, value: Any) -> Any:
 
 def run(case: Case, numbers: Mapping[str, float]) -> Found:
     """Simulate and solve one recording."""
-    if case.effect == SEVERAL:
+    if case.effect in DRAWN:
         drawn, numbers = several(case)
     else:
         signs = np.random.default_rng([case.seed, 2]).choice([-1.0, 1.0], len(numbers))
@@ -238,10 +241,12 @@ def report(found: Sequence[Found]) -> Iterator[str]:
     if changed:
         yield f"without any effect said to have changed: {sum(changed)} of {len(changed)}"
     yield f"within the priors inconsistent although right: {refused} of {len(right)}"
-    errors = np.abs([error for f in found if f.case.effect == SEVERAL for error in f.errors])
-    if errors.size:
+    for effect in DRAWN:
+        errors = np.abs([error for f in found if f.case.effect == effect for error in f.errors])
+        if not errors.size:
+            continue
         shares = ", ".join(f"{np.mean(errors < sigmas):.3f}" for sigmas in (1.0, 2.0, 3.0))
-        yield f"several: within 1, 2, 3 sigmas {shares} of {errors.size} errors"
+        yield f"{effect}: within 1, 2, 3 sigmas {shares} of {errors.size} errors"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -250,7 +255,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("method")
     parser.add_argument("--scenario", help="default: the nominal one")
     parser.add_argument(
-        "--only", nargs="+", metavar="EFFECT", help=f"default: all; {NOTHING}: sensors as they should be; {SEVERAL}"
+        "--only",
+        nargs="+",
+        metavar="EFFECT",
+        help=f"default: all; {NOTHING}: sensors as they should be; {SEVERAL}; {EVERY}",
     )
     parser.add_argument("--solver", default="batch", choices=("batch", "incremental"))
     parser.add_argument("--seeds", type=int, default=10)
@@ -261,7 +269,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cases = [
         Case(options.method, options.scenario, options.solver, effect, size, seed)
         for effect in options.only or swept
-        for size, seed in product({NOTHING: (0.0,), SEVERAL: (1.0,)}.get(effect, SIZES), range(options.seeds))
+        for size, seed in product(
+            {NOTHING: (0.0,), **dict.fromkeys(DRAWN, (1.0,))}.get(effect, SIZES), range(options.seeds)
+        )
     ]
     done = {} if options.out is None else {f.case: f for f in _read(options.out)}
     left = [case for case in cases if case not in done]

@@ -25,12 +25,14 @@ from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import Linearization
-from tests.support.command import Command
+from tests.support.command import LONGER, Command
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """A clock that the test moves, and the usual limit as it is outside of tests."""
     now = [100.0]
+    monkeypatch.setattr(deadline, "LEAST_S", deadline.LEAST_S / LONGER)
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     return now
 

@@ -24,19 +24,31 @@ _ALL = pytest.param((len(TRIALS), np.inf), marks=pytest.mark.slow, id="all")
 
 
 @pytest.fixture(scope="module", params=[pytest.param((1, 50.0), id="50 s of one"), _ALL])
+def extent(request: pytest.FixtureRequest) -> tuple[int, float]:
+    """How many of the trials, and how many seconds of each."""
+    count, seconds = request.param
+    return count, seconds
+
+
+def _write_trial(trial_file: Path, seconds: float, recording: Path) -> None:
+    """Convert the first `seconds` of a trial to a recording."""
+    data = converted(trial_file, recording)
+    if seconds < np.inf:
+        head = methods.method("head")
+        head.write_data(recording, head.faults.segment(data, 0.0, seconds), None, CONFIG)
+
+
+@pytest.fixture(scope="module")
 def scored(
-    request: pytest.FixtureRequest, shared_data: Path, tmp_path_factory: pytest.TempPathFactory
+    extent: tuple[int, float], shared_data: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, tuple[Calibration, Score]]:
     """The batch calibration of each trial, through the files that it writes."""
     out = {}
-    count, seconds = request.param
+    count, seconds = extent
     for name in list(TRIALS)[:count]:
         trial_file = shared_data / "broad" / f"{name}.mat"
         folder = tmp_path_factory.mktemp(name)
-        data = converted(trial_file, folder / "s.mcap")
-        if seconds < np.inf:
-            head = methods.method("head")
-            head.write_data(folder / "s.mcap", head.faults.segment(data, 0.0, seconds), None, CONFIG)
+        _write_trial(trial_file, seconds, folder / "s.mcap")
         (calibration,) = calibrate(folder / "s.mcap", ["batch"])
         write_results(folder / "results", calibration)
         out[name] = calibration, score_results(read_trial(trial_file), folder / "results")
@@ -73,10 +85,10 @@ def test_chi_square_fits_the_stated_noise(scored: dict[str, tuple[Calibration, S
 
 @pytest.mark.slow
 def test_wrong_noise_is_said_plainly_and_changes_nothing(
-    scored: dict[str, tuple[Calibration, Score]], tmp_path: Path, shared_data: Path
+    scored: dict[str, tuple[Calibration, Score]], extent: tuple[int, float], tmp_path: Path, shared_data: Path
 ) -> None:
     name = next(iter(TRIALS))
-    converted(shared_data / "broad" / f"{name}.mat", tmp_path / "s.mcap")
+    _write_trial(shared_data / "broad" / f"{name}.mat", extent[1], tmp_path / "s.mcap")
     (tmp_path / "noise.yaml").write_text("noise: {vision_attitude: 0.004}\n")
     (calibration,) = calibrate(tmp_path / "s.mcap", ["batch"], config=tmp_path / "noise.yaml")
     right = scored[name][0]

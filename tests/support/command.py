@@ -13,3 +13,6 @@ class Run(NamedTuple):
 
 
 Command = Callable[..., Run]
+
+# Times the usual time limit in the tests' own process.
+LONGER = 10.0
