@@ -619,8 +619,8 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     columns = propose_columns(recording)
     if columns is not None and columns.columns:
         raise NotARecordingError(
-            f"{recording.path}: a table needs `columns:` in the config; `alidade info` proposes them to paste, "
-            "`--auto-columns` uses the proposal"
+            f"{recording.path}: tables, and messages of unknown types, need `columns:` in the config; `alidade info` "
+            "proposes them to paste, `--auto-columns` uses the proposal"
         )
     raise InputError(
         f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "

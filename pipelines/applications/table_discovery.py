@@ -8,7 +8,8 @@ its reasons, and with what could not be concluded.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
+from alidade.pipelines.recording.message_tables import message_tables
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import TableTopic, tables_of
@@ -32,7 +34,7 @@ from alidade.pipelines.recording.table_values import (
     unit_named,
     unit_of,
 )
-from alidade.pipelines.recording.tables import CsvFile, numbers, read_columns
+from alidade.pipelines.recording.tables import Table, numbers
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
 
@@ -47,7 +49,7 @@ _SI = {"gyro": "rad/s", "accel": "m/s^2", "field": "T"}
 _LINEAR = re.compile(r"lin|free|user|without.?g|gravity|acceleration.?no.?g")
 # In a preamble: a rate by name, or, as Vicon's, a number alone in its line.
 _RATE = re.compile(r"(?:rate|\bfs\b|freq\w*|sampling)\W*(\d+(?:\.\d+)?)|^(\d+(?:\.\d+)?)\W*$", re.IGNORECASE)
-_VISION = re.compile(r"vision|pose|mocap|vicon|optitrack|tracker|ground|trajectory")
+_VISION = re.compile(r"vision|visual|pose|mocap|vicon|optitrack|tracker|ground|trajectory")
 # Median norms, in a unit; of an accelerometer gravity, of a magnetometer the earth's field and some iron.
 _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "accel": {"m/s^2": (8.0, 12.0), "g": (0.8, 1.25), "mg": (800.0, 1250.0)},
@@ -111,22 +113,32 @@ class Columns:
 
 
 def propose_columns(recording: Recording) -> Columns | None:
-    """Propose the columns of a recording's tables that no config describes; None if there is no such table."""
-    tables = tables_of(recording.container)
-    if not tables:
-        return None
-    found = [_Table(table, len(tables) > 1) for table in tables.values()]
+    """Propose the columns of a recording's tables that no config describes; None if there is no such table.
+
+    Messages of types that are not known count as tables where they have something that is.
+    """
+    files = tables_of(recording.container)
+    found = [_Table(table, len(files) > 1) for table in files.values()]
+    made = [one.topics() for one in found]
+    for table in message_tables(recording.container).values():
+        with suppress(InputError):  # what cannot be read is no proposal
+            if not table.is_known and table.form.names:
+                one = _Table(table, True)
+                if topics := one.topics():
+                    found, made = [*found, one], [*made, topics]
     columns: dict[str, TableTopic] = {}
-    for one in found:
-        for topic, table in one.topics().items():
-            columns[_free(topic, one.path, columns)] = table
+    for one, topics in zip(found, made, strict=True):
+        for topic, described in topics.items():
+            columns[_free(topic, one.path, {*columns, *recording.topics})] = described
+    if not found:
+        return None
     gyros = [name for name, table in columns.items() if table.gyro and not table.accel]
     accels = [name for name, table in columns.items() if table.accel and not table.gyro]
-    topics = {"imu": TopicSource(gyro=gyros[0], accel=accels[0])} if len(gyros) == len(accels) == 1 else {}
+    sources = {"imu": TopicSource(gyro=gyros[0], accel=accels[0])} if len(gyros) == len(accels) == 1 else {}
     if len(gyros) + len(accels) == 1 and "/imu" not in columns:
-        topics = {"imu": TopicSource(topic=(gyros or accels)[0])}
+        sources = {"imu": TopicSource(topic=(gyros or accels)[0])}
     reasons = tuple(reason for one in found for reason in one.reasons)
-    return Columns(columns, topics, reasons, tuple(doubt for one in found for doubt in one.doubts))
+    return Columns(columns, sources, reasons, tuple(doubt for one in found for doubt in one.doubts))
 
 
 def with_columns(recording: Recording, config: Config) -> tuple[Recording, Config]:
@@ -148,16 +160,16 @@ def with_columns(recording: Recording, config: Config) -> tuple[Recording, Confi
 class _Table:
     """Sensors, units and time that are recognised in one table."""
 
-    def __init__(self, table: CsvFile, is_named: bool) -> None:
-        self.path, self._form = table.path, table.form
-        self._file = table.path.name if is_named else None
-        self._where = f"{table.path.name}: " if is_named else ""
+    def __init__(self, table: Table, is_named: bool) -> None:
+        self.path, self._form = table.form.path, table.form
+        self._file = table.name if is_named else None
+        self._where = f"{table.name}: " if is_named else ""
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
         rate = next((found for line in self._form.preamble if (found := _RATE.search(line))), None)
         self._rate = float(rate[rate.lastindex or 0]) if rate else 0.0  # Hz, by its preamble
-        texts, _ = read_columns(self._form, names, _ROWS)
+        texts, _ = table.read(names, _ROWS)
         self._texts = list(texts.values())
         self._values = [self._numbers(i) for i in range(len(names))]
 
@@ -308,6 +320,8 @@ class _Table:
             # ROS calls linear acceleration what has gravity in it.
             is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
             norms = self._norms(columns)
+            if len(norms) > 1 and not any(np.ptp(self._values[i]) for i in columns):
+                continue  # a placeholder
             if is_linear or (kind == "accel" and len(norms) and lacks_gravity(norms)):
                 self.doubts.append(f"{self._where}{self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
             elif kind and kind not in out:
@@ -436,6 +450,6 @@ def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
     return found
 
 
-def _free(topic: str, path: Path, taken: Mapping[str, TableTopic]) -> str:
+def _free(topic: str, path: Path, taken: Collection[str]) -> str:
     """Return the topic's name, extended by the table's name if another table has a topic of that name."""
     return topic if topic not in taken else f"{topic}/{re.sub(r'[^a-z0-9]+', '_', path.stem.lower())}"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Stamps
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.container import Channel, Container, MessageBlock, Schema, combined_sha256, file_sha256
 from alidade.pipelines.recording.messages import Definition, definition_text, known
@@ -123,6 +123,7 @@ class ArrayContainer(Container):
         assumptions: sentences about what was assumed.
         data: file they were read from; None: `path`.
         files: whose digests make that of the recording; none: `path` alone.
+        log_ns: log times, Unix ns, of the topics whose messages were not recorded at their stamps.
     """
 
     def __init__(
@@ -132,9 +133,10 @@ class ArrayContainer(Container):
         assumptions: Sequence[str] = (),
         data: Path | None = None,
         files: Sequence[Path] = (),
+        log_ns: Mapping[str, Stamps] | None = None,
     ) -> None:
         super().__init__(path, data)
-        self.assumptions, self._files = tuple(assumptions), files
+        self.assumptions, self._files, self._log_ns = tuple(assumptions), files, log_ns or {}
         self._topics = dict(enumerate(topics.values(), start=1))
         for number, (name, topic) in enumerate(topics.items(), start=1):
             kind = encode_series(topic).definition.name
@@ -150,6 +152,7 @@ class ArrayContainer(Container):
         """Messages of these channels, one channel after the other."""
         for number in sorted(channels):
             encoder = encode_series(self._topics[number])
+            encoder.log_ns = self._log_ns.get(self.channels[number].topic, encoder.log_ns)
             step = _VARYING_BLOCK if encoder.varies else _UNIFORM_BLOCK
             for start in range(0, self.counts[number], step):
                 yield encoder.block(number, min(step, self.counts[number] - start))

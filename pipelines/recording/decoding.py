@@ -19,7 +19,7 @@ from alidade.factors.array import Array, Stamps
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.container import Channel, MessageBlock, Schema, byte_windows
 from alidade.pipelines.recording.messages import Definition, Language, Layout, Leaf, MessageError, Wire, at
-from alidade.pipelines.recording.translation import Translation, is_foxglove, ros_type
+from alidade.pipelines.recording.translation import Translation, cells, is_foxglove, parser, ros_type
 
 # Stamps and log times (N,), Unix ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -33,6 +33,8 @@ _ROS: dict[str, tuple[Wire, Language]] = {
 }
 _TRANSLATED = ("protobuf/protobuf", "json/jsonschema")
 READABLE = (*_ROS, *_TRANSLATED)
+# Of a table of messages the column of the times at which these were recorded.
+LOG_TIME = "log_time"
 # Encoding that is not read -> how to get one that is.
 _CONVERSIONS = {
     "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
@@ -279,6 +281,44 @@ class MessageFormat:
             with at_log_time(log_ns):
                 content = definition.decode(block.message(i))
             yield DecodedMessage(stamp, bool(absent[i]), content, definition)
+
+    def cells(self, block: MessageBlock) -> Iterator[dict[str, Any]]:
+        """Yield the numbers and words of each message of a block by their paths, whatever its type.
+
+        LOG_TIME is the time at which a message was recorded, Unix ns. Raises MessageError.
+        """
+        assert self._schema is not None
+        parse = parser(self._recorded if self._wire else self._schema)
+        for i, log_ns in enumerate(block.log_ns.tolist()):
+            with at_log_time(log_ns):
+                try:
+                    found = dict(cells(parse(block.message(i))))
+                except (ValueError, AttributeError, RecursionError) as error:
+                    raise MessageError(f"a message of {block.size[i]} bytes cannot be read ({error})") from error
+            yield found | {LOG_TIME: log_ns}
+
+    def texts(self, block: MessageBlock, names: Sequence[str]) -> list[NDArray[np.str_]]:
+        """Return some of the `cells` of a block's messages as texts (N,) by name, empty where a message lacks one.
+
+        Messages of ROS that are laid out alike are read at once, fifty times as fast. Raises MessageError.
+        """
+        if self._wire and len(block.start):
+            data = block.message(0)
+            layout = self._recorded.layout(data)
+            if layout is not None and (block.size == len(data)).all():
+                rows = byte_windows(block.buffer, len(data))[block.start].view(np.uint8).reshape(-1, len(data))
+                if layout.agrees(rows).all():  # in words as well
+                    first = next(self.cells(block))
+                    alike = {name: np.full(len(rows), first.get(name, "")) for name in names}
+                    columns = alike | layout.numbers(names, rows) | {LOG_TIME: block.log_ns}
+                    return [columns[name].astype(str) for name in names]
+        each = [[cells.get(name, "") for name in names] for cells in self.cells(block)]
+        return [np.array(list(map(str, column)), dtype=np.str_) for column in zip(*each, strict=True)]
+
+    @property
+    def is_parsed(self) -> bool:
+        """Whether messages of this encoding can be read, whatever their type."""
+        return self._schema is not None and (self._wire is not None or self.encoding in _TRANSLATED)
 
     @cached_property
     def _recorded(self) -> Definition:

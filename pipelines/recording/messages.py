@@ -7,6 +7,7 @@ serves every message with the same size, strings and lengths; the others are dec
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from typing import Any, Literal
@@ -119,6 +120,19 @@ class Layout:
                 raise KeyError(path)
             end = leaf.offset + leaf.count * leaf.dtype.itemsize
         return Leaf(path, found[0].offset, found[0].dtype, sum(leaf.count for leaf in found))
+
+    def numbers(self, names: Iterable[str], messages: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+        """Return the numbers (n,) called `gyro_rad[0]`, or `header.stamp` (ns), in messages (n, size), by name."""
+        leaves, found = {leaf.path: leaf for leaf in self.leaves}, dict[str, NDArray[Any]]()
+        for name in names:
+            path, _, at = name.removesuffix("]").rpartition("[") if name.endswith("]") else (name, "", "0")
+            if path in leaves and int(at) < leaves[path].count:
+                values = leaves[path].of(messages)[:, int(at)]
+                found[name] = values.astype(float) if values.dtype.kind == "f" else values
+            elif f"{name}.nanosec" in leaves:
+                sec, nanosec = (leaves[f"{name}.{part}"].of(messages)[:, 0] for part in ("sec", "nanosec"))
+                found[name] = 1_000_000_000 * sec.astype(np.int64) + nanosec
+        return found
 
     def agrees(self, messages: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Mask (n,) of the messages (n, size) that have this layout."""

@@ -19,13 +19,15 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Stamps
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, MultiPartContainer
+from alidade.pipelines.recording.decoding import LOG_TIME
 from alidade.pipelines.recording.images import VideoFile
+from alidade.pipelines.recording.message_tables import WithTables, message_tables
 from alidade.pipelines.recording.table_values import (
     COMPATIBLE,
     TIME_UNITS,
@@ -35,7 +37,7 @@ from alidade.pipelines.recording.table_values import (
     of_rate,
     unit_of,
 )
-from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns
+from alidade.pipelines.recording.tables import CsvFile, Table, TableHead, numbers, numbers_or_times
 from alidade.pipelines.recording.topics import Axes, along
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
@@ -66,7 +68,7 @@ class TableTopic(BaseModel):
     """A topic made of columns of a table: where its time and its numbers are.
 
     Attributes:
-        file: name of the file; needed where there are several tables.
+        file: name of the file, needed where there are several tables; or of the topic whose messages are the rows.
         time: column of the stamps: numbers, or dates as ISO 8601 has them.
         unit: what they count; without it what the header says, else s.
         rate: Hz, of rows without a time.
@@ -137,19 +139,19 @@ class TableTopic(BaseModel):
         return [*stamps, *self.where, *(name for found in self._given.values() for name in found)]
 
     def to_series(
-        self, topic: str, form: TableForm, columns: Mapping[str, NDArray[np.str_]]
-    ) -> tuple[series.Topic, list[str]]:
-        """Return the topic as a series, and sentences about assumptions and left-out rows.
+        self, topic: str, form: TableHead, columns: Mapping[str, NDArray[np.str_]]
+    ) -> tuple[series.Topic, Stamps | None, list[str]]:
+        """Return the topic as a series, its log times, Unix ns, if any, and sentences about assumptions and lost rows.
 
         Rows without a number in any of its columns are left out. Raises InputError.
 
         Args:
             topic: its name.
             form: the table.
-            columns: texts of its columns, `names` at least.
+            columns: texts of its columns, `names` at least; of a table of messages LOG_TIME as well.
         """
         path, given, notes = form.path, self._given, list[str]()
-        columns = {name: columns[name] for name in self.names}
+        columns = {name: columns[name] for name in (*self.names, *({LOG_TIME} & columns.keys()))}
         rows = self._rows(path, columns)
         columns = {name: column[rows] for name, column in columns.items()}
         values = {name: numbers(path, columns, found) for name, found in given.items()}
@@ -163,7 +165,9 @@ class TableTopic(BaseModel):
             unit = self._time_unit(form, notes)
             t_ns = nanoseconds(path, columns[self.time][filled], unit)
         values = {name: one[filled] for name, one in values.items()}
-        t_ns, values = _without_erased(path, t_ns, values, notes)
+        log_ns = nanoseconds(path, columns[LOG_TIME][filled], "ns") if LOG_TIME in columns else None
+        if log_ns is None:
+            t_ns, values = _without_erased(path, t_ns, values, notes)
         if not self._is_slow and self.time is not None:
             check_steps(path, topic, t_ns, unit, SLOWEST_GYRO_S if self.gyro else SLOWEST_S)
         scales = {name: self._scale(name, form, notes) for name in values}
@@ -180,9 +184,9 @@ class TableTopic(BaseModel):
             values["wxyz"] = so3.exp(values["rotation_vector"])
         if self.video is not None:
             pictures = VideoFile(path.with_name(Path(self.video).name), len(t_ns))
-            return series.ImageSeries(t_ns, pictures, "netpbm"), notes
+            return series.ImageSeries(t_ns, pictures, "netpbm"), log_ns, notes
         if self.joints is not None:
-            return series.JointSeries(t_ns, values["joints"], tuple(self.joints)), notes
+            return series.JointSeries(t_ns, values["joints"], tuple(self.joints)), log_ns, notes
         kind = next(kind for name, kind in _KINDS.items() if name in values)
         shaped: dict[str, Any] = {
             name: one.reshape(len(t_ns), *kind.COLUMNS[name].shape)
@@ -191,7 +195,7 @@ class TableTopic(BaseModel):
         }
         if kind is series.ImuSeries:
             shaped |= _absent({"gyro", "accel"} - values.keys())
-        return kind(t_ns, **shaped), notes
+        return kind(t_ns, **shaped), log_ns, notes
 
     @property
     def _given(self) -> dict[str, list[str]]:
@@ -217,7 +221,7 @@ class TableTopic(BaseModel):
         each = [value] if isinstance(value, str) else value.values() if isinstance(value, dict) else value
         return [column for column in each if column is not None]
 
-    def _time_unit(self, form: TableForm, notes: list[str]) -> str:
+    def _time_unit(self, form: TableHead, notes: list[str]) -> str:
         """Unit of time by the config, else by the header, else s."""
         stated = "" if self.time is None else form.units[form.index(self.time)]
         if self.unit is not None or stated not in TIME_UNITS:
@@ -226,7 +230,7 @@ class TableTopic(BaseModel):
             notes.append(f"{form.path.name}: {self.time} is in {stated} by its header")
         return stated
 
-    def _scale(self, name: str, form: TableForm, notes: list[str]) -> float:
+    def _scale(self, name: str, form: TableHead, notes: list[str]) -> float:
         """Return the factor to SI of a quantity's unit: by the config, else by the header of its columns, else 1."""
         if name in self.units:
             return UNITS[self.units[name]]
@@ -288,28 +292,44 @@ _NUMBERS = (
 
 
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:
-    """Return a container with its tables read as the config describes. Raises InputError for a missing table."""
-    tables = tables_of(container)
-    by_file: dict[str, dict[str, TableTopic]] = {}
+    """Return a container with its tables, and its messages, read as the config describes.
+
+    Raises InputError for a missing table, or a topic that is recorded under the same name.
+    """
+    files = tables_of(container)
+    tables: Mapping[str, Table] = {**message_tables(container), **files}
+    recorded = {channel.topic for channel in container.channels.values()}
+    by_table: dict[str, dict[str, TableTopic]] = {}
     for topic, table in columns.items():
-        if (table.file is None and len(tables) != 1) or (table.file is not None and table.file not in tables):
+        if (table.file is None and len(files) != 1) or (table.file is not None and table.file not in tables):
             there = ", ".join(tables) or "none"
             wanted = (
                 f"no table {table.file}{nearest(table.file, list(tables))}" if table.file else "which table is meant?"
             )
             raise InputError(f"{container.path}: columns.{topic}.file: {wanted}; tables there: {there}")
-        by_file.setdefault(table.file or next(iter(tables)), {})[topic] = table
+        if topic in recorded:
+            raise InputError(
+                f"{container.path}: columns.{topic}: a topic of that name was recorded; choose another, and name it "
+                "under `topics:`"
+            )
+        by_table.setdefault(table.file or next(iter(files)), {})[topic] = table
     of: dict[str, dict[str, series.Topic]] = {}
+    logged: dict[str, Stamps] = {}
     notes: list[str] = []
-    for name, topics in by_file.items():
+    for name, topics in by_table.items():
         form = tables[name].form
-        needed = dict.fromkeys(column for table in topics.values() for column in table.names)
-        texts, left_out = read_columns(form, list(needed))
+        needed = [column for table in topics.values() for column in table.names]
+        texts, left_out = tables[name].read(list(dict.fromkeys([*needed, *([] if name in files else [LOG_TIME])])))
         notes += left_out
-        found = {topic: table.to_series(topic, form, texts) for topic, table in topics.items()}
-        of[name] = {topic: made for topic, (made, _) in found.items()}
-        notes += [note for _, concluded in found.values() for note in concluded]
+        of[name] = {}
+        for topic, table in topics.items():
+            of[name][topic], log_ns, concluded = table.to_series(topic, form, texts)
+            logged |= {} if log_ns is None else {topic: log_ns}
+            notes += concluded
     whole = _with_topics(container, of)
+    if logged:
+        of_messages = {topic: made for topics in of.values() for topic, made in topics.items() if topic in logged}
+        whole = WithTables(whole, ArrayContainer(container.path, of_messages, log_ns=logged))
     whole.assumptions = tuple(dict.fromkeys([*whole.assumptions, *notes]))
     return whole
 
@@ -317,7 +337,7 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
 def tables_of(container: Container) -> dict[str, CsvFile]:
     """The CSV files in a container, by name."""
     if isinstance(container, CsvFile):
-        return {container.path.name: container}
+        return {container.name: container}
     parts = container.parts if isinstance(container, MultiPartContainer) else ()
     return {name: table for part in parts for name, table in tables_of(part).items()}
 

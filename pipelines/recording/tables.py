@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,31 +48,19 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|
 
 
 @dataclass(frozen=True)
-class TableForm:
-    """Format of a table in a text file: encoding, delimiter, decimal mark, columns.
+class TableHead:
+    """Names and units of a table's columns.
 
     Attributes:
-        path: as it was named.
-        data: the file to read.
-        encoding: of its text.
-        delimiter: between cells; a blank stands for one or more.
-        decimal: mark of a fraction, a point or a comma.
+        path: of the table, as it was named.
         names: of its columns; `column 1` and so on where it has no header.
         units: of its columns as the header has them, in the words of `table_values.UNITS`; empty where it says nothing.
-        first: number of lines ahead of its first row.
-        width: cells of a row.
         preamble: what stands ahead of the header.
     """
 
     path: Path
-    data: Path
-    encoding: str
-    delimiter: str
-    decimal: str
     names: tuple[str, ...]
     units: tuple[str, ...]
-    first: int
-    width: int
     preamble: tuple[str, ...]
 
     def index(self, name: str) -> int:
@@ -86,6 +75,42 @@ class TableForm:
             places = " and ".join(f"`column {i + 1}`" for i in found)
             raise InputError(f"{self.path}: {len(found)} columns are called {name}; name one of them as {places}")
         return found[0]
+
+
+@dataclass(frozen=True)
+class TableForm(TableHead):
+    """Format of a table in a text file: encoding, delimiter, decimal mark, columns.
+
+    Attributes:
+        data: the file to read.
+        encoding: of its text.
+        delimiter: between cells; a blank stands for one or more.
+        decimal: mark of a fraction, a point or a comma.
+        first: number of lines ahead of its first row.
+        width: cells of a row.
+    """
+
+    data: Path
+    encoding: str
+    delimiter: str
+    decimal: str
+    first: int
+    width: int
+
+
+class Table(Protocol):
+    """Rows of named columns: a text file, or the messages of a topic."""
+
+    @property
+    def name(self) -> str:
+        """Name under `columns:`, `file`."""
+
+    @property
+    def form(self) -> TableHead:
+        """Names and units of the columns."""
+
+    def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+        """Return the named columns as texts, and sentences about rows that are left out; see `read_columns`."""
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
@@ -111,7 +136,11 @@ class CsvFile(ArrayContainer):
         columns = ", ".join(form.names[:40])
         assumed = f"a table with the columns {columns}; `columns:` in the config says which is what"
         super().__init__(form.path, {}, [assumed], form.data)
-        self.form = form
+        self.name, self.form = form.path.name, form
+
+    def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+        """Return the named columns as texts, and sentences about rows that are left out; see `read_columns`."""
+        return read_columns(self.form, names, most)
 
 
 def looks_like_text(start: bytes) -> bool:
@@ -156,15 +185,15 @@ def table_form(path: Path, data: Path) -> TableForm:
     stated += [""] * (len(names) - len(stated))
     return TableForm(
         path,
+        tuple(names),
+        tuple(unit_in(name) or unit for name, unit in zip(names, stated, strict=False)),
+        tuple(line.strip() for line in lines[: first if header is None else header] if line.strip()),
         data,
         encoding,
         delimiter,
         decimal,
-        tuple(names),
-        tuple(unit_in(name) or unit for name, unit in zip(names, stated, strict=False)),
         first,
         min(width, len(names)),
-        tuple(line.strip() for line in lines[: first if header is None else header] if line.strip()),
     )
 
 

@@ -8,8 +8,9 @@ does not say is NaN; a covariance is zero, unknown.
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ _FOXGLOVE = {
     "RawImage": messages.IMAGE,
     "LocationFix": messages.NAV_SAT_FIX,
 }
+# Numbers of a list that are columns of a table at most: a covariance has 36.
+_LONGEST = 64
 # Names of the two parts of a time.
 _SECONDS, _NANOSECONDS = ("sec", "seconds", "secs"), ("nanosec", "nsec", "nanos", "nsecs")
 
@@ -57,11 +60,7 @@ class Translation:
 
     def __init__(self, recorded: Schema | Definition, definition: Definition) -> None:
         self._definition = definition
-        self._parse: Callable[[bytes], Any]
-        if isinstance(recorded, Definition):
-            self._parse = recorded.decode
-        else:
-            self._parse = _protobuf(recorded) if recorded.encoding == "protobuf" else _json
+        self._parse = parser(recorded)
 
     def __call__(self, data: bytes) -> bytes:
         """Translate one message into the bytes of a CDR message."""
@@ -110,6 +109,45 @@ class Translation:
         if values.ndim != 1 or count not in (0, len(values)):
             raise ValueError(f"{name}: shape {values.shape} instead of {count or 'a list'}")
         return values
+
+
+def parser(recorded: Schema | Definition) -> Callable[[bytes], Any]:
+    """Return the function from a message's bytes to its fields: an object of ROS or protobuf, or JSON's mapping.
+
+    Raises MessageError for a definition that cannot be read; the function MessageError or ValueError.
+    """
+    if isinstance(recorded, Definition):
+        return recorded.decode
+    return _protobuf(recorded) if recorded.encoding == "protobuf" else _json
+
+
+def cells(tree: Any, name: str = "") -> Iterator[tuple[str, int | float | str]]:
+    """Yield the numbers and words in a message's fields by path, `header.stamp`, `gyro_rad[0]`; true and false as 1, 0.
+
+    A time of seconds and nanoseconds is one number, ns. Lists of more than `_LONGEST` numbers are left out, as pictures
+    are.
+    """
+    if isinstance(tree, (bool, int, float, str, np.generic)):
+        yield name, int(tree) if isinstance(tree, (bool, np.bool_)) else tree  # type: ignore[misc]
+    elif hasattr(tree, "__len__") and not isinstance(tree, (bytes, Mapping)):
+        for i, each in enumerate(tree if len(tree) <= _LONGEST else ()):
+            yield from cells(each, f"{name}[{i}]")
+    elif not isinstance(tree, (bytes, type(None))):
+        fields = _field_names(tree)
+        if len(fields) == 2 and fields[0] in _SECONDS and fields[1] in _NANOSECONDS:
+            yield name, int(_get(tree, fields[0]) or 0) * 1_000_000_000 + int(_get(tree, fields[1]) or 0)
+            return
+        for field in fields:
+            yield from cells(_get(tree, field), f"{name}.{field}" if name else field)
+
+
+def _field_names(tree: Any) -> list[str]:
+    """Return the names of a message's fields, in order."""
+    if isinstance(tree, Mapping):
+        return list(map(str, tree))
+    if hasattr(tree, "__msgtype__"):
+        return [each.name for each in dataclasses.fields(tree) if each.name != "__msgtype__"]
+    return [each.name for each in tree.DESCRIPTOR.fields]
 
 
 def _scalar(kind: str, found: Any) -> Any:

@@ -1,0 +1,266 @@
+"""Messages of a laboratory's own types, described as tables: ROS 2, ROS 1, JSON, protobuf."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from alidade.factors import so3
+from alidade.factors.array import Array
+from alidade.pipelines.applications.table_discovery import propose_columns
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.decoding import MessageFormat
+from alidade.pipelines.recording.message_tables import message_tables
+from alidade.pipelines.recording.opening import open_container
+from alidade.pipelines.recording.recording import open_recording
+from alidade.pipelines.recording.table_topics import TableTopic
+from tests.support.command import Command
+
+START = 1_700_000_000_000_000_000
+# What a laboratory calls its IMU: rates in deg/s, one array and three numbers, a device's number and name.
+RAW = "float64[3] rate_dps\nfloat32 ax\nfloat32 ay\nfloat32 az\nuint8 device\nstring name\n"
+COLUMNS = ["rate_dps[0]", "rate_dps[1]", "rate_dps[2]", "ax", "ay", "az"]
+RNG = np.random.default_rng(5)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A body that turns: stamps (n,) s, attitude (n, 4), rates (n, 3) rad/s and specific force (n, 3) m/s^2."""
+
+    t: Array
+    wxyz: Array
+    rates: Array
+    force: Array
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    """20 s at 100 Hz, swings of half a radian about three axes."""
+    t = np.arange(0.0, 20.0, 1e-2)
+    hertz, phase = np.array([[0.31], [0.43], [0.23]]), np.array([[0.0], [1.0], [2.0]])
+    yaw, pitch, roll = 0.5 * np.sin(2.0 * np.pi * hertz * t + phase)
+    axes = np.eye(3)
+    about = [so3.exp(angle[:, None] * axis) for angle, axis in zip((yaw, pitch, roll), axes[::-1], strict=True)]
+    wxyz = so3.multiply(so3.multiply(about[0], about[1]), about[2])
+    rates = so3.log(so3.multiply(so3.inverse(wxyz[:-1]), wxyz[1:])) / 1e-2
+    force = so3.rotate(so3.inverse(wxyz), np.array([0.0, 0.0, 9.81]))
+    return Motion(t[:-1], wxyz[:-1], rates + RNG.normal(0.0, 2e-3, rates.shape), force[:-1])
+
+
+def _stamp(t: float, kind: Any) -> Any:
+    return kind(*divmod(START + int(1e9 * t), 1_000_000_000))
+
+
+def write_ros2(path: Path, motion: Motion, storage: StoragePlugin = StoragePlugin.MCAP) -> Path:
+    """Write the IMU as a type of ROS 2, and an attitude at 25 Hz as PoseStamped; a third IMU message is another's."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(f"std_msgs/Header header\n{RAW}", "lab_msgs/msg/Raw"))
+    types = store.types
+    time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    with Ros2Writer(path, version=9, storage_plugin=storage) as bag:
+        raw = bag.add_connection("/lab/raw", "lab_msgs/msg/Raw", typestore=store)
+        pose = bag.add_connection("/mocap/pose", "geometry_msgs/msg/PoseStamped", typestore=store)
+        for i, t in enumerate(motion.t):
+            log_ns, stamped = START + int(1e9 * t) + 2_000_000, header(_stamp(t, time), "body")
+            rates = np.rad2deg(motion.rates[i])
+            for device, name, sign in ((2, "head", 1.0), *([(7, "hand, left", -1.0)] if i % 3 == 0 else [])):
+                message = types["lab_msgs/msg/Raw"](stamped, sign * rates, *motion.force[i], device, name)
+                bag.write(raw, log_ns, store.serialize_cdr(message, "lab_msgs/msg/Raw"))
+            if i % 4 == 0:
+                w, x, y, z = motion.wxyz[i]
+                attitude = types["geometry_msgs/msg/Quaternion"](x, y, z, w)
+                place = types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)
+                message = types["geometry_msgs/msg/PoseStamped"](
+                    stamped, types["geometry_msgs/msg/Pose"](place, attitude)
+                )
+                bag.write(pose, log_ns, store.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
+    return path
+
+
+def write_ros1(path: Path, motion: Motion) -> Path:
+    """Write the IMU as a type of ROS 1."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg(f"Header header\n{RAW}", "lab_msgs/msg/Raw"))
+    types = store.types
+    with Ros1Writer(path) as bag:
+        raw = bag.add_connection("/lab/raw", "lab_msgs/msg/Raw", typestore=store)
+        for i, t in enumerate(motion.t):
+            header = types["std_msgs/msg/Header"](i, _stamp(t, types["builtin_interfaces/msg/Time"]), "body")
+            message = types["lab_msgs/msg/Raw"](header, np.rad2deg(motion.rates[i]), *motion.force[i], 2, "head")
+            bag.write(raw, START + int(1e9 * t), store.serialize_ros1(message, "lab_msgs/msg/Raw"))
+    return path
+
+
+def write_mcap(path: Path, motion: Motion, encoding: str, schema: tuple[str, str, bytes], message: Any) -> Path:
+    """Write the IMU's messages (from a dict of their fields) in an encoding, every tenth."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        number = writer.register_channel("/lab/raw", encoding, writer.register_schema(*schema))
+        for i in range(0, len(motion.t), 10):
+            sec, nanosec = divmod(START + int(1e9 * motion.t[i]), 1_000_000_000)
+            fields = {"rate_dps": np.rad2deg(motion.rates[i]).tolist()}
+            fields |= dict(zip(("ax", "ay", "az"), motion.force[i].tolist(), strict=True))
+            log_ns = START + int(1e9 * motion.t[i])
+            writer.add_message(number, log_ns, message({"sec": sec, "nanosec": nanosec}, fields), log_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def write_json(path: Path, motion: Motion) -> Path:
+    def message(stamp: dict[str, int], fields: dict[str, Any]) -> bytes:
+        return json.dumps({"header": {"stamp": stamp}, **fields, "ok": True, "device": 2}).encode()
+
+    return write_mcap(path, motion, "json", ("lab.Raw", "jsonschema", b'{"type": "object"}'), message)
+
+
+def write_protobuf(path: Path, motion: Motion) -> Path:
+    kinds = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(name="lab.proto", package="lab", syntax="proto3")
+    stamp, header, raw = (file.message_type.add(name=name) for name in ("Stamp", "Header", "Raw"))
+    stamp.field.add(name="sec", number=1, type=kinds.TYPE_INT64, label=1)
+    stamp.field.add(name="nanosec", number=2, type=kinds.TYPE_INT64, label=1)
+    header.field.add(name="stamp", number=1, type=kinds.TYPE_MESSAGE, type_name=".lab.Stamp", label=1)
+    raw.field.add(name="header", number=1, type=kinds.TYPE_MESSAGE, type_name=".lab.Header", label=1)
+    raw.field.add(name="rate_dps", number=2, type=kinds.TYPE_DOUBLE, label=3)
+    for number, name in enumerate(("ax", "ay", "az"), start=3):
+        raw.field.add(name=name, number=number, type=kinds.TYPE_FLOAT, label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("lab.Raw"))
+    data = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+
+    def message(stamp: dict[str, int], fields: dict[str, Any]) -> bytes:
+        return bytes(kind(header={"stamp": stamp}, **fields).SerializeToString())
+
+    return write_mcap(path, motion, "protobuf", ("lab.Raw", "protobuf", data), message)
+
+
+WRITERS: dict[str, tuple[Callable[[Path, Motion], Path], str]] = {
+    "ROS 2": (write_ros2, "bag"),
+    "ROS 1": (write_ros1, "lab.bag"),
+    "JSON": (write_json, "json.mcap"),
+    "protobuf": (write_protobuf, "protobuf.mcap"),
+}
+
+
+def described(path: Path, **given: Any) -> Any:
+    table = {"file": "/lab/raw", "time": "header.stamp", "unit": "ns", "gyro": COLUMNS[:3], "accel": COLUMNS[3:]}
+    columns = {"/head/imu": TableTopic(**table | {"units": {"gyro": "deg/s"}} | given)}
+    return open_recording(path).with_config((), columns)
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_messages_are_read_as_described(form: str, motion: Motion, tmp_path: Path) -> None:
+    write, name = WRITERS[form]
+    recording = described(write(tmp_path / name, motion), **({"where": {"device": 2}} if form == "ROS 2" else {}))
+    step = 10 if name.endswith("mcap") else 1
+    imu = recording.imu("/head/imu")
+    np.testing.assert_array_equal(imu.t_ns, START + (1e9 * motion.t[::step]).astype(np.int64))
+    np.testing.assert_allclose(imu.gyro, motion.rates[::step], rtol=1e-12)
+    np.testing.assert_allclose(imu.accel, motion.force[::step], rtol=1e-6, atol=1e-6)
+    assert recording.duration_s == pytest.approx(motion.t[::step][-1], abs=1e-6)
+
+
+def test_a_word_selects_the_messages_of_one_device(motion: Motion, tmp_path: Path) -> None:
+    """Their layouts differ, and messages of both are mixed."""
+    path = write_ros2(tmp_path / "bag", motion)
+    imu = described(path, where={"name": "hand, left"}).imu("/head/imu")
+    np.testing.assert_allclose(imu.gyro, -motion.rates[::3], rtol=1e-12)
+
+
+def test_messages_one_by_one_and_all_at_once_are_the_same(motion: Motion, tmp_path: Path) -> None:
+    container = open_container(write_ros1(tmp_path / "lab.bag", motion))
+    (number,) = container.channels
+    form = MessageFormat(container.channels[number], container.schemas[container.channels[number].schema_id])
+    block = container.first_blocks({number})[number]
+    cells = list(form.cells(block))
+    names = list(cells[0])
+    assert names == ["header.seq", "header.stamp", "header.frame_id", *COLUMNS, "device", "name", "log_time"]
+    for name, texts in zip(names, form.texts(block, names), strict=True):
+        assert texts.tolist() == [str(each[name]) for each in cells]
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_columns_are_proposed(form: str, motion: Motion, tmp_path: Path) -> None:
+    write, name = WRITERS[form]
+    found = propose_columns(open_recording(write(tmp_path / name, motion)))
+    assert found is not None
+    (table,) = found.columns.values()
+    assert (table.file, table.time, table.unit) == ("/lab/raw", "header.stamp", "ns")
+    assert list(table.gyro or ()) == COLUMNS[:3]
+    assert list(table.accel or ()) == COLUMNS[3:]
+    assert table.units == {"gyro": "deg/s"}
+
+
+def test_known_messages_are_not_proposed_and_may_be_described(motion: Motion, tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", motion)
+    found = propose_columns(open_recording(path))
+    assert found is not None
+    assert [table.file for table in found.columns.values()] == ["/lab/raw"]
+    names = [f"pose.orientation.{axis}" for axis in "wxyz"]
+    pose = TableTopic(file="/mocap/pose", time="header.stamp", unit="ns", wxyz=tuple(names))  # type: ignore[arg-type]
+    read = open_recording(path).with_config((), {"/vision/attitude": pose}).poses("/vision/attitude")
+    np.testing.assert_array_equal(read.wxyz, motion.wxyz[::4])
+
+
+@pytest.mark.parametrize(
+    ("topic", "given", "problem"),
+    [
+        ("/head/imu", {"file": "/lab/rw"}, "no table /lab/rw; the nearest known key is /lab/raw"),
+        ("/head/imu", {"time": "stamp"}, "no column stamp; the columns are header.stamp"),
+        ("/lab/raw", {}, "columns./lab/raw: a topic of that name was recorded"),
+    ],
+)
+def test_what_is_not_there_is_named(
+    topic: str, given: dict[str, Any], problem: str, motion: Motion, tmp_path: Path
+) -> None:
+    table = {"file": "/lab/raw", "time": "header.stamp", "unit": "ns", "gyro": COLUMNS[:3]} | given
+    recording = open_recording(write_json(tmp_path / "lab.mcap", motion))
+    with pytest.raises(InputError, match=problem.replace(".", r"\.")):
+        recording.with_config((), {topic: TableTopic(**table)})
+
+
+def test_a_bag_of_ones_own_messages_is_calibrated(motion: Motion, tmp_path: Path, alidade: Command) -> None:
+    """The other device on the topic is told apart in the config."""
+    path = write_ros2(tmp_path / "bag", motion, StoragePlugin.SQLITE3)
+    (tmp_path / "lab.yaml").write_text(
+        "columns:\n"
+        f"  /head/imu: {{file: /lab/raw, time: header.stamp, unit: ns, gyro: {COLUMNS[:3]}, accel: {COLUMNS[3:]}, "
+        "units: {gyro: deg/s}, where: {device: 2}}\n"
+        "topics: {vision_attitude: /mocap/pose}\n"
+    )
+    command = ("--config", str(tmp_path / "lab.yaml"), "--out", str(tmp_path / "out"))
+    done = alidade("calibrate", str(path), *command)
+    assert done.code == 0, done.err + done.out
+    found = json.loads((tmp_path / "out" / "result.json").read_text())["parameters"]
+    mount = [each for each in found if each["name"].startswith("helmet_mount_")]
+    assert len(mount) == 3
+    assert all(abs(each["value"]) < 4.0 * each["sigma"] for each in mount)
+
+
+def _messages(path: Path) -> Iterator[Sequence[str]]:
+    yield from (table.form.names for table in message_tables(open_container(path)).values())
+
+
+def test_pictures_are_no_columns(tmp_path: Path) -> None:
+    """Nor are numbers by the thousand."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("uint8[] data\nfloat32[100] ranges\nfloat32 range\n", "lab_msgs/msg/Scan"))
+    with Ros2Writer(tmp_path / "bag", version=9) as bag:
+        scan = bag.add_connection("/scan", "lab_msgs/msg/Scan", typestore=store)
+        message = store.types["lab_msgs/msg/Scan"](np.zeros(5000, np.uint8), np.zeros(100, np.float32), 1.0)
+        bag.write(scan, START, store.serialize_cdr(message, "lab_msgs/msg/Scan"))
+    assert list(_messages(tmp_path / "bag")) == [("range", "log_time")]
