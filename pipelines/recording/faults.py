@@ -24,8 +24,9 @@ _CLIPPED, _QUANTA = 3, 20.0
 # for no longer than so many s (rests and steady turns are longer) are a plateau if they fall by more than a parabola,
 # so many times their height within their length before and after, and a quartic through all that misses by so many
 # times their height (RMS). So do 90 % of the plateaus of simulated swings, and none of 1,300 of their peaks. Off three
-# samples of a noisy peak they may: the longest plateau has so many.
-_NEAR_END, _BRIEFLY, _FALL, _MISSED, _PLATEAU = 0.02, 1.0, 8.0, 2.0, 6
+# samples of a noisy peak they may: the longest plateau has so many. Of thousands of noisy peaks some do (an hour at 1
+# kHz: 12 of 2,800 samples that near): this share of those is on plateaus where a range ends.
+_NEAR_END, _BRIEFLY, _FALL, _MISSED, _PLATEAU, _LEAST_FLAT = 0.02, 1.0, 8.0, 2.0, 6, 0.25
 # Ranges begin at 2 g and .8 gauss. Gravity, or the earth's field, that lingers along an axis is at the end of none.
 _SMALLEST_RANGE = {"m/s^2": 15.0, "T": 8e-5}
 # Readings of two devices in turn: one differs from the next by so many times what it does from the next but one. Of
@@ -168,18 +169,15 @@ def _clipped(t: Array, x: Array, smallest: float) -> Mask:
 
 def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
     """Mask (N,) of plateaus near the largest reading, with edges sharp for their height, apart from known ones."""
-    out, longest = np.zeros(len(x), dtype=bool), 0
+    out, longest, near = np.zeros(len(x), dtype=bool), 0, 0
     above = x - np.nanmedian(x)
     edges = np.diff(np.concatenate([[False], above > (1.0 - _NEAR_END) * np.nanmax(above), [False]]).astype(int))
     for first, stop in np.flatnonzero(edges).reshape(-1, 2).tolist():
         count = stop - first
-        if (
-            known[first:stop].any()
-            or count < _CLIPPED
-            or t[stop - 1] - t[first] > _BRIEFLY
-            or first < count
-            or stop + count > len(x)
-        ):
+        if known[first:stop].any() or t[stop - 1] - t[first] > _BRIEFLY:
+            continue
+        near += count
+        if count < _CLIPPED or first < count or stop + count > len(x):
             continue
         low, middle = np.quantile(above[first:stop], [0.25, 0.5])
         level = middle - 3.0 * (middle - low)  # what is on its way there is not on the plateau
@@ -189,7 +187,7 @@ def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
         if fall > _FALL * height and _off_quartic(around) > _MISSED * height:
             out[flat] = True
             longest = max(longest, len(flat))
-    return out & (longest >= _PLATEAU)
+    return out & (longest >= _PLATEAU and out.sum() >= _LEAST_FLAT * near)
 
 
 def _off_quartic(x: Array) -> float:

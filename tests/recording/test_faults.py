@@ -226,6 +226,19 @@ def test_a_flat_top_of_smooth_motion_is_no_saturation() -> None:
         assert len(drop_faults("/imu", t, noisy, {}, "rad/s")) == len(t)
 
 
+@pytest.mark.parametrize(("peaks", "left_out"), [(1, 8), (200, 0)])
+def test_one_flat_top_among_many_peaks_as_high_is_chance(peaks: int, left_out: int) -> None:
+    """An hour at 1 kHz has thousands of noisy peaks; where a range ends most are flat."""
+    t = np.arange(0.0, peaks, 2e-3)
+    x = np.sin(2.0 * np.pi * t) + np.random.default_rng(3).normal(0.0, 1e-3, len(t))
+    top = 125
+    x[top - 12 : top + 12] -= 0.05
+    x[top - 4 : top + 4] = 1.0 + 1e-5 * np.arange(8)
+    dropped: dict[str, int] = {}
+    drop_faults("/imu", t, x[:, None], dropped, "rad/s")
+    assert dropped.get("/imu: saturated", 0) == left_out
+
+
 def test_gravity_that_lingers_along_an_axis_for_less_than_a_second_is_no_plateau() -> None:
     t = np.arange(0.0, 10.0, 0.01)
     turn = np.cumsum(np.where(np.abs(t - 5.0) < 0.3, 0.0, 0.02))
