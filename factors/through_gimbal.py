@@ -15,7 +15,10 @@ larger v is than stated.
 
 Errors that are unknowns would be chosen to make that noise smaller, and be biased by a number of sigmas that grows with
 the square root of the recording's length. Multiplied with the inverse of 1 + K, residuals have the same noise whatever
-the errors are. K is of first order in them, so they are counted from a first guess, where K is 0.
+the errors are. K is of first order in them, so they are counted from a first guess, where K is 0. Of the camera's own
+turns, whose priors are the widest, it is of second order (of pictures but for e^2 times the encoders' share of v): what
+is left of that order counts as information once the rows are more than the inverse of a prior's variance, 10,000 for a
+roll of .6 deg. Without it the camera of an hour at 10 pictures/s rolled by 58 prior sigmas.
 """
 
 from __future__ import annotations
@@ -149,7 +152,11 @@ class ThroughGimbalFactor(WrappedModel):
         e = np.stack([blocks[error_blocks[block]][:, column] - guess for block, column, guess, *_ in errors])
         to_steps, to_residuals = self._units()
         Y = self._by_steps([error[3:] for error in errors])
-        K = to_residuals @ np.einsum("en,ekjn->nkj", e, Y) @ to_steps
+        change = np.einsum("en,ekjn->kjn", e, Y)
+        for i, bend in self._bends([error[3] for error in errors]):
+            change += 0.5 * e[i] ** 2 * bend
+            Y[i] += e[i] * bend
+        K = to_residuals @ change.transpose(2, 0, 1) @ to_steps
         whitening = np.linalg.inv(np.eye(self.rows) + K)
         residuals = np.einsum("nij,nj->ni", whitening, residuals)
 
@@ -180,6 +187,20 @@ class ThroughGimbalFactor(WrappedModel):
         information = np.ones_like(to_residuals[:, :, 0]) if self.weights is None else self.weights**2
         to_steps = (information[..., None] * (to_residuals @ by_angles)).swapaxes(1, 2)
         return (self.encoder**2)[:, None, None] * to_steps, to_residuals
+
+    def _bends(self, turns: list[int]) -> Iterator[tuple[int, Array]]:
+        """Yield the numbers of the errors that turn the camera itself, and the second derivative (3, 2, n) by each.
+
+        It is a x (a x a_k) of pictures; attitudes turn back.
+        """
+        sign = -1.0 if self.encoder is None else 1.0
+        se, ce = sign * np.sin(self.gimbal[:, 1]), sign * np.cos(self.gimbal[:, 1])
+        for i, turn in enumerate(turns):
+            if turn in (_COLLIMATION, _ROLL):
+                bend = np.zeros((3, 2, len(se)))
+                bend[_X, 1] = -sign
+                bend[(_Y, 0) if turn == _COLLIMATION else (_Z, 0)] = -se if turn == _COLLIMATION else -ce
+                yield i, bend
 
     def _by_steps(self, errors: list[tuple[int, Array, Array]]) -> Array:
         """Matrices Y (errors, 3, 2, n), camera frame, of errors with rotation axis, function, angle derivatives."""

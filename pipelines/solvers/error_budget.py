@@ -369,6 +369,8 @@ def coloured_noises(
     """
     found = {}
     for family, lags in correlations.items():
+        if squares[family][1] < 1.0:  # nothing is left of it
+            continue
         whitened = _residuals(influence.at.engine.measured[family], influence.at.values)
         together = 1.0 + 2.0 * float(lags.sum())
         noise = ColouredNoise.fitted(whitened, _basis(influence, family), squares[family][1], together)

@@ -176,8 +176,8 @@ def _length(predicted: float, before: float) -> float:
 def _is_minimum(enough: float, damping: float, predicted: float, decrease: float) -> bool:
     """Whether the end of a step is a minimum, from its damping and the predicted and actual decrease."""
     if damping > 0.0:
-        determined = damping <= _INITIAL_DAMPING and predicted < _DETERMINED
-        return determined and (decrease <= 0.0 or damping == _INITIAL_DAMPING)
+        determined = damping <= _INITIAL_DAMPING and predicted < max(_DETERMINED, enough)
+        return determined and (decrease <= 0.0 or damping == _INITIAL_DAMPING or enough > _DETERMINED)
     as_predicted = predicted < 1.0 and abs(decrease - predicted) < _AS_PREDICTED
     return predicted < enough or (predicted < _CURVED and decrease < enough) or as_predicted
 

@@ -67,19 +67,28 @@ def _camera(gimbal: Array, angles: Array, encoder: Array) -> Array:
     return _level(true).camera(np.tile(angles, (N, 1)))
 
 
-def _errors(size: float) -> tuple[Array, Array, float, list[Array]]:
-    """Angles, s and c, the scale of LOS errors, and the blocks (N, d) that contain them."""
+def _errors(size: float, only: str | None = None) -> tuple[Array, Array, float, list[Array]]:
+    """Angles, s and c, the scale of LOS errors, and the blocks (N, d) that contain them; or one angle alone."""
     rng = np.random.default_rng(3)
-    angles, encoder = size * rng.standard_normal(len(NAMES)), size * rng.standard_normal(4)
+    angles, encoder, scale = size * rng.standard_normal(len(NAMES)), size * rng.standard_normal(4), size
+    if only is not None:
+        angles, encoder, scale = np.where(np.array(NAMES) == only, size, 0.0), np.zeros(4), 0.0
     sight = np.zeros(len(SIGHT_ERRORS))
-    sight[ENCODERS], sight[SCALE] = encoder, size
-    return angles, encoder, size, [np.tile(each, (N, 1)) for each in (angles + np.array(MOUNT), sight)]
+    sight[ENCODERS], sight[SCALE] = encoder, scale
+    return angles, encoder, scale, [np.tile(each, (N, 1)) for each in (angles + np.array(MOUNT), sight)]
+
+
+ERRORS = {"all": (1e-3, None), "collimation": (0.04, "collimation"), "camera_roll": (0.04, "camera_roll")}
 
 
 @pytest.mark.parametrize("following", [1.0, 0.4])
-def test_noise_of_increments_is_that_of_the_gyro_whatever_the_gimbal_is(following: float) -> None:
-    """The gimbal, driven by n, moves the camera by a step; attitudes of the gyro follow from angles and pictures."""
-    angles, encoder, scale, blocks = _errors(1e-3)
+@pytest.mark.parametrize("which", ERRORS)
+def test_noise_of_increments_is_that_of_the_gyro_whatever_the_gimbal_is(which: str, following: float) -> None:
+    """The gimbal, driven by n, moves the camera by a step; attitudes of the gyro follow from angles and pictures.
+
+    The camera's own turns change it by less than second order, 2e-3: what is left would pass for information.
+    """
+    angles, encoder, scale, blocks = _errors(*ERRORS[which])
     step, n = 1e-3, np.random.default_rng(4).standard_normal((N, 3))
 
     def turned(gimbal: Array) -> Array:
@@ -93,13 +102,14 @@ def test_noise_of_increments_is_that_of_the_gyro_whatever_the_gimbal_is(followin
     read = n - through
     ours = ThroughGimbalFactor(_fixed(read), GIMBAL, GimbalErrors(NAMES, MOUNT), following=following)
     assert np.abs(read - n).max() > 2e-3
-    np.testing.assert_allclose(ours(np.ones((N, 1)), *blocks)[0], n, atol=3e-5)
+    np.testing.assert_allclose(ours(np.ones((N, 1)), *blocks)[0], n, atol=3e-5 if which == "all" else 5e-4)
 
 
 @pytest.mark.parametrize(("rows", "stated"), [(2, 1.0), (3, 1.0), (2, 0.4), (3, 2.0)])
-def test_noise_of_pictures_is_the_same_whatever_the_gimbal_is(rows: int, stated: float) -> None:
+@pytest.mark.parametrize("which", ERRORS)
+def test_noise_of_pictures_is_the_same_whatever_the_gimbal_is(which: str, rows: int, stated: float) -> None:
     """Covariance of encoder noise in pictures, by differences at the errors, whitened at its true level: 1."""
-    angles, encoder, scale, blocks = _errors(1e-3)
+    angles, encoder, scale, blocks = _errors(*ERRORS[which])
     sigma, own = 5e-6, 4e-6
 
     def covariance(angles: Array, encoder: Array, scale: float) -> Array:
@@ -121,7 +131,8 @@ def test_noise_of_pictures_is_the_same_whatever_the_gimbal_is(rows: int, stated:
         columns.append(stated * ours.at_noise(np.full((N, rows), stated))(np.ones((N, 1)), *blocks)[0])
     whitened = np.stack(columns, axis=2)
     assert np.abs(stated**2 * spread @ spread.swapaxes(1, 2) - np.eye(rows)).max() > 5e-4
-    np.testing.assert_allclose(whitened @ whitened.swapaxes(1, 2), np.tile(np.eye(rows), (N, 1, 1)), atol=2e-5)
+    atol = 2e-5 if which == "all" else 1e-3  # with the first order alone 2e-3
+    np.testing.assert_allclose(whitened @ whitened.swapaxes(1, 2), np.tile(np.eye(rows), (N, 1, 1)), atol=atol)
 
 
 def test_map_lets_through_what_errors_of_the_gimbal_do() -> None:
