@@ -166,7 +166,7 @@ def test_clocks_that_drift_for_a_quarter_of_an_hour() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "rate"), [(1, 5.0), (2, 5.0), (0, 10.0)])
+@pytest.mark.parametrize(("seed", "rate"), [(1, 5.0), (2, 5.0), (1, 10.0)])
 def test_an_hour_is_as_right_as_a_minute(seed: int, rate: float) -> None:
     """The gyro's noise moves the gimbal: errors of the gimbal that are variables would be 7 sigmas off."""
     scenario = LosScenario(
