@@ -57,6 +57,7 @@ from alidade.pipelines.recording.decoding import ENCODING
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.plausibility import HELD
 from alidade.pipelines.recording.recording import Recording, open_recording
+from alidade.pipelines.recording.table_topics import tables_of
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, SessionFacts, facts_of, lacking, wanted
 from alidade.pipelines.reports.calibration import load_known
 from alidade.pipelines.reports.result import Calibration
@@ -618,7 +619,8 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         raise InputError(f"{recording.path}: these topics alone do not select a method; use {options}")
     columns = propose_columns(recording)
     if columns is not None and columns.columns:
-        raise NotARecordingError(
+        kind = NotARecordingError if tables_of(recording.container) else InputError
+        raise kind(
             f"{recording.path}: tables, and messages of unknown types, need `columns:` in the config; `alidade info` "
             "proposes them to paste, `--auto-columns` uses the proposal"
         )

@@ -11,6 +11,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.message_tables import message_tables
+from alidade.pipelines.recording.messages import IMU
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import TableTopic, tables_of
@@ -122,7 +124,7 @@ def propose_columns(recording: Recording) -> Columns | None:
     made = [one.topics() for one in found]
     for table in message_tables(recording.container).values():
         with suppress(InputError):  # what cannot be read is no proposal
-            if not table.is_known and table.form.names:
+            if table.is_proposed:
                 one = _Table(table, True)
                 if topics := one.topics():
                     found, made = [*found, one], [*made, topics]
@@ -135,7 +137,8 @@ def propose_columns(recording: Recording) -> Columns | None:
     gyros = [name for name, table in columns.items() if table.gyro and not table.accel]
     accels = [name for name, table in columns.items() if table.accel and not table.gyro]
     sources = {"imu": TopicSource(gyro=gyros[0], accel=accels[0])} if len(gyros) == len(accels) == 1 else {}
-    if len(gyros) + len(accels) == 1 and "/imu" not in columns:
+    recorded = any(each.type == IMU for each in recording.topics.values())
+    if len(gyros) + len(accels) == 1 and "/imu" not in columns and not recorded:
         sources = {"imu": TopicSource(topic=(gyros or accels)[0])}
     reasons = tuple(reason for one in found for reason in one.reasons)
     return Columns(columns, sources, reasons, tuple(doubt for one in found for doubt in one.doubts))
@@ -452,4 +455,5 @@ def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
 
 def _free(topic: str, path: Path, taken: Collection[str]) -> str:
     """Return the topic's name, extended by the table's name if another table has a topic of that name."""
-    return topic if topic not in taken else f"{topic}/{re.sub(r'[^a-z0-9]+', '_', path.stem.lower())}"
+    longer = topic if topic not in taken else f"{topic}/{re.sub(r'[^a-z0-9]+', '_', path.stem.lower())}"
+    return longer if longer not in taken else next(n for i in count(2) if (n := f"{longer}_{i}") not in taken)

@@ -293,7 +293,7 @@ class MessageFormat:
             with at_log_time(log_ns):
                 try:
                     found = dict(cells(parse(block.message(i))))
-                except (ValueError, AttributeError, RecursionError) as error:
+                except (ValueError, TypeError, AttributeError, OverflowError, RecursionError, MemoryError) as error:
                     raise MessageError(f"a message of {block.size[i]} bytes cannot be read ({error})") from error
             yield found | {LOG_TIME: log_ns}
 
@@ -309,9 +309,11 @@ class MessageFormat:
                 rows = byte_windows(block.buffer, len(data))[block.start].view(np.uint8).reshape(-1, len(data))
                 if layout.agrees(rows).all():  # in words as well
                     first = next(self.cells(block))
-                    alike = {name: np.full(len(rows), first.get(name, "")) for name in names}
-                    columns = alike | layout.numbers(names, rows) | {LOG_TIME: block.log_ns}
-                    return [columns[name].astype(str) for name in names]
+                    words = {name: first.get(name, "") for name in names}
+                    columns = {name: np.full(len(rows), word) for name, word in words.items() if isinstance(word, str)}
+                    columns |= layout.numbers(names, rows) | {LOG_TIME: block.log_ns}
+                    if columns.keys() >= set(names):
+                        return [columns[name].astype(str) for name in names]
         each = [[cells.get(name, "") for name in names] for cells in self.cells(block)]
         return [np.array(list(map(str, column)), dtype=np.str_) for column in zip(*each, strict=True)]
 

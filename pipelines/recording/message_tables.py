@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,14 @@ from alidade.pipelines.recording.container import Container, MultiPartContainer
 from alidade.pipelines.recording.decoding import LOG_TIME, MessageFormat
 from alidade.pipelines.recording.messages import SENSORS, MessageError
 from alidade.pipelines.recording.table_values import unit_in
-from alidade.pipelines.recording.tables import TableHead
+from alidade.pipelines.recording.tables import MOST_COLUMNS, TableHead
+
+# Messages whose fields are columns: the first may lack some.
+_FIRST = 100
+# Bytes of a message beyond which its numbers are those of a picture or a scan; a pose with covariances has 400.
+_LARGEST = 1 << 14
+# ns since 1970, of 1973.
+_UNIX_NS = 10**17
 
 
 class MessageTable:
@@ -36,21 +44,27 @@ class MessageTable:
         self.name, self._container, self._formats = name, container, formats
 
     @property
-    def is_known(self) -> bool:
-        """Whether the messages are of a type that is read as it is."""
-        return any(each.type in SENSORS for each in self._formats.values())
+    def is_proposed(self) -> bool:
+        """Whether the columns are looked at unasked: the type is not known, and no message is as large as a picture."""
+        block = next(self._container.blocks(set(self._formats)), None)
+        is_small = block is not None and int(block.size.max(initial=0)) <= _LARGEST
+        return is_small and not any(each.type in SENSORS for each in self._formats.values())
 
     @cached_property
     def form(self) -> TableHead:
-        """Names of the columns, those of the first message. Raises InputError."""
+        """Names of the columns, those of the first messages. Raises InputError."""
         path = self._container.path / self.name.strip("/")
-        for number, block in self._container.first_blocks(self._formats).items():
+        first: dict[str, object] = {}
+        for block in islice(self._container.blocks(set(self._formats)), 1):
             try:
-                names = tuple(next(self._formats[number].cells(block)))
+                for cells in islice(self._formats[block.channel].cells(block), _FIRST):
+                    first = {**cells, **first}
             except MessageError as error:
                 raise InputError(f"{self._container.path}: topic {self.name}: {error}") from error
-            return TableHead(path, names, tuple("ns" if n == LOG_TIME else unit_in(n) for n in names), ())
-        return TableHead(path, (), (), ())
+        if len(first) > MOST_COLUMNS:
+            raise InputError(f"{self._container.path}: topic {self.name}: its messages have {len(first)} fields")
+        names = tuple(sorted(first, key=lambda name: name == LOG_TIME))
+        return TableHead(path, names, tuple("ns" if _is_unix_ns(first[n]) else unit_in(n) for n in names), ())
 
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
         """Return the named columns as texts, empty where a message lacks the field; and no sentences.
@@ -77,6 +91,11 @@ class MessageTable:
         return dict(zip(names, texts, strict=True)), []
 
 
+def _is_unix_ns(value: object) -> bool:
+    """Whether a number is a time of day, ns since 1970: nothing else is as large."""
+    return isinstance(value, int) and value > _UNIX_NS
+
+
 class WithTables(MultiPartContainer):
     """A recording with topics that are made of its own messages.
 
@@ -86,7 +105,8 @@ class WithTables(MultiPartContainer):
     """
 
     def __init__(self, recorded: Container, made: Container) -> None:
-        super().__init__(recorded.path, [recorded, made])
+        parts = recorded.parts if isinstance(recorded, MultiPartContainer) else [recorded]
+        super().__init__(recorded.path, [*parts, made])
         self._recorded = recorded
         self.assumptions, self.incomplete = recorded.assumptions, recorded.incomplete
 

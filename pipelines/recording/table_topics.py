@@ -139,7 +139,11 @@ class TableTopic(BaseModel):
         return [*stamps, *self.where, *(name for found in self._given.values() for name in found)]
 
     def to_series(
-        self, topic: str, form: TableHead, columns: Mapping[str, NDArray[np.str_]]
+        self,
+        topic: str,
+        form: TableHead,
+        columns: Mapping[str, NDArray[np.str_]],
+        logged: NDArray[np.str_] | None = None,
     ) -> tuple[series.Topic, Stamps | None, list[str]]:
         """Return the topic as a series, its log times, Unix ns, if any, and sentences about assumptions and lost rows.
 
@@ -148,10 +152,11 @@ class TableTopic(BaseModel):
         Args:
             topic: its name.
             form: the table.
-            columns: texts of its columns, `names` at least; of a table of messages LOG_TIME as well.
+            columns: texts of its columns, `names` at least.
+            logged: of a table of messages the log times.
         """
         path, given, notes = form.path, self._given, list[str]()
-        columns = {name: columns[name] for name in (*self.names, *({LOG_TIME} & columns.keys()))}
+        columns = {name: columns[name] for name in self.names}
         rows = self._rows(path, columns)
         columns = {name: column[rows] for name, column in columns.items()}
         values = {name: numbers(path, columns, found) for name, found in given.items()}
@@ -165,7 +170,7 @@ class TableTopic(BaseModel):
             unit = self._time_unit(form, notes)
             t_ns = nanoseconds(path, columns[self.time][filled], unit)
         values = {name: one[filled] for name, one in values.items()}
-        log_ns = nanoseconds(path, columns[LOG_TIME][filled], "ns") if LOG_TIME in columns else None
+        log_ns = None if logged is None else nanoseconds(path, logged[rows][filled], "ns")
         if log_ns is None:
             t_ns, values = _without_erased(path, t_ns, values, notes)
         if not self._is_slow and self.time is not None:
@@ -323,7 +328,9 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
         notes += left_out
         of[name] = {}
         for topic, table in topics.items():
-            of[name][topic], log_ns, concluded = table.to_series(topic, form, texts)
+            of[name][topic], log_ns, concluded = table.to_series(
+                topic, form, texts, None if name in files else texts[LOG_TIME]
+            )
             logged |= {} if log_ns is None else {topic: log_ns}
             notes += concluded
     whole = _with_topics(container, of)

@@ -28,7 +28,7 @@ from alidade.pipelines.recording.table_values import TIME_NAME, bare_name, nanos
 
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 # A line of a table of sensors is shorter, and has fewer columns.
-_LONGEST_LINE, _MOST_COLUMNS = 1 << 16, 1000
+_LONGEST_LINE, MOST_COLUMNS = 1 << 16, 1000
 # How a table is written is looked for in so much of its beginning, B, and so many of its lines.
 _HEAD, _SAMPLE = 1 << 18, 200
 # Numbers of a row that begins with a word, at least: a vector.
@@ -163,7 +163,7 @@ def table_form(path: Path, data: Path) -> TableForm:
         raise NotARecordingError.of(path)
     delimiter, decimal = _separators(lines)
     cells = [_cells(line, delimiter) for line in lines]
-    if max(map(len, cells)) > _MOST_COLUMNS:
+    if max(map(len, cells)) > MOST_COLUMNS:
         raise NotARecordingError.of(path)
     sample = [row for row in cells[-_SAMPLE:] if any(row)]
     usual = Counter((len(row), _begins_with_value(row)) for row in sample).most_common(1)[0][0] if sample else (0, True)

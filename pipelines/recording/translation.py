@@ -33,6 +33,8 @@ _FOXGLOVE = {
     "RawImage": messages.IMAGE,
     "LocationFix": messages.NAV_SAT_FIX,
 }
+# What a message of ROS 2 has that has nothing.
+_NO_MEMBER = "structure_needs_at_least_one_member"
 # Numbers of a list that are columns of a table at most: a covariance has 36.
 _LONGEST = 64
 # Names of the two parts of a time.
@@ -127,27 +129,30 @@ def cells(tree: Any, name: str = "") -> Iterator[tuple[str, int | float | str]]:
     A time of seconds and nanoseconds is one number, ns. Lists of more than `_LONGEST` numbers are left out, as pictures
     are.
     """
-    if isinstance(tree, (bool, int, float, str, np.generic)):
-        yield name, int(tree) if isinstance(tree, (bool, np.bool_)) else tree  # type: ignore[misc]
+    if isinstance(tree, np.generic):
+        tree = tree.item()
+    if isinstance(tree, (bool, int, float, str)):
+        yield name, int(tree) if isinstance(tree, bool) else tree
     elif hasattr(tree, "__len__") and not isinstance(tree, (bytes, Mapping)):
         for i, each in enumerate(tree if len(tree) <= _LONGEST else ()):
             yield from cells(each, f"{name}[{i}]")
     elif not isinstance(tree, (bytes, type(None))):
-        fields = _field_names(tree)
-        if len(fields) == 2 and fields[0] in _SECONDS and fields[1] in _NANOSECONDS:
-            yield name, int(_get(tree, fields[0]) or 0) * 1_000_000_000 + int(_get(tree, fields[1]) or 0)
+        fields = _fields(tree)
+        if [each for each, _ in fields] == ["sec", "nanosec"] and all(isinstance(one, int) for _, one in fields):
+            yield name, fields[0][1] * 1_000_000_000 + fields[1][1]
             return
-        for field in fields:
-            yield from cells(_get(tree, field), f"{name}.{field}" if name else field)
+        for field, value in fields:
+            yield from cells(value, f"{name}.{field}" if name else field)
 
 
-def _field_names(tree: Any) -> list[str]:
-    """Return the names of a message's fields, in order."""
+def _fields(tree: Any) -> list[tuple[str, Any]]:
+    """Return the names and values of a message's fields, in order."""
     if isinstance(tree, Mapping):
-        return list(map(str, tree))
+        return [(str(key), value) for key, value in tree.items()]
     if hasattr(tree, "__msgtype__"):
-        return [each.name for each in dataclasses.fields(tree) if each.name != "__msgtype__"]
-    return [each.name for each in tree.DESCRIPTOR.fields]
+        names = [each.name for each in dataclasses.fields(tree) if each.name not in ("__msgtype__", _NO_MEMBER)]
+        return [(name, getattr(tree, name)) for name in names]
+    return [(each.name, _get(tree, each.name)) for each in tree.DESCRIPTOR.fields]
 
 
 def _scalar(kind: str, found: Any) -> Any:

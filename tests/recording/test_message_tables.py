@@ -264,3 +264,71 @@ def test_pictures_are_no_columns(tmp_path: Path) -> None:
         message = store.types["lab_msgs/msg/Scan"](np.zeros(5000, np.uint8), np.zeros(100, np.float32), 1.0)
         bag.write(scan, START, store.serialize_cdr(message, "lab_msgs/msg/Scan"))
     assert list(_messages(tmp_path / "bag")) == [("range", "log_time")]
+
+
+def _write_split(folder: Path, motion: Motion) -> Path:
+    """Write the JSON recording as two parts, each with a temperature beside."""
+    folder.mkdir()
+    half = len(motion.t) // 2
+    for number, rows in enumerate((slice(half), slice(half, None))):
+        part = Motion(motion.t[rows], motion.wxyz[rows], motion.rates[rows], motion.force[rows])
+        write_json(folder / f"lab_{number}.mcap", part)
+    return folder
+
+
+def test_all_parts_of_a_split_bag_are_read(motion: Motion, tmp_path: Path) -> None:
+    """Numbers of channels of the second part once met those of the topics that were made."""
+    recording = described(_write_split(tmp_path / "split", motion))
+    half = len(motion.t) // 2
+    stamps = np.concatenate([motion.t[:half:10], motion.t[half::10]])
+    np.testing.assert_array_equal(recording.imu("/head/imu").t_ns, START + (1e9 * stamps).astype(np.int64))
+    assert recording.topics["/lab/raw"].count == len(stamps)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"sec": [1], "nanosec": {}}, {"sec": float("inf"), "nanosec": 0}, {"1": 2.0, "deep": [[1.0] * 64] * 64}],
+)
+def test_odd_messages_are_no_proposal_and_no_traceback(fields: Any, motion: Motion, tmp_path: Path) -> None:
+    path = tmp_path / "odd.mcap"
+    schema = ("lab.Odd", "jsonschema", b"{}")
+    write_mcap(path, motion, "json", schema, lambda _, __: json.dumps({"odd": fields}).encode())
+    assert propose_columns(open_recording(path)) is None
+
+
+def test_times_of_ones_own_type_are_read_message_by_message(tmp_path: Path) -> None:
+    """`sec` and `nsec` are two columns."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("int64 sec\nuint32 nsec\n", "lab_msgs/msg/Stamp"))
+    with Ros2Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/stamp", "lab_msgs/msg/Stamp", typestore=store)
+        for i in range(3):
+            message = store.types["lab_msgs/msg/Stamp"](100 + i, 7 * i)
+            bag.write(topic, START + i, store.serialize_cdr(message, "lab_msgs/msg/Stamp"))
+    table = message_tables(open_container(tmp_path / "bag"))["/stamp"]
+    assert {name: texts.tolist() for name, texts in table.read(["sec", "nsec"])[0].items()} == {
+        "sec": ["100", "101", "102"],
+        "nsec": ["0", "7", "14"],
+    }
+
+
+def test_a_first_message_without_fields_hides_none(motion: Motion, tmp_path: Path) -> None:
+    sparse = iter([b"{}"])
+    path = tmp_path / "sparse.mcap"
+
+    def message(stamp: dict[str, int], fields: dict[str, Any]) -> bytes:
+        return next(sparse, json.dumps({"header": {"stamp": stamp}, **fields}).encode())
+
+    write_mcap(path, motion, "json", ("lab.Raw", "jsonschema", b"{}"), message)
+    found = propose_columns(open_recording(path))
+    assert found is not None
+    assert [table.gyro for table in found.columns.values()] == [tuple(COLUMNS[:3])]
+
+
+def test_a_column_of_a_file_may_be_called_log_time(tmp_path: Path) -> None:
+    rows = "\n".join(f"{0.01 * i:.2f},{i % 7},{i % 5},{i % 3}" for i in range(300))
+    (tmp_path / "log.csv").write_text(f"log_time,gx,gy,gz\n{rows}\n")
+    columns = {"/imu": TableTopic(time="log_time", unit="s", gyro=("gx", "gy", "gz"))}
+    recording = open_recording(tmp_path / "log.csv").with_config((), columns)
+    assert recording.topics["/imu"].count == 300
+    assert recording.duration_s == pytest.approx(2.99)

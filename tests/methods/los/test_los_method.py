@@ -166,17 +166,27 @@ def test_clocks_that_drift_for_a_quarter_of_an_hour() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "rate"), [(1, 5.0), (2, 5.0), (1, 10.0)])
-def test_an_hour_is_as_right_as_a_minute(seed: int, rate: float) -> None:
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_hour_is_as_right_as_a_minute(seed: int) -> None:
     """The gyro's noise moves the gimbal: errors of the gimbal that are variables would be 7 sigmas off."""
     scenario = LosScenario(
-        duration_s=3600.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0, image_rate_hz=rate, sensors=Sensors()
+        duration_s=3600.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0, image_rate_hz=5.0, sensors=Sensors()
     )
     data, truth = simulate_los(scenario, seed)
     estimate = solve_batch(problem(data, _config(scenario)), error_map=True)
     assert estimate.error_map is None
     size = len(estimate.names)
     assert quantile(5e-3, size) < _nees(estimate, truth) < quantile(1 - 5e-3, size)
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+
+
+@pytest.mark.slow
+def test_an_hour_of_ten_pictures_a_second_rolls_no_camera() -> None:
+    """With the whitening of first order it rolls by 58 prior sigmas."""
+    scenario = LosScenario(duration_s=3600.0, gyro_rate_hz=200.0, gimbal_rate_hz=200.0, image_rate_hz=10.0)
+    data, truth = simulate_los(scenario, 0)
+    estimate = solve_batch(problem(data, _config(scenario)))
+    assert estimate.converged
     assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
 
 
