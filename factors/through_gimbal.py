@@ -195,8 +195,9 @@ class ThroughGimbalFactor(WrappedModel):
     def _bends(self, turns: list[int]) -> Iterator[tuple[int, Array]]:
         """Yield the numbers of the errors that turn the camera itself, and the derivative of each Y by its error.
 
-        Of all `turns`; the derivative is (3, 2, n), a x (a x a_k) of pictures, with the axes of the module's text; attitudes turn back. What a
-        collimation and a roll do together is left out: it rotates noise and lets none pass for information.
+        Of all `turns`; the derivative is (3, 2, n), a x (a x a_k) of pictures, with the axes of the module's text;
+        attitudes turn back. What a collimation and a roll do together is left out: it rotates noise, and lets none pass
+        for information.
         """
         sign = -1.0 if self.encoder is None else 1.0
         se, ce = sign * np.sin(self.gimbal[:, 1]), sign * np.cos(self.gimbal[:, 1])
