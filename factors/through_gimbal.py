@@ -40,7 +40,7 @@ _LOS_SCALE = 5
 # The camera's axes in the order of the pictures' rows, phx, phz and roll, which are larger by its turns about them.
 _X, _Z, _Y = range(3)
 # Turn of the camera, rad, up to which the second order is counted: ten prior sigmas of a roll. Beyond, where nothing
-# fits, it only bends the way to the minimum: 65 iterations in place of 40, or more than 100.
+# fits, it only lengthens the way to the minimum: 65 iterations in place of 40, or more than 100.
 _LARGEST_TURN = 0.1
 # Which turn a mounting angle adds to; those that stand before the gimbal change nothing.
 _TURNS = {
@@ -156,10 +156,10 @@ class ThroughGimbalFactor(WrappedModel):
         to_steps, to_residuals = self._units()
         Y = self._by_steps([error[3:] for error in errors])
         change = np.einsum("en,ekjn->kjn", e, Y)
-        for i, bend in self._bends([error[3] for error in errors]):
+        for i, second in self._second_derivatives([error[3] for error in errors]):
             held = np.clip(e[i], -_LARGEST_TURN, _LARGEST_TURN)
-            change += 0.5 * held**2 * bend
-            Y[i] += np.where(held == e[i], held, 0.0) * bend
+            change += 0.5 * held**2 * second
+            Y[i] += np.where(held == e[i], held, 0.0) * second
         K = to_residuals @ change.transpose(2, 0, 1) @ to_steps
         whitening = np.linalg.inv(np.eye(self.rows) + K)
         residuals = np.einsum("nij,nj->ni", whitening, residuals)
@@ -192,7 +192,7 @@ class ThroughGimbalFactor(WrappedModel):
         to_steps = (information[..., None] * (to_residuals @ by_angles)).swapaxes(1, 2)
         return (self.encoder**2)[:, None, None] * to_steps, to_residuals
 
-    def _bends(self, turns: list[int]) -> Iterator[tuple[int, Array]]:
+    def _second_derivatives(self, turns: list[int]) -> Iterator[tuple[int, Array]]:
         """Yield the numbers of the errors that turn the camera itself, and the derivative of each Y by its error.
 
         Of all `turns`; the derivative is (3, 2, n), a x (a x a_k) of pictures, with the axes of the module's text;
@@ -203,10 +203,10 @@ class ThroughGimbalFactor(WrappedModel):
         se, ce = sign * np.sin(self.gimbal[:, 1]), sign * np.cos(self.gimbal[:, 1])
         for i, turn in enumerate(turns):
             if turn in (_COLLIMATION, _ROLL):
-                bend = np.zeros((3, 2, len(se)))
-                bend[_X, 1] = -sign
-                bend[(_Y, 0) if turn == _COLLIMATION else (_Z, 0)] = -se if turn == _COLLIMATION else -ce
-                yield i, bend
+                second = np.zeros((3, 2, len(se)))
+                second[_X, 1] = -sign
+                second[(_Y, 0) if turn == _COLLIMATION else (_Z, 0)] = -se if turn == _COLLIMATION else -ce
+                yield i, second
 
     def _by_steps(self, errors: list[tuple[int, Array, Array]]) -> Array:
         """Matrices Y (errors, 3, 2, n), camera frame, of errors with rotation axis, function, angle derivatives."""
