@@ -200,12 +200,13 @@ class ThroughGimbalFactor(WrappedModel):
         for information.
         """
         sign = -1.0 if self.encoder is None else 1.0
-        se, ce = sign * np.sin(self.gimbal[:, 1]), sign * np.cos(self.gimbal[:, 1])
+        elevation = self.gimbal[:, 1]
+        across = {_COLLIMATION: (_Y, np.sin(elevation)), _ROLL: (_Z, np.cos(elevation))}
         for i, turn in enumerate(turns):
-            if turn in (_COLLIMATION, _ROLL):
-                second = np.zeros((3, 2, len(se)))
-                second[_X, 1] = -sign
-                second[(_Y, 0) if turn == _COLLIMATION else (_Z, 0)] = -se if turn == _COLLIMATION else -ce
+            if turn in across:
+                axis, by_azimuth = across[turn]
+                second = np.zeros((3, 2, len(elevation)))
+                second[_X, 1], second[axis, 0] = -sign, -sign * by_azimuth
                 yield i, second
 
     def _by_steps(self, errors: list[tuple[int, Array, Array]]) -> Array:

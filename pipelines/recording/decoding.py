@@ -283,7 +283,7 @@ class MessageFormat:
             yield DecodedMessage(stamp, bool(absent[i]), content, definition)
 
     def cells(self, block: MessageBlock) -> Iterator[dict[str, Any]]:
-        """Yield the numbers and words of each message of a block by their paths, whatever its type.
+        """Yield a mapping from field path to number or word for each message of a block, whatever the type.
 
         LOG_TIME is the time at which a message was recorded, Unix ns. Raises MessageError.
         """

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.container import Container, MultiPartContainer
+from alidade.pipelines.recording.container import Container, MessageBlock, MultiPartContainer
 from alidade.pipelines.recording.decoding import LOG_TIME, MessageFormat
 from alidade.pipelines.recording.messages import SENSORS, MessageError
 from alidade.pipelines.recording.table_values import unit_in
@@ -45,9 +45,8 @@ class MessageTable:
 
     @property
     def is_proposed(self) -> bool:
-        """Whether the columns are looked at unasked: the type is not known, and no message is as large as a picture."""
-        block = next(self._container.blocks(set(self._formats)), None)
-        is_small = block is not None and int(block.size.max(initial=0)) <= _LARGEST
+        """Whether columns of these messages may be proposed: of an unknown type, none as large as a picture."""
+        is_small = self._first is not None and int(self._first.size.max(initial=0)) <= _LARGEST
         return is_small and not any(each.type in SENSORS for each in self._formats.values())
 
     @cached_property
@@ -55,9 +54,9 @@ class MessageTable:
         """Names of the columns, those of the first messages. Raises InputError."""
         path = self._container.path / self.name.strip("/")
         first: dict[str, object] = {}
-        for block in islice(self._container.blocks(set(self._formats)), 1):
+        if self._first is not None:
             try:
-                for cells in islice(self._formats[block.channel].cells(block), _FIRST):
+                for cells in islice(self._formats[self._first.channel].cells(self._first), _FIRST):
                     first = {**cells, **first}
             except MessageError as error:
                 raise InputError(f"{self._container.path}: topic {self.name}: {error}") from error
@@ -65,6 +64,11 @@ class MessageTable:
             raise InputError(f"{self._container.path}: topic {self.name}: its messages have {len(first)} fields")
         names = tuple(sorted(first, key=lambda name: name == LOG_TIME))
         return TableHead(path, names, tuple("ns" if _is_unix_ns(first[n]) else unit_in(n) for n in names), ())
+
+    @cached_property
+    def _first(self) -> MessageBlock | None:
+        """First block of messages; None without any."""
+        return next(self._container.blocks(set(self._formats)), None)
 
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
         """Return the named columns as texts, empty where a message lacks the field; and no sentences.
@@ -97,7 +101,7 @@ def _is_unix_ns(value: object) -> bool:
 
 
 class WithTables(MultiPartContainer):
-    """A recording with topics that are made of its own messages.
+    """Recording that has, beside its own topics, those that the config describes as tables of its messages.
 
     Args:
         recorded: the recording.

@@ -49,7 +49,7 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|
 
 @dataclass(frozen=True)
 class TableHead:
-    """Names and units of a table's columns.
+    """Columns of a table of sensor readings: their names and units, and what stands above them.
 
     Attributes:
         path: of the table, as it was named.
@@ -103,14 +103,14 @@ class Table(Protocol):
 
     @property
     def name(self) -> str:
-        """Name under `columns:`, `file`."""
+        """Name by which `file`, under `columns:` in the config, chooses the table."""
 
     @property
     def form(self) -> TableHead:
         """Names and units of the columns."""
 
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-        """Return the named columns as texts, and sentences about rows that are left out; see `read_columns`."""
+        """Return a table's columns of these names as texts, and sentences on rows left out; see `read_columns`."""
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
@@ -139,7 +139,7 @@ class CsvFile(ArrayContainer):
         self.name, self.form = form.path.name, form
 
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-        """Return the named columns as texts, and sentences about rows that are left out; see `read_columns`."""
+        """Return a table's columns of these names as texts, and sentences on rows left out; see `read_columns`."""
         return read_columns(self.form, names, most)
 
 

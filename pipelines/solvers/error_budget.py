@@ -369,7 +369,7 @@ def coloured_noises(
     """
     found = {}
     for family, lags in correlations.items():
-        if squares[family][1] < 1.0:  # nothing is left of it
+        if squares[family][1] < 1.0:  # the fit leaves it no degree of freedom
             continue
         whitened = _residuals(influence.at.engine.measured[family], influence.at.values)
         together = 1.0 + 2.0 * float(lags.sum())

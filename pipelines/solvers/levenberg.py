@@ -42,7 +42,7 @@ _AS_PREDICTED = 2e-6
 _CURVED = 1e-2
 # Predicted decrease of the first damped step below which all is at its minimum that has more information than the
 # damping, where the full step raises the cost even corrected: priors say where the rest is to be (`weak_directions`).
-# .001 is .03 sigma.
+# .001 is .03 sigma. A rough minimisation, whose tolerance is larger, ends at that, also while the cost still falls.
 _DETERMINED = 1e-3
 # Damping of corrections and of the first damped step, relative to the diagonal of A'A; that of a correction over that
 # of the step; and the damping below which steps are full ones again.

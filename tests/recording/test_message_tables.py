@@ -234,7 +234,7 @@ def test_what_is_not_there_is_named(
 
 
 def test_a_bag_of_ones_own_messages_is_calibrated(motion: Motion, tmp_path: Path, alidade: Command) -> None:
-    """The other device on the topic is told apart in the config."""
+    """The config selects one of two devices on the topic."""
     path = write_ros2(tmp_path / "bag", motion, StoragePlugin.SQLITE3)
     (tmp_path / "lab.yaml").write_text(
         "columns:\n"
@@ -267,7 +267,7 @@ def test_pictures_are_no_columns(tmp_path: Path) -> None:
 
 
 def _write_split(folder: Path, motion: Motion) -> Path:
-    """Write the JSON recording as two parts, each with a temperature beside."""
+    """Write the JSON recording as a folder of two parts."""
     folder.mkdir()
     half = len(motion.t) // 2
     for number, rows in enumerate((slice(half), slice(half, None))):
