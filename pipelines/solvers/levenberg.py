@@ -11,9 +11,9 @@ on it take hundreds. So the step is corrected first: from where it leads, damped
 the floor and leave the rest where it is. The cost there counts. A gimbal that was at rest for 30 s, whose bias follows
 its mount: 26 linear systems, where 200 damped steps alone had a third of the way before them.
 
-Where the residuals are curved as well, the linear system makes every step along the floor too short by the same part;
-after one such step the next is lengthened by what the two predict (Aitken). Recordings at rest for 50 s, of 5 pictures
-per second: 32 to 48 linear systems in place of 38 to 93; the worst known 70 in place of 287.
+Where the residuals are curved as well, the linear system makes every step along the floor too short, or too long, by
+the same part; after one such step the length of the next follows from what the two predict (Aitken). Recordings at rest
+for 50 s, of 5 pictures per second: 32 to 48 linear systems in place of 38 to 93; the worst known 70 in place of 287.
 
 Limits: a minimum is a local one. A cost is a sum of squares, in units of squared sigmas, with the losses in force.
 """
@@ -31,8 +31,9 @@ from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.linearization import Linearization, System
 
 # Decrease of the cost over the one predicted above which a step is doubled: along it the cost is no parabola, and falls
-# on, as it does about a saddle, where the ratio is 2.
-_DOUBLE = 1.5
+# on, as it does about a saddle, where the ratio is 2; and below which it was too long, if it was shorter than a sigma:
+# farther from the minimum that says nothing of the next step.
+_DOUBLE, _TOO_LONG, _NEAR = 1.5, 0.5, 1.0
 # Largest length, in full steps, of a step after one that the linear system makes too short.
 _LONGEST = 8.0
 # Error of the predicted decrease of an undamped step below which that step is the last.
@@ -46,7 +47,7 @@ _CURVED = 1e-2
 _DETERMINED = 1e-3
 # Damping of corrections and of the first damped step, relative to the diagonal of A'A; that of a correction over that
 # of the step; and the damping below which steps are full ones again.
-_INITIAL_DAMPING, _FIRMER, _MIN_DAMPING = 1e-6, 100.0, 1e-12
+INITIAL_DAMPING, _FIRMER, _MIN_DAMPING = 1e-6, 100.0, 1e-12
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,7 @@ def minimize(
 ) -> Solution:
     """Minimise an engine's cost from some values; `known` gives the linear system and cost there."""
     here = Point(engine, values, *known) if known else Point.of(engine, values)
-    damping, growth, iteration, served, before = 0.0, 2.0, 0, _INITIAL_DAMPING, 0.0
+    damping, growth, iteration, served, before = 0.0, 2.0, 0, INITIAL_DAMPING, 0.0
 
     def solution(converged: bool, message: str) -> Solution:
         return Solution(engine, here.values, here.system, here.cost, converged, message, iteration)
@@ -141,8 +142,7 @@ def minimize(
             there, corrections = _reached(engine, here, step.times(length), max(predicted, enough), damping, config)
             iteration += corrections
             decrease = here.cost - there.cost
-            falls_on = damping == 0.0 and length == 1.0 and decrease > _DOUBLE * max(predicted, enough)
-            before = predicted if falls_on else 0.0
+            before = _misjudged(decrease, max(predicted, enough)) if damping == 0.0 and length == 1.0 else 0.0
             if length > 1.0 and decrease < enough:
                 continue  # too far, which proves no minimum: the next step is the single one from here
             is_minimum = _is_minimum(enough, damping, predicted, decrease)
@@ -165,20 +165,28 @@ def minimize(
 
 
 def _length(predicted: float, before: float) -> float:
-    """Length, in full steps, of a step after one whose predicted decrease `before` was too small (0: there was none).
+    """Length, in full steps, of a step after a misjudged one, see `_misjudged`.
 
-    Steps that shrink by a factor lead to the minimum as a geometric series does: Aitken's extrapolation.
+    Steps that shrink by a factor lead to the minimum as a geometric series does, whose sign alternates where steps are
+    too long: Aitken's extrapolation.
     """
-    ratio = (predicted / before) ** 0.5 if before > 0.0 else 0.0
-    return 1.0 / (1.0 - min(ratio, 1.0 - 1.0 / _LONGEST))
+    ratio = (predicted / abs(before)) ** 0.5 if before else 0.0
+    return 1.0 / (1.0 - min(ratio, 1.0 - 1.0 / _LONGEST)) if before > 0.0 else 1.0 / (1.0 + min(ratio, 1.0))
+
+
+def _misjudged(decrease: float, predicted: float) -> float:
+    """Predicted decrease of a step that was too short, its negative if it was too long, and 0 if it was neither."""
+    if decrease > _DOUBLE * predicted:
+        return predicted
+    return -predicted if decrease < _TOO_LONG * predicted and predicted < _NEAR else 0.0
 
 
 def _is_minimum(enough: float, damping: float, predicted: float, decrease: float) -> bool:
     """Whether the end of a step is a minimum, from its damping and the predicted and actual decrease."""
     if damping > 0.0:
-        determined = damping <= _INITIAL_DAMPING and predicted < max(_DETERMINED, enough)
-        return determined and (decrease <= 0.0 or damping == _INITIAL_DAMPING or enough > _DETERMINED)
-    as_predicted = predicted < 1.0 and abs(decrease - predicted) < _AS_PREDICTED
+        determined = damping <= INITIAL_DAMPING and predicted < max(_DETERMINED, enough)
+        return determined and (decrease <= 0.0 or damping == INITIAL_DAMPING or enough > _DETERMINED)
+    as_predicted = predicted < _NEAR and abs(decrease - predicted) < _AS_PREDICTED
     return predicted < enough or (predicted < _CURVED and decrease < enough) or as_predicted
 
 
@@ -191,7 +199,7 @@ def _reached(
         return _lengthened(engine, here.values, step, there.cost), 0
     if there.cost < here.cost or config.corrections == 0:
         return there, 0
-    firm, counted = max(_INITIAL_DAMPING, _FIRMER * damping), engine.counting(engine.inliers(here.values))
+    firm, counted = max(INITIAL_DAMPING, _FIRMER * damping), engine.counting(engine.inliers(here.values))
     back = Point.of(counted, there.values)
     for count in range(1, config.corrections + 1):
         correction, _ = _step(back.system, firm)

@@ -27,7 +27,7 @@ from alidade.pipelines import deadline
 from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import DEFAULT, LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.levenberg import DEFAULT, INITIAL_DAMPING, LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization, System
 
 # Decrease of chi-square per measurement at which plain least squares is near enough to begin with: residuals move by
@@ -139,7 +139,7 @@ def _graduated(
             break
         try:
             system, cost = relaxed.at(values)
-            step = Tangent(*system.eliminate().solve())
+            step = Tangent(*system.eliminate(INITIAL_DAMPING).solve())
         except (IndeterminateStateError, np.linalg.LinAlgError):
             break
         values, iterations = engine.layout.retract(here := values, step), iterations + 1
