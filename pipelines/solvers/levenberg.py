@@ -30,10 +30,9 @@ from alidade.pipelines.solvers.chain import Factorization, IndeterminateStateErr
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.linearization import Linearization, System
 
-# Decrease of the cost over the one predicted above which a step is doubled: along it the cost is no parabola, and falls
-# on, as it does about a saddle, where the ratio is 2; and below which it was too long, if it was shorter than a sigma:
-# farther from the minimum that says nothing of the next step.
-_DOUBLE, _TOO_LONG, _NEAR = 1.5, 0.5, 1.0
+# Decrease of the cost over the one predicted above which a step was too short (about a saddle the ratio is 2), and below
+# which it was too long, if it was shorter than a sigma: farther from the minimum that says nothing of the next step.
+_TOO_SHORT, _TOO_LONG, _NEAR = 1.5, 0.5, 1.0
 # Largest length, in full steps, of a step after one that the linear system makes too short.
 _LONGEST = 8.0
 # Error of the predicted decrease of an undamped step below which that step is the last.
@@ -139,7 +138,7 @@ def minimize(
         step, predicted = _step(here.system, damping)
         if step is not None:
             length = _length(predicted, before) if damping == 0.0 else 1.0
-            there, corrections = _reached(engine, here, step.times(length), max(predicted, enough), damping, config)
+            there, corrections = _reached(engine, here, step.times(length), damping, config)
             iteration += corrections
             decrease = here.cost - there.cost
             before = _misjudged(decrease, max(predicted, enough)) if damping == 0.0 and length == 1.0 else 0.0
@@ -176,7 +175,7 @@ def _length(predicted: float, before: float) -> float:
 
 def _misjudged(decrease: float, predicted: float) -> float:
     """Predicted decrease of a step that was too short, its negative if it was too long, and 0 if it was neither."""
-    if decrease > _DOUBLE * predicted:
+    if decrease > _TOO_SHORT * predicted:
         return predicted
     return -predicted if decrease < _TOO_LONG * predicted and predicted < _NEAR else 0.0
 
@@ -191,12 +190,10 @@ def _is_minimum(enough: float, damping: float, predicted: float, decrease: float
 
 
 def _reached(
-    engine: Linearization, here: Point, step: Tangent, predicted: float, damping: float, config: LevenbergConfig
+    engine: Linearization, here: Point, step: Tangent, damping: float, config: LevenbergConfig
 ) -> tuple[Point, int]:
-    """Return the point after a step, lengthened or corrected to second order, and the number of corrections."""
+    """Return the point after a step, corrected to second order where the cost rises, and the number of corrections."""
     there = Point.of(engine, engine.layout.retract(here.values, step))
-    if here.cost - there.cost > _DOUBLE * predicted:
-        return _lengthened(engine, here.values, step, there.cost), 0
     if there.cost < here.cost or config.corrections == 0:
         return there, 0
     firm, counted = max(INITIAL_DAMPING, _FIRMER * damping), engine.counting(engine.inliers(here.values))
@@ -212,18 +209,6 @@ def _reached(
         if engine.cost(back.values) < here.cost:
             return Point.of(engine, back.values), count
     return there, config.corrections
-
-
-def _lengthened(engine: Linearization, values: Values, step: Tangent, cost: float) -> Point:
-    """Double a step while the cost falls and return its end; `cost` is that after the single step."""
-    length = 1.0
-
-    def ahead(length: float) -> Values:
-        return engine.layout.retract(values, step.times(length))
-
-    while (further := engine.cost(ahead(2.0 * length))) < cost:
-        length, cost = 2.0 * length, further
-    return Point.of(engine, ahead(length))
 
 
 def _enough(config: LevenbergConfig, point: Point, rows: int) -> float:
