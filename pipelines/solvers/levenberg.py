@@ -30,8 +30,8 @@ from alidade.pipelines.solvers.chain import Factorization, IndeterminateStateErr
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.linearization import Linearization, System
 
-# Decrease of the cost over the one predicted above which a step was too short (about a saddle the ratio is 2), and below
-# which it was too long, if it was shorter than a sigma: farther from the minimum that says nothing of the next step.
+# Decrease of the cost over the one predicted above which a step was too short (about a saddle the ratio is 2), and
+# below which it was too long, if it was shorter than a sigma: farther from the minimum that says nothing of the next.
 _TOO_SHORT, _TOO_LONG, _NEAR = 1.5, 0.5, 1.0
 # Largest length, in full steps, of a step after one that the linear system makes too short.
 _LONGEST = 8.0
