@@ -37,7 +37,7 @@ WRONG, RIGHT = 4.0, 3.0
 LIMIT_S = 300.0
 # Ranges, even in the logarithm, of the settings that `several` and `every` draw where a simulator has them.
 RANGES = {
-    "duration_s": (15.0, 600.0),
+    "duration_s": (15.0, 3600.0),
     "gyro_rate_hz": (25.0, 1000.0),
     "platform_gyro_rate_hz": (25.0, 400.0),
     "imu_rate_hz": (25.0, 400.0),

@@ -37,7 +37,7 @@ class VisionAttitudeFactor(Model):
     time offset, s, positive when a picture was taken later than its stamp says; clock skew, at = stamp + time offset -
     skew * elapsed; angle scale, Log(first^T cRh) is measured 1 + scale times as large; filter, s^2, half the difference
     of the second moments of both impulse responses, vision's less the gyro's, which adds Exp(filter * acceleration) to
-    bRv, the angular acceleration by the helmet's gyro (a platform's own, of 1 rad/s^2, would add 2e-5 rad).
+    bRv, the angular acceleration of the helmet on its platform as both gyros read it.
 
     Scale and filter act on the prediction: a measurement that is scaled shrinks its own noise. The scale fades out
     between FADE and half a turn from the first attitude, where the logarithm changes sign.
@@ -85,17 +85,16 @@ class VisionAttitudeFactor(Model):
         anchor = self.time if self.anchor is None else self.anchor
         middle = 0.5 * (anchor + (self.time if self.expected is None else self.expected))
         dV, rate, by_gyro = carried(self.helmet, anchor, middle, at, bias, errors)
-        filtered, acceleration, jerk = self._filtered(at, picture)
-        lag = so3.exp(filtered)
-        bRv = so3.compose(bRv, dV, lag)
-        rate = so3.rotate(so3.inverse(lag), rate)
+        bRv = so3.multiply(bRv, dV)
         by_dB: Derivatives = tuple
         if self.platform is not None:
             base_bias, base_errors = platform_errors(self.platform, platform, len(at))
             dB, platform_rate, by_dB = carried(self.platform, anchor, middle, at, base_bias, base_errors)
             bRv = so3.multiply(so3.inverse(dB), bRv)
             rate = rate - so3.rotate(so3.inverse(bRv), platform_rate)
-        seen, by_cRh, by_scale = self._seen(so3.compose(cRb, bRv, vRh), picture)
+        filtered, acceleration, jerk, by_turn = self._filtered(at, picture, bRv, rate)
+        lag = so3.exp(filtered)
+        seen, by_cRh, by_scale = self._seen(so3.compose(cRb, bRv, lag, vRh), picture)
         error = so3.local(seen, self.measured)
 
         def jacobians() -> tuple[Array, ...]:
@@ -103,34 +102,48 @@ class VisionAttitudeFactor(Model):
             weight = -self.sqrt_information @ so3.right_jacobian_inverse(-error)
             by_picture = weight @ by_scale
             weight = weight @ by_cRh()
-            by_bRv = weight @ so3.matrix(so3.inverse(vRh))
-            by_cRb = by_bRv @ so3.matrix(so3.inverse(bRv))
-            by_dV = by_bRv @ so3.matrix(so3.inverse(lag))
-            by_filtered = by_bRv @ so3.right_jacobian(filtered)
-            by_times = (by_bRv @ rate[..., None] + by_filtered @ jerk[..., None]) * by_at[:, None]
+            by_lag = weight @ so3.matrix(so3.inverse(vRh))
+            by_cRb = by_lag @ so3.matrix(so3.inverse(so3.multiply(bRv, lag)))
+            by_filtered, unfiltered = by_lag @ so3.right_jacobian(filtered), by_lag @ so3.matrix(so3.inverse(lag))
+            by_times = (unfiltered @ rate[..., None] + by_filtered @ jerk[..., None]) * by_at[:, None]
             by_filter = [by_filtered @ acceleration[..., None]] if picture.shape[1] > 1 else []
-            by_bias, *by_errors = (by_dV @ each for each in by_gyro())
+            by_bRv = unfiltered + by_filtered @ by_turn
+            by_platform = by_bRv @ so3.matrix(so3.inverse(bRv))
+            by_bias, *by_errors = (by_bRv @ each for each in by_gyro())
             # The columns of the pictures' errors stand as in PICTURE_ERRORS.
             return (
-                by_dV @ so3.matrix(so3.inverse(dV)),
+                by_bRv @ so3.matrix(so3.inverse(dV)),
                 by_bias,
                 by_cRb,
                 weight,
                 np.concatenate([by_times, by_picture, *by_filter], axis=2),
                 *by_errors,
-                *(-by_cRb @ each for each in by_platform_errors(by_dB, platform)),
+                *(-by_platform @ each for each in by_platform_errors(by_dB, platform)),
             )
 
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
 
-    def _filtered(self, at: Array, picture: Array) -> tuple[Array, Array, Array]:
-        """Rotation (n, 3), rad, of bRv by the gyro's filter, angular acceleration, rotation derivative by time."""
+    def _filtered(self, at: Array, picture: Array, bRv: Array, rate: Array) -> tuple[Array, Array, Array, Array]:
+        """Rotation (n, 3), rad, that the filter adds to bRv, and its derivatives by filter, by time and by bRv.
+
+        With w, b the rates that both gyros read and u = bRv^T b, the helmet turns on its platform at w - u, which
+        changes by w' - bRv^T b' + w x u. `rate` is that at which bRv turns.
+        """
         if picture.shape[1] == 1:
             nothing = np.zeros((len(at), 3))
-            return nothing, nothing, nothing
+            return nothing, nothing, nothing, np.zeros((len(at), 3, 3))
         acceleration, jerk = self.helmet.acceleration(at)
+        by_turn = np.zeros((len(at), 3, 3))
+        if self.platform is not None:
+            w, by_w = self.helmet.rate_and_slope(at)
+            read = *self.platform.rate_and_slope(at), *self.platform.acceleration(at)
+            u, by_u, swing, by_swing = (so3.rotate(so3.inverse(bRv), each) for each in read)
+            by_u, by_swing = by_u - np.cross(rate, u), by_swing - np.cross(rate, swing)
+            by_turn = so3.hat(w) @ so3.hat(u) - so3.hat(swing)
+            acceleration = acceleration - swing + np.cross(w, u)
+            jerk = jerk - by_swing + np.cross(by_w, u) + np.cross(w, by_u)
         filter_ = picture[:, [FILTER_COLUMN]]
-        return filter_ * acceleration, acceleration, filter_ * jerk
+        return filter_ * acceleration, acceleration, filter_ * jerk, filter_[..., None] * by_turn
 
     def exposed(self, picture: Array) -> tuple[Array, Array]:
         """Exposure times (n,), s, and their derivatives by time offset and skew (n, 1 or 2)."""

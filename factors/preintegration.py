@@ -173,9 +173,13 @@ class GyroPath:
 
     def rate(self, at: ArrayLike) -> Array:
         """Rate (n, 3), rad/s, at the times, interpolated linearly, minus bias_hat."""
+        return self.rate_and_slope(at)[0]
+
+    def rate_and_slope(self, at: ArrayLike) -> tuple[Array, Array]:
+        """Rate (n, 3), as `rate` gives it, and its derivative by time, rad/s^2."""
         i, s = self._place(np.asarray(at, dtype=float))
         rate, slope = self._line(i, _rates)
-        return np.asarray(rate + slope * s)
+        return np.asarray(rate + slope * s), slope
 
     def acceleration(self, at: ArrayLike) -> tuple[Array, Array]:
         """Angular acceleration (n, 3), rad/s^2, and its derivative by time, from differences of rates around times."""
