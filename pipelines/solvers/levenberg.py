@@ -37,9 +37,6 @@ _TOO_SHORT, _TOO_LONG, _NEAR = 1.5, 0.5, 1.0
 _LONGEST = 8.0
 # Error of the predicted decrease of an undamped step below which that step is the last.
 _AS_PREDICTED = 2e-6
-# Predicted decrease of an undamped step, corrected, below which it may raise the cost at a minimum: what the data
-# hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
-_CURVED = 1e-2
 # Predicted decrease of the first damped step below which all is at its minimum that has more information than the
 # damping, where the full step raises the cost even corrected: priors say where the rest is to be (`weak_directions`).
 # .001 is .03 sigma. A rough minimisation, whose tolerance is larger, ends at that, also while the cost still falls.
@@ -186,7 +183,7 @@ def _is_minimum(enough: float, damping: float, predicted: float, decrease: float
         determined = damping <= INITIAL_DAMPING and predicted < max(_DETERMINED, enough)
         return determined and (decrease <= 0.0 or damping == INITIAL_DAMPING or enough > _DETERMINED)
     as_predicted = predicted < _NEAR and abs(decrease - predicted) < _AS_PREDICTED
-    return predicted < enough or (predicted < _CURVED and decrease < enough) or as_predicted
+    return predicted < enough or as_predicted
 
 
 def _reached(
