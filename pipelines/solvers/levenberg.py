@@ -120,7 +120,7 @@ def minimize(
 ) -> Solution:
     """Minimise an engine's cost from some values; `known` gives the linear system and cost there."""
     here = Point(engine, values, *known) if known else Point.of(engine, values)
-    damping, growth, iteration, served, before = 0.0, 2.0, 0, INITIAL_DAMPING, 0.0
+    damping, growth, iteration, before = 0.0, 2.0, 0, 0.0
 
     def solution(converged: bool, message: str) -> Solution:
         return Solution(engine, here.values, here.system, here.cost, converged, message, iteration)
@@ -147,14 +147,13 @@ def minimize(
             if is_minimum:
                 return solution(True, f"converged after {iteration} iterations")
             if decrease > 0.0:
-                served = damping or served
                 ratio = decrease / predicted if predicted > 0.0 else 1.0
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
                 growth = 2.0
                 if damping < _MIN_DAMPING or predicted < _DETERMINED:
                     damping = 0.0
                 continue
-        damping, growth = (damping * growth if damping > 0.0 else served), 2.0 * growth
+        damping, growth = (damping * growth if damping > 0.0 else INITIAL_DAMPING), 2.0 * growth
         if damping > config.max_damping:
             return solution(False, f"no step lowers chi-square of {here.cost:.6g}")
     return solution(False, f"not converged after {iteration} iterations")
