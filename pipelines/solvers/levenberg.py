@@ -135,7 +135,9 @@ def minimize(
         step, predicted = _step(here.system, damping)
         if step is not None:
             length = _length(predicted, before) if damping == 0.0 else 1.0
-            there, corrections = _reached(engine, here, step.times(length), damping, config)
+            # Where there is nothing to be gained the cost rises by rounding.
+            most = config.corrections if predicted >= enough else 0
+            there, corrections = _reached(engine, here, step.times(length), damping, most)
             iteration += corrections
             decrease = here.cost - there.cost
             before = _misjudged(decrease, max(predicted, enough)) if damping == 0.0 and length == 1.0 else 0.0
@@ -185,16 +187,14 @@ def _is_minimum(enough: float, damping: float, predicted: float, decrease: float
     return predicted < enough or as_predicted
 
 
-def _reached(
-    engine: Linearization, here: Point, step: Tangent, damping: float, config: LevenbergConfig
-) -> tuple[Point, int]:
-    """Return the point after a step, corrected to second order where the cost rises, and the number of corrections."""
+def _reached(engine: Linearization, here: Point, step: Tangent, damping: float, most: int) -> tuple[Point, int]:
+    """Return the point after a step, corrected where the cost rises, `most` times at most, and how many times."""
     there = Point.of(engine, engine.layout.retract(here.values, step))
-    if there.cost < here.cost or config.corrections == 0:
+    if there.cost < here.cost or most == 0:
         return there, 0
     firm, counted = max(INITIAL_DAMPING, _FIRMER * damping), engine.counting(engine.inliers(here.values))
     back = Point.of(counted, there.values)
-    for count in range(1, config.corrections + 1):
+    for count in range(1, most + 1):
         correction, _ = _step(back.system, firm)
         if correction is None:
             return there, count
@@ -204,7 +204,7 @@ def _reached(
         back = further
         if engine.cost(back.values) < here.cost:
             return Point.of(engine, back.values), count
-    return there, config.corrections
+    return there, most
 
 
 def _enough(config: LevenbergConfig, point: Point, rows: int) -> float:
