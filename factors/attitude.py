@@ -92,7 +92,7 @@ class VisionAttitudeFactor(Model):
             dB, platform_rate, by_dB = carried(self.platform, anchor, middle, at, base_bias, base_errors)
             bRv = so3.multiply(so3.inverse(dB), bRv)
             rate = rate - so3.rotate(so3.inverse(bRv), platform_rate)
-        filtered, acceleration, jerk, by_turn = self._filtered(at, picture, bRv, rate)
+        filtered, acceleration, filtered_by_time, filtered_by_turn = self._filtered(at, picture, bRv, rate)
         lag = so3.exp(filtered)
         seen, by_cRh, by_scale = self._seen(so3.compose(cRb, bRv, lag, vRh), picture)
         error = so3.local(seen, self.measured)
@@ -105,9 +105,9 @@ class VisionAttitudeFactor(Model):
             by_lag = weight @ so3.matrix(so3.inverse(vRh))
             by_cRb = by_lag @ so3.matrix(so3.inverse(so3.multiply(bRv, lag)))
             by_filtered, unfiltered = by_lag @ so3.right_jacobian(filtered), by_lag @ so3.matrix(so3.inverse(lag))
-            by_times = (unfiltered @ rate[..., None] + by_filtered @ jerk[..., None]) * by_at[:, None]
+            by_times = (unfiltered @ rate[..., None] + by_filtered @ filtered_by_time[..., None]) * by_at[:, None]
             by_filter = [by_filtered @ acceleration[..., None]] if picture.shape[1] > 1 else []
-            by_bRv = unfiltered + by_filtered @ by_turn
+            by_bRv = unfiltered + by_filtered @ filtered_by_turn
             by_platform = by_bRv @ so3.matrix(so3.inverse(bRv))
             by_bias, *by_errors = (by_bRv @ each for each in by_gyro())
             # The columns of the pictures' errors stand as in PICTURE_ERRORS.
@@ -124,7 +124,7 @@ class VisionAttitudeFactor(Model):
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
 
     def _filtered(self, at: Array, picture: Array, bRv: Array, rate: Array) -> tuple[Array, Array, Array, Array]:
-        """Rotation (n, 3), rad, that the filter adds to bRv, and its derivatives by filter, by time and by bRv.
+        """Rotation (n, 3), rad, that the filter adds to bRv, and derivatives by filter, time and turns of bRv.
 
         With w, b the rates that both gyros read and u = bRv^T b, the helmet turns on its platform at w - u, which
         changes by w' - bRv^T b' + w x u. `rate` is that at which bRv turns.

@@ -34,7 +34,8 @@ from alidade.pipelines.solvers.linearization import Group, Linearization, System
 # .05 sigma yet; and its iterations at most: where they do not do outliers lead, and the surrogates begin anyhow.
 _ROUGH_TOLERANCE, _ROUGH_ITERATIONS = 2e-3, 8
 # Factor of mu from one surrogate to the next, with one reweighted step each (Yang et al.: 1.4), and the last mu at
-# most: weights are 0 or 1 then but for .1 % about the gate.
+# most: weights are 0 or 1 then but for .1 % about the gate. Steps are damped, since what decides a weight is
+# determined, and a full one may leave a curved valley.
 _MU_STEP, _LAST_MU = 2.5, 1e3
 # Share of measurements whose weights are neither 0 nor 1 below which the truncated loss follows: what they say of
 # anything is less than that share.

@@ -237,6 +237,40 @@ def test_a_lengthened_step_that_goes_too_far_proves_no_minimum(monkeypatch: pyte
     assert found.cost - least < 1e-6
 
 
+@dataclass(frozen=True)
+class Bent(Model):
+    """Sees x, and K + c x^2 / (2 K): the true curvature is 1 + c times that of the linear system."""
+
+    time: Array
+    c: float
+    K: float = 10.0
+    rows: int = 2
+    blocks = (1,)
+
+    def __call__(self, x: Array) -> Residuals:
+        residuals = np.hstack([x, self.K + self.c * x**2 / (2.0 * self.K)])
+        return residuals, lambda: (np.stack([np.ones_like(x), self.c * x / self.K], axis=1),)
+
+
+# Gauss-Newton's steps alone: 33, 35 and more than 100 iterations.
+@pytest.mark.parametrize(("c", "most"), [(-0.7, 5), (0.7, 6), (0.99, 6), (20.0, 60)])
+def test_steps_of_the_wrong_length_are_made_right(c: float, most: int) -> None:
+    initial = gtsam.Values()
+    initial.insert(0, np.array([0.05 if c > 1.0 else 0.5]))
+    step = Step(0.0, initial, [Factor.of("bent", Bent(np.zeros(1), c).on(0))])
+    problem = Problem("", (Parameter(0, (Quantity("x", "", None, 1.0, 0.1),)),), lambda _: iter([step]))
+    compiled = Compiled.of(problem, "gtsam")
+    found = levenberg.minimize(compiled.engine, compiled.initial)
+    assert found.converged
+    assert found.iterations <= most
+    assert found.cost - Bent.K**2 < 1e-4
+
+
+@pytest.mark.parametrize("before", [0.5, -0.5, 0.0])
+def test_a_decrease_that_is_negative_by_rounding_gives_a_full_step(before: float) -> None:
+    assert levenberg._length(-1e-9, before) == 1.0
+
+
 @pytest.mark.parametrize("pictures_hz", [5.0, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_where_measurements_do_not_fit_steps_get_the_right_length(pictures_hz: float) -> None:
     """A gyro warms up and nobody says so: residuals are tens of sigmas, and bend the error as much as Jacobians do.
