@@ -20,7 +20,7 @@ from alidade.pipelines.recording.plausibility import density
 from alidade.pipelines.recording.recording import open_recording
 
 # Of los at 1 kHz and 50 pictures a second, bytes a sample of the gyro: with ten hours, 36 million, in 8 GiB.
-READING, READ, PREPARING, PREPARED = 165.0, 73.0, 150.0, 115.0
+READING, READ, PREPARING, PREPARED = 165.0, 73.0, 145.0, 115.0
 
 
 @pytest.mark.parametrize("block", [37, 1000])

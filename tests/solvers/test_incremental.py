@@ -285,14 +285,15 @@ def test_a_number_without_prior_keeps_its_posterior() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "seed", [1, 3, pytest.param(4, marks=pytest.mark.xfail(strict=True, reason="one sigma is 16 % below batch's"))]
+    "seed", [1, pytest.param(3, marks=pytest.mark.xfail(strict=True, reason="one sigma is 6 % below batch's")), 4]
 )
-def test_after_two_minutes_an_answer_is_as_good_as_batch_though_nothing_tells_the_roll(seed: int) -> None:
-    """In the initialisation phase or after it."""
+def test_the_initialisation_phase_ends_though_nothing_tells_the_roll(seed: int) -> None:
+    """After two minutes the answer is as good as batch; else it would be solved anew until the tenth minute."""
     problem, truth = made("los", drawn_los(seed, duration_s=120.0), seed)
     following = IncrementalSolver(problem, DEFAULT_WINDOW)
     for step in problem.steps(1):
         following.add_step(step)
+    assert not following.initialising
     batch, estimate = solve_batch(problem), following.finish(0.0)
     assert _apart(estimate, batch) < 0.5
     np.testing.assert_allclose(estimate.sigmas, batch.sigmas, rtol=0.05)
