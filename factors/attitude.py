@@ -124,7 +124,7 @@ class VisionAttitudeFactor(Model):
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
 
     def _filtered(self, at: Array, picture: Array, bRv: Array, rate: Array) -> tuple[Array, Array, Array, Array]:
-        """Rotation (n, 3), rad, that the filter adds to bRv, and derivatives by filter, time and turns of bRv.
+        """Return vision's low-pass as rotation vectors (n, 3), rad, right of bRv; derivatives by filter, time, bRv.
 
         With w, b the rates that both gyros read and u = bRv^T b, the helmet turns on its platform at w - u, which
         changes by w' - bRv^T b' + w x u. `rate` is that at which bRv turns.

@@ -45,7 +45,7 @@ class MessageTable:
 
     @property
     def is_proposed(self) -> bool:
-        """Whether columns of these messages may be proposed: of an unknown type, none as large as a picture."""
+        """Whether `info` may propose columns for the topic: its message type is unknown and no message is a picture."""
         is_small = self._first is not None and int(self._first.size.max(initial=0)) <= _LARGEST
         return is_small and not any(each.type in SENSORS for each in self._formats.values())
 
@@ -96,7 +96,7 @@ class MessageTable:
 
 
 def _is_unix_ns(value: object) -> bool:
-    """Whether a number is a time of day, ns since 1970: nothing else is as large."""
+    """Whether an integer is so large that it can only be a time in ns since 1970."""
     return isinstance(value, int) and value > _UNIX_NS
 
 

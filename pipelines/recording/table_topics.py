@@ -145,7 +145,7 @@ class TableTopic(BaseModel):
         columns: Mapping[str, NDArray[np.str_]],
         logged: NDArray[np.str_] | None = None,
     ) -> tuple[series.Topic, Stamps | None, list[str]]:
-        """Return the rows of a table as a series of SI values, log times, Unix ns, if any, and notes for the user.
+        """Return a topic's series in SI units from the rows of a table, its log times (Unix ns) or None, and notes.
 
         Rows without a number in any of its columns are left out. Raises InputError.
 

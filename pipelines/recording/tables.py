@@ -49,7 +49,7 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|
 
 @dataclass(frozen=True)
 class TableHead:
-    """Columns of a table of sensor readings: their names and units, and what stands above them.
+    """Names and units of the columns of a table of sensor readings, and the lines above the table.
 
     Attributes:
         path: of the table, as it was named.
@@ -110,7 +110,7 @@ class Table(Protocol):
         """Names and units of the columns."""
 
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-        """Return a table's columns of these names as texts, and sentences on rows left out; see `read_columns`."""
+        """Return the named columns of a table as texts, and a sentence about each kind of row left out."""
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
@@ -139,7 +139,7 @@ class CsvFile(ArrayContainer):
         self.name, self.form = form.path.name, form
 
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-        """Return a table's columns of these names as texts, and sentences on rows left out; see `read_columns`."""
+        """Return the named columns of a table as texts, and a sentence about each kind of row left out."""
         return read_columns(self.form, names, most)
 
 

@@ -146,7 +146,7 @@ def cells(tree: Any, name: str = "") -> Iterator[tuple[str, int | float | str]]:
 
 
 def _fields(tree: Any) -> list[tuple[str, Any]]:
-    """Return names and values of the top-level fields of a ROS, protobuf or JSON message, in order."""
+    """Return the name and value of each top-level field of a ROS, protobuf or JSON message, in order."""
     if isinstance(tree, Mapping):
         return [(str(key), value) for key, value in tree.items()]
     if hasattr(tree, "__msgtype__"):

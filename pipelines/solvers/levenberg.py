@@ -193,7 +193,7 @@ def _is_minimum(enough: float, damping: float, predicted: float, decrease: float
 
 
 def _reached(engine: Linearization, here: Point, step: Tangent, damping: float, most: int) -> tuple[Point, int]:
-    """Return the point after a step, corrected where the cost rises, `most` times at most, and how many times."""
+    """Return the end of a step, corrected at most `most` times where the cost rises, and the number of corrections."""
     there = Point.of(engine, engine.layout.retract(here.values, step))
     if there.cost < here.cost or most == 0:
         return there, 0
