@@ -105,20 +105,20 @@ class LocalMotion(Stacked):
 
         Of a recording that grows windows and following stay as they were `before`.
         """
-        sums = _commanded(gyro_t, gyro, gimbal)
-        commanded = GimbalPath(gyro_t, sums[:, :2])
-        rest = gimbal.angles - commanded.at(gimbal.t)
+        angles, by_delay = _commanded(gyro_t, gyro, gimbal)
+        commanded = GimbalPath(gyro_t, angles)
+        rest, reached = gimbal.angles - commanded.at(gimbal.t), commanded.at(at)
+        following = _following(gimbal, commanded) if before is None else before.following
+        del angles, commanded  # As large as the recording, like the rates by delay.
         if before is None:
             windows = _smoothing(at, gyro_t, gyro), _smoothing(at, gimbal.t, rest)
-            following = _following(gimbal, commanded)
         else:
-            windows, following = before.windows, before.following
-        resting, reached = _local_cubics(at, gimbal.t, rest, windows[1]), commanded.at(at)
+            windows = before.windows
         return cls(
             _local_cubics(at, gyro_t, gyro, windows[0]),
             reached + GimbalPath(gimbal.t, rest).at(at),
-            resting[:, 1:].copy(),
-            _local_cubics(at, gyro_t, sums[:, 2:], windows[1])[:, 1:].copy(),
+            _local_cubics(at, gimbal.t, rest, windows[1])[:, 1:].copy(),
+            _local_cubics(at, gyro_t, by_delay, windows[1])[:, 1:].copy(),
             windows,
             following,
             None if drivers is None else interpolated(at, gyro_t, drivers),
@@ -177,20 +177,20 @@ def _command_change(rate: Array, angles: Array, by: Array) -> Array:
     return np.stack([elevation * ahead * (1.0 + tangent**2) - azimuth * tangent * right, -azimuth * ahead], axis=1)
 
 
-def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
+def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> tuple[Array, Array]:
     """Integrated commanded angles of the gimbal since the first sample, and their derivative by a delay.
 
     Returns:
-        (N, 4) rad and rad/s: azimuth, elevation, and by how much more each is with the gyro read so much later.
+        (N, 2) azimuth and elevation, rad; (N, 2) by how much more each is with the gyro read so much later, rad/s.
     """
-    out = np.zeros((len(t), 4))
+    angles, by_delay = np.zeros((len(t), 2)), np.zeros((len(t), 2))
     for i in range(0, len(t) - 1, _BLOCK):
-        some = slice(i, i + _BLOCK + 1)
-        rates, angles = rate[some], gimbal.at(t[some])
-        middle, mean = 0.5 * (angles[1:] + angles[:-1]), 0.5 * (rates[1:] + rates[:-1])
-        steps = np.diff(t[some])[:, None] * command(mean, middle), command(np.diff(rates, axis=0), middle)
-        out[i + 1 : i + _BLOCK + 1] = out[i] + np.cumsum(np.hstack(steps), axis=0)
-    return out
+        some, then = slice(i, i + _BLOCK + 1), slice(i + 1, i + _BLOCK + 1)
+        rates, read = rate[some], gimbal.at(t[some])
+        middle, mean = 0.5 * (read[1:] + read[:-1]), 0.5 * (rates[1:] + rates[:-1])
+        angles[then] = angles[i] + np.cumsum(np.diff(t[some])[:, None] * command(mean, middle), axis=0)
+        by_delay[then] = by_delay[i] + np.cumsum(command(np.diff(rates, axis=0), middle), axis=0)
+    return angles, by_delay
 
 
 def _following(gimbal: GimbalPath, commanded: GimbalPath) -> float:
