@@ -110,10 +110,7 @@ class LocalMotion(Stacked):
         rest, reached = gimbal.angles - commanded.at(gimbal.t), commanded.at(at)
         following = _following(gimbal, commanded) if before is None else before.following
         del angles, commanded  # As large as the recording, like the rates by delay.
-        if before is None:
-            windows = _smoothing(at, gyro_t, gyro), _smoothing(at, gimbal.t, rest)
-        else:
-            windows = before.windows
+        windows = (_smoothing(at, gyro_t, gyro), _smoothing(at, gimbal.t, rest)) if before is None else before.windows
         return cls(
             _local_cubics(at, gyro_t, gyro, windows[0]),
             reached + GimbalPath(gimbal.t, rest).at(at),

@@ -275,6 +275,7 @@ def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Arra
     ways = ways[sizes > STRAIGHT * np.sqrt(DRAWS)]
     if not len(ways):
         return np.zeros((k, k))
+    ways *= np.copysign(1.0, ways @ way)[:, None]  # to the side of the last draw: rounding decides which one svd takes
     H = slopes(directions, roots, follows, np.sqrt(len(ways)) * ways.T) / np.sqrt(len(ways))
     mean = 0.5 * np.einsum("ial,il->a", H, ways)
     return np.asarray(0.5 * np.einsum("ial,ibl->ab", H, H) + np.outer(mean, mean))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -127,6 +129,19 @@ def test_curvature_is_the_variance_of_what_follows_a_weak_direction() -> None:
     assert directions.with_curvature(found).weak.shape[1] == 1
     # Where it follows by more than the prior leaves, it is no longer determined.
     assert directions.with_curvature(100.0 * found).weak.shape[1] == 2
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_curvature_does_not_depend_on_the_signs_of_axes(sign: float) -> None:
+    """With s - w w / 20 - w w w / 100 measured, slopes on one side differ from those on the other."""
+
+    def at(w: float) -> Array:
+        return root(np.array([[1e4, -1e3 * w - 3e2 * w**2], [0.0, 1.0]]), 1e-3 * np.eye(2))
+
+    directions = WeakDirections.of(at(0.0), np.eye(2))
+    flipped = replace(directions, strong=sign * directions.strong, weak=-sign * directions.weak)
+    roots = [curvature(each, lambda moves: [at(float(w)) for w in moves[1]]) for each in (directions, flipped)]
+    np.testing.assert_allclose(roots[0], roots[1], rtol=1e-9)
 
 
 def test_linear_system_has_no_curvature() -> None:
