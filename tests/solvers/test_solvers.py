@@ -231,7 +231,8 @@ def test_a_lengthened_step_that_goes_too_far_proves_no_minimum(monkeypatch: pyte
     near = engine.layout.retract(start.values, step.times(1.0 - share))
     lengths = iter((3.0, *(10 * [1.0])))
     monkeypatch.setattr(levenberg, "_length", lambda *_: next(lengths))
-    found = levenberg.minimize(engine, near, levenberg.LevenbergConfig(corrections=0))
+    monkeypatch.setattr(levenberg, "_CORRECTIONS", 0)
+    found = levenberg.minimize(engine, near, levenberg.LevenbergConfig())
     assert engine.cost(near) - least == pytest.approx(0.05**2, rel=1e-3)
     assert found.converged
     assert found.cost - least < 1e-6
@@ -296,14 +297,19 @@ def test_where_measurements_do_not_fit_steps_get_the_right_length(pictures_hz: f
     assert found.cost - least < 0.02**2 * found.cost / measured
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_roll_that_pictures_do_not_determine_does_not_swing(seed: int) -> None:
-    """Ten minutes of los with all nuisance parameters: few iterations, and no more to be gained."""
-    scenario = LosScenario(duration_s=600.0, gyro_rate_hz=200.0, image_rate_hz=50.0)
+@pytest.mark.parametrize(
+    ("duration_s", "seed", "most"),
+    [(200.0, 1, 4), *(pytest.param(600.0, seed, 8, marks=pytest.mark.slow) for seed in (1, 2))],
+)
+def test_a_roll_that_pictures_do_not_determine_does_not_swing(duration_s: float, seed: int, most: int) -> None:
+    """Minutes of los with all nuisance parameters: few iterations, and no more to be gained.
+
+    From states that are aligned with single pictures, whose noise the scale of LOS errors then explains, 5 and 13.
+    """
+    scenario = LosScenario(duration_s=duration_s, gyro_rate_hz=200.0, image_rate_hz=50.0)
     problem = los.problem(simulate_los(scenario, seed)[0], load_config(los_config(scenario).encode()))
     compiled = Compiled.of(problem)
     found = minimum(compiled, problem.noises)
-    assert found.iterations < 16
+    assert found.iterations <= most
     last = levenberg.minimize(found.engine, found.values, levenberg.LevenbergConfig(cost_tolerance=1e-9))
     assert found.engine.cost(found.values) - last.cost < 0.01**2
