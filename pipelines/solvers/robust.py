@@ -42,9 +42,9 @@ _MU_STEP, _LAST_MU = 2.5, 1e3
 # Share of measurements whose weights are neither 0 nor 1 below which the truncated loss follows: what they say of
 # anything is less than that share.
 _UNDECIDED = 0.01
-# Factors of sigmas where a family has lost most of its measurements, one after the other while it does: so large that
-# priors hold all, or nearly all; mu and iterations of each of the steps, `_MU_STEP` apart, from there to true sigmas.
-_SOFTNESS, _HARDENING_MU, _HARDENING_ITERATIONS = (1e4, 1e3), 0.2, 2
+# Factor of sigmas where a family has lost most of its measurements: so large that priors hold all; mu and iterations of
+# each of the steps, `_MU_STEP` apart, from there to true sigmas.
+_SOFTNESS, _HARDENING_MU, _HARDENING_ITERATIONS = 1e4, 0.2, 2
 # Chance that a family loses more than half of its measurements to outliers.
 _MAX_CHANCE = 1e-3
 
@@ -70,11 +70,9 @@ def solve_robust(
     same = start is found.values and truncated.cost_of(unweighted) == plain.cost_of(unweighted)
     final = solve_truncated(engine, start, loss, config, (found.system, found.cost) if same else None)
     iterations += more + final.iterations
-    for softness in _SOFTNESS:
-        lost = zip(truncated.groups, final.engine.groups, strict=True)
-        if deadline.passed() or not any(before.loss is not None and after.loss is None for before, after in lost):
-            break
-        again = solve_truncated(engine, _hardened(engine, values, softness, loss, config), loss, config)
+    lost = zip(truncated.groups, final.engine.groups, strict=True)
+    if any(before.loss is not None and after.loss is None for before, after in lost) and not deadline.passed():
+        again = solve_truncated(engine, _hardened(engine, values, loss, config), loss, config)
         iterations += again.iterations
         final = min(final, again, key=lambda each: truncated.cost(each.values))
     return replace(final, iterations=iterations)
@@ -94,15 +92,13 @@ def _states_first(engine: Linearization, values: Values) -> Values:
     return values
 
 
-def _hardened(
-    engine: Linearization, values: Values, softness: float, loss: TruncatedLoss, config: LevenbergConfig
-) -> Values:
-    """Find initial values by softened measurements: all sigmas `softness` times as large, reduced in stages.
+def _hardened(engine: Linearization, values: Values, loss: TruncatedLoss, config: LevenbergConfig) -> Values:
+    """Find initial values by softened measurements: all sigmas `_SOFTNESS` times as large, reduced in stages.
 
     A dozen pictures, three of them outliers, are explained by a gyro scale 200 sigmas from its prior, and every way
     from there leads past the minimum. While measurements are soft, priors and process models hold.
     """
-    few = replace(config, max_iterations=_ROUGH_ITERATIONS)
+    few, softness = replace(config, max_iterations=_ROUGH_ITERATIONS), _SOFTNESS
     values = minimize(_soft(engine.under(None), softness), values, few).values
     few = replace(few, max_iterations=_HARDENING_ITERATIONS)
     while softness > 1.0 and not deadline.passed():
