@@ -30,14 +30,8 @@ from alidade.pipelines.recording.container import Channel, Schema
 from alidade.pipelines.recording.decoding import MessageFormat
 from alidade.pipelines.recording.messages import SENSORS
 
-# Encoding of messages -> that of their schema, where a bridge does not say it.
-_SCHEMAS = {
-    "cdr": "ros2msg",
-    "ros1": "ros1msg",
-    "protobuf": "protobuf",
-    "json": "jsonschema",
-    "flatbuffer": "flatbuffer",
-}
+# Encoding of messages -> that of their schema, where a bridge does not say it and it is another.
+_SCHEMAS = {"cdr": "ros2msg", "ros1": "ros1msg", "json": "jsonschema"}
 # Schemas that are bytes go as base64 through JSON.
 _BYTES = ("protobuf", "flatbuffer")
 # Between two calls of a bridge that does not answer, and for one that does, s.

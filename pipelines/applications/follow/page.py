@@ -152,7 +152,7 @@ class LivePage:
             self._noted = [note for note in self._noted if not note[1].startswith(WAITING)]
         motion = view.motion
         self._publish(
-            view.summary,
+            **view.summary,
             notes=self._notes(),
             done=view.done,
             alarms=list(view.alarms),
@@ -177,11 +177,10 @@ class LivePage:
     def _end(self, status: str, headline: str) -> None:
         self._publish(over={"status": status, "headline": headline})
 
-    def _publish(self, *new: dict[str, Any], **more: Any) -> None:
+    def _publish(self, **changed: Any) -> None:
         """Send the state, with what changed in it, to all clients."""
         with self._lock:
-            for changed in (*new, more):
-                self._state |= changed
+            self._state |= changed
             self._event = (self._event[0] + 1, to_json(self._state, inf_nan_mode="null").decode())
 
     def _notes(self) -> list[str]:

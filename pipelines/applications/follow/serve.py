@@ -117,12 +117,7 @@ class LiveServer:
         at = view.epoch_ns + round(view.time * 1e9)
         if view.values is not None and view.sigmas is not None:
             for q, value, sigma in zip(view.quantities, view.values.tolist(), view.sigmas.tolist(), strict=True):
-                message = {
-                    "value": value,
-                    "sigma": sigma,
-                    "lower": value - sigma,
-                    "upper": value + sigma,
-                }
+                message = {"value": value, "sigma": sigma, "lower": value - sigma, "upper": value + sigma}
                 if q.judged:
                     message |= {"require": q.require, "verdict": view.verdicts[q.name]}
                 self._log(f"/estimate/{q.name}", _ESTIMATE, {"unit": q.unit}, message, at)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from alidade.pipelines.applications.follow.follow import Screen
 from alidade.pipelines.applications.follow.guidance import View
-from alidade.pipelines.applications.follow.screen import Screen
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.observability import weak_directions

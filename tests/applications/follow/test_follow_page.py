@@ -23,10 +23,10 @@ import pytest
 from mcap.reader import make_reader
 from rich.console import Console
 
+from alidade.pipelines.applications.follow.follow import Screen
 from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.page import LivePage
-from alidade.pipelines.applications.follow.screen import Screen
 from alidade.pipelines.applications.follow.sources import Source
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
