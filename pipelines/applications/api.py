@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numbers
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass, replace
 from functools import partial
@@ -13,7 +13,6 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from alidade.factors.array import Array
@@ -325,8 +324,11 @@ def _checked(method: Method, data: Any) -> Any:
             if len(lost):
                 more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
                 raise InputError(f"arrays: {name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
-        kept = _in_order(stamps, t, [arrays[name] for name in names], dropped)
-        arrays |= {name: arrays[name][kept] for name in (stamps, *names)} if kept is not None else {}
+        if not (np.diff(t) > 0.0).all():  # the rows are sorted, and some dropped, as those of a file are
+            each = (np.nan_to_num(arrays[name]).reshape(len(t), -1) for name in names)
+            with _naming_arrays():
+                kept = clean(stamps, nanoseconds(t, 0), 0, np.hstack([t[:, None] * 0.0, *each]), dropped)[1]
+            arrays |= {name: arrays[name][kept] for name in (stamps, *names)}
         has_gyro = any("gyro" in name for name in names)
         t_ns = nanoseconds(arrays[stamps], 0)
         check_time_unit(f"arrays: {stamps}", t_ns, SLOWEST_GYRO_S if has_gyro else SLOWEST_S)
@@ -347,15 +349,6 @@ def _naming_arrays() -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"arrays: {str(error).removeprefix('topic ')}") from error
-
-
-def _in_order(name: str, t: Array, carried: Sequence[Array], dropped: dict[str, int]) -> NDArray[np.int64] | None:
-    """Return the rows to keep, in the order of time, as for a file; None if all rows are in order."""
-    if (np.diff(t) > 0.0).all():
-        return None
-    values = np.hstack([t[:, None] * 0.0, *(np.nan_to_num(one).reshape(len(t), -1) for one in carried)])
-    with _naming_arrays():
-        return clean(name, nanoseconds(t, 0), 0, values, dropped)[1]
 
 
 def _check_stamps(name: str, given: Any, t: Array) -> None:

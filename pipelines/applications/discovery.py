@@ -156,10 +156,7 @@ def empty(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
 class _Search:
     """Search of a recording for the topics of one method.
 
-    Args:
-        recording, config: what there is, and what of it is named.
-        method: its name.
-        pairings: (gyro, attitude) -> how they turn together, shared by all searches of a recording.
+    `pairings`, (gyro, attitude) -> how they turn together, are shared by all searches of a recording.
     """
 
     def __init__(

@@ -96,16 +96,7 @@ class Alone:
             inflation=estimate.inflation,
             error_map=estimate.error_map,
         )
-        problem = replace(
-            calibration.problem,
-            steps=lambda _: iter(()),
-            steps_after=None,
-            continuation=None,
-            attitudes=None,
-            at_gyro_rate=None,
-            denser_graph=None,
-            error_map=None,
-        )
+        problem = Problem(calibration.problem.method, calibration.problem.parameters, steps=lambda _: iter(()))
         return cls(
             calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
             day=_day(session),

@@ -180,14 +180,8 @@ def predict(
 ) -> Prediction:
     """Predict the sigmas after a recording of this motion, the largest over several random draws of the scenario.
 
-    Args:
-        method_name, config_file, require: as in `plan`.
-        scenario: the motion.
-        seeds: of the draws; None: as many as the method's scenarios need.
-        made: predictions of draws, which are not made again; new ones are added. All else has to be the same.
-
-    Raises:
-        InputError: the recording would be unusable.
+    Without `seeds` there are as many draws as the method's scenarios need. Predictions that `made` has are not made
+    again, and new ones are added; all else has to be the same. Raises InputError when the recording would be unusable.
     """
     made = {} if made is None else made
     drawn = (

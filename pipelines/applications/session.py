@@ -10,7 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -269,8 +269,7 @@ class Session:
     def calibrated_beside(self, others: Callable[[SqrtInformation], Mapping[str, float]]) -> Calibration:
         """Calibrate by batch, with the information linearised where other recordings have the parameters.
 
-        Args:
-            others: of what the recording says, linear about its solution, the numbers as they are with the others.
+        `others` maps the recording's information, linear about its solution, to the parameters given the others too.
         """
         with self.usual_time():
             (calibration,) = self.judged([self._solve("batch", None, others)], {})
@@ -278,9 +277,8 @@ class Session:
 
     def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
         """Context manager with the default time limit of a calibration, where no command has set one."""
-        stamps = [time for time in self.method.faults.times(self.data) if len(time)]
-        start = min((float(time[0]) for time in stamps), default=0.0)
-        return deadline.usual(max((float(time[-1]) for time in stamps), default=0.0) - start, online)
+        start, stop = self.method.faults.span(self.data)
+        return deadline.usual(stop - start, online)
 
     def judged(
         self,
@@ -291,14 +289,8 @@ class Session:
     ) -> list[Calibration]:
         """Return a calibration for each estimate of the session's parameters: findings added, ready for reports.
 
-        Args:
-            solved: as above.
-            seconds: what reading took.
-            check: end incremental runs with batch's solution.
-            report: with the method's findings.
-
-        Raises:
-            InputError: attitudes are wanted at the gyro's rate, and the method has none.
+        `seconds` is what reading took; `check` and `report` are as `calibrate` has them. Raises InputError when
+        attitudes are wanted at the gyro's rate, and the method has none.
         """
         if self.attitude_rate == "gyro" and self.problem().at_gyro_rate is None:
             raise InputError(f"attitude rate gyro: {self.method.name} has no attitudes between those it estimates")
@@ -314,7 +306,8 @@ class Session:
             if estimate.solver == "published":
                 published = estimate
             elif report and estimate.solver == "incremental" and published is None:
-                published = self._published()
+                with suppress(InputError):  # that solver needs more data
+                    published = self._solve("published", None)
             stable, change = self._change(estimate, quantities)
             conflicts = prior_conflicts(estimate, quantities)
             if estimate.converged and estimate.solver != "published":
@@ -502,13 +495,6 @@ class Session:
             except InputError:  # on the edge of what can be used, a step farther than the recording itself
                 continue
             yield exact.name, problem
-
-    def _published(self) -> Estimate | None:
-        """Return the published solver's estimate; None if that solver, which needs more data, cannot serve."""
-        try:
-            return self._solve("published", None)
-        except InputError:
-            return None
 
 
 def open_session(

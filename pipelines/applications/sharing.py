@@ -52,14 +52,9 @@ def _share(config: Config, name: str) -> str | float | None:
 
 
 def device_prior(known: SavedCalibration, method: Method, config: Config, sha256: str, start_ns: int) -> GaussianPrior:
-    """Prior on the device at the time of another recording, from an earlier calibration.
+    """Prior on the device at the time of another recording, from the earlier calibration `known`.
 
-    Args:
-        known: the earlier calibration.
-        method: of the recording.
-        config: of the recording; its `share` says what walks.
-        sha256: of the recording.
-        start_ns: of the recording, Unix ns.
+    The other arguments are the recording's: `config` says in `share` what walks, `start_ns` is Unix ns.
 
     Raises:
         InputError: the calibration is another method's, has no sigmas worth the name, or is of this very recording; or
