@@ -74,7 +74,8 @@ def allan_curve(pieces: Sequence[Array], interval_s: float) -> AllanCurve:
 
 def allan_variance(tau: Array, squares: Array) -> Array:
     """Allan variance (n,) of the model with Q^2, N^2, B^2, K^2 in `squares` (4,), at tau (n,), s."""
-    return np.asarray(_shares(tau) @ squares)
+    flat = np.full(len(tau), 2.0 * np.log(2.0) / np.pi)
+    return np.asarray(np.stack([3.0 / tau**2, 1.0 / tau, flat, tau / 3.0], axis=1) @ squares)
 
 
 def confidence(curve: AllanCurve, squares: Array) -> tuple[Array, Array, Array]:
@@ -98,12 +99,6 @@ def _second_differences_squared(integral: Array, m: int) -> float:
         second -= 2.0 * integral[start + m : stop + m]
         total += float(second @ second)
     return total
-
-
-def _shares(tau: Array) -> Array:
-    """Allan variance (n, 4) of noises with unit coefficients Q, N, B, K, at tau (n,), s."""
-    flat = np.full(len(tau), 2.0 * np.log(2.0) / np.pi)
-    return np.stack([3.0 / tau**2, 1.0 / tau, flat, tau / 3.0], axis=1)
 
 
 def _degrees_of_freedom(curve: AllanCurve, tau: float, squares: Array) -> float:

@@ -95,8 +95,8 @@ def change_finding(
         found: a change that is more than chance.
         parts: parameter -> values before and after it; none where the segments have no solution.
         quantities: of the estimate.
-        ratio: of sandwich to nominal sigmas, the largest of a required parameter: what errs slowly over the whole
-            recording has few draws in a segment, whose sigmas do not show it.
+        ratio: of sandwich to nominal sigmas, the largest of a required parameter: sigmas of a segment do not show what
+            errs slowly over the whole recording.
     """
     steps = _significant({name: (part.step, part.step_sigma) for name, part in parts.items()}, ratio)
     if not steps:
@@ -136,12 +136,8 @@ def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Seq
     """Most severe finding of kind `change` or `jump` on significant steps; None if no step is significant.
 
     A change is a step that motion alone shows too, and the same one; it is a NOTE where it is not material. A `jump` is
-    a material one that motion attributes neither to the mount nor to the reference.
-
-    Args:
-        steps: that explain the recording best, the most significant first.
-        duration: of the recording, s.
-        quantities: of the estimate.
+    a material one that motion attributes neither to the mount nor to the reference. The most significant of the steps
+    comes first; `duration` is the recording's, s.
     """
     found = [f for s in steps if (f := _changed(s, duration, quantities)) is not None]
     jumps = [s for s in steps if _is_jump(s, duration) and _is_material(s, quantities)]
@@ -191,11 +187,8 @@ def with_change(estimate: Estimate, change: Finding) -> Estimate:
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
     """Test an estimate's stability over time; None without a posterior history or anything that could change.
 
-    Quantities that walk are left out, since they may change, and those that are hardly better known than before.
-
-    Args:
-        estimate: with its `posterior_history`.
-        quantities: of the estimate, in its order.
+    Quantities, in the estimate's order, are left out if they walk, since they may change, and if they are hardly better
+    known than before.
     """
     posterior_history = estimate.posterior_history
     if posterior_history is None:

@@ -51,8 +51,7 @@ def split_halves(
     build: Build, faults: FaultModel, data: Any, config: Config
 ) -> tuple[dict[str, SplitHalf], tuple[str, ...]]:
     """Solve both halves of a recording, see `solve_segments`; also return unsolved ones ("first", "second")."""
-    start, stop = faults.span(data)
-    parts = _solved_parts(build, faults, data, config, 0.5 * (start + stop))
+    parts = _solved_parts(build, faults, data, config, 0.5 * sum(faults.span(data)))
     return _in_both(*parts), tuple(name for name, part in zip(("first", "second"), parts, strict=True) if not part)
 
 
@@ -62,14 +61,8 @@ def solve_segments(
     """Solve the segments before and after a time, s; return the parameters that both determine.
 
     Parameters that a prior determines in either part are left out: they would agree whatever was recorded. A bias that
-    walks differs between the parts by its walk too.
-
-    Args:
-        build: data and config -> problem.
-        faults: how data are cut.
-        data, config: of the whole recording.
-        middle: s, where it is cut.
-        levels: noise levels of the whole recording, which both parts have; those of other noises are estimated anew.
+    walks differs between the parts by its walk too. Both parts have the noise levels of the whole recording in
+    `levels`; those of other noises are estimated anew.
     """
     build = partial(_at_levels, build, {level.noise.name: level for level in levels})
     return _in_both(*_solved_parts(build, faults, data, config, middle))

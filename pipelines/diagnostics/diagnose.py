@@ -66,12 +66,11 @@ def diagnose(
     """Derive all findings from an estimate, the most severe first; equally severe ones cause before symptom.
 
     Args:
-        estimate: values (n,) with their final covariance (n, n).
+        estimate: with its final covariance.
         quantities: of the estimate, in its order.
         advise: weights of a direction -> motion that would determine it.
-        change: finding of `diagnostics.change_test`.
-        hypotheses: findings of `diagnostics.hypothesis_tests`, which run where `is_suspect` is true.
-        contradictions: findings of `diagnostics.stated_priors`.
+        change, hypotheses, contradictions: findings of the modules `change_test`, `hypothesis_tests`, which runs where
+            `is_suspect` is true, and `stated_priors`.
         conflicts: `prior_conflicts` of the estimate before they widened it; None: of the estimate.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone

@@ -62,13 +62,8 @@ def find_hypotheses(
 ) -> tuple[Finding, ...]:
     """Find faults whose correction makes a misfitting recording fit, the best fit first.
 
-    Args:
-        build: makes the graph of the data.
-        model: what can be wrong with the data.
-        data: as read.
-        config: of the recording.
-        estimate: its calibration, by whose residuals the worst segment is chosen; None: the whole is used.
-        freed: the config with what the recording contradicts in it free: a fault has to explain more than that does.
+    Tested is the segment where the residuals of `estimate` are worst, the whole without one. A fault has to explain
+    more than `freed` does, the config in which what the recording contradicts is free.
     """
     known = config.noise_known == 0.0
     # With the noise as stated: levels that are estimated hide what is looked for.

@@ -29,7 +29,7 @@ from alidade.pipelines.diagnostics.allan import NOISES, AllanCurve, allan_curve,
 
 # Power of sqrt(u) and of tau0 in the variance, in the order Q, N, B, K.
 _POWER_U, _POWER_TAU = np.array([2.0, 0.0, -1.0, -2.0]), np.array([-2.0, -1.0, 0.0, 1.0])
-_N = NOISES.index("N")
+_N, _EACH = NOISES.index("N"), np.arange(4)
 # Numbers of the transform are averaged within bins of this part of an octave.
 _PER_OCTAVE = 16
 # A noise is part of the model when twice the logarithm of the likelihood rises by more than this without bound, and is
@@ -185,16 +185,13 @@ def _fits(bins: _Bins, squares: Array) -> bool:
 def _select(bins: _Bins, candidates: Sequence[str]) -> tuple[Array, Mask]:
     """Select noises stepwise by likelihood; return squared coefficients (4,) and the mask of noises in the model."""
     left = {NOISES.index(name) for name in candidates} - {_N}
-    model = np.zeros(4, dtype=bool)
-    model[_N] = True
+    model = _EACH == _N
     squares = _maximise(bins, model)
     best = _likelihood(bins, squares)
     while left:
         trials = []
         for i in left:
-            wider = model.copy()
-            wider[i] = True
-            trial = _maximise(bins, wider)
+            trial = _maximise(bins, model | (i == _EACH))
             trials.append((_likelihood(bins, trial), i, trial))
         likelihood, i, trial = max(trials, key=lambda t: t[0])
         if likelihood - best < _INCLUDED:
@@ -264,12 +261,9 @@ def _coefficient(i: int, bins: _Bins, squares: Array, model: Mask, samples: int,
 
 def _bound(i: int, bins: _Bins, squares: Array, model: Mask) -> float:
     """Upper limit (95 %) of the squared coefficient i, by the profile likelihood."""
-    with_it = model.copy()
-    with_it[i] = True
-    start = _maximise(bins, with_it)
+    start = _maximise(bins, model | (i == _EACH))
     best = max(_likelihood(bins, start), _likelihood(bins, squares))
-    others = with_it.copy()
-    others[i] = False
+    others = model & (i != _EACH)
 
     def fallen(square: float) -> bool:
         return best - _likelihood(bins, _maximise(bins, others, (i, square))) > _BELOW
@@ -288,9 +282,7 @@ def _length_needed(
     i: int, bins: _Bins, squares: Array, model: Mask, square: float, samples: int, interval_s: float
 ) -> float | None:
     """Length, s, of one record that would determine noise i with this squared coefficient."""
-    with_it = model.copy()
-    with_it[i] = True
-    there = np.where(np.arange(4) == i, square, squares)
+    with_it, there = model | (i == _EACH), np.where(i == _EACH, square, squares)
     edges = 2.0 ** np.arange(np.log2(2.0 * bins.hz[-1] * interval_s), -60.0, -1.0 / _PER_OCTAVE)
     length = samples * interval_s
     while length < _LONGEST_RECORD:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -117,7 +116,13 @@ def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> Tri
     A trial has data and noise that nobody recorded: what it raises ends the trial alone, and is logged. A worker
     process that is lost says nothing of the trial, and is raised.
     """
-    return _tried(label, partial(_solution, build, data, config))
+    from alidade.pipelines.solvers.batch import solve_batch
+
+    def solution() -> TrialFit | None:
+        problem = build(data, config)
+        return TrialFit.of(problem, solve_batch(problem, _MAX_ITERATIONS))
+
+    return _tried(label, solution)
 
 
 def score_trial(build: Build, data: Any, config: Config, label: str = "") -> tuple[float, float]:
@@ -145,13 +150,6 @@ def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
         _log.warning("trial (%s) failed: %s: %s", label or "as recorded", type(error).__name__, error)
         _log.debug("trial (%s)", label or "as recorded", exc_info=True)
     return None
-
-
-def _solution(build: Build, data: Any, config: Config) -> TrialFit | None:
-    from alidade.pipelines.solvers.batch import solve_batch
-
-    problem = build(data, config)
-    return TrialFit.of(problem, solve_batch(problem, _MAX_ITERATIONS))
 
 
 def max_concurrent(times: Sequence[Array]) -> int:
