@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from alidade.factors.array import Array, interpolated
+from alidade.factors.array import Array, Index, Stamps, interpolated
 from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, load_config
@@ -198,7 +197,7 @@ def _check_units(name: str, t: Array, samples: Mapping[str, Array]) -> None:
         )
 
 
-def _sensors(recording: Recording, name: str) -> tuple[NDArray[np.int64], dict[str, Array]]:
+def _sensors(recording: Recording, name: str) -> tuple[Stamps, dict[str, Array]]:
     """Return the stamps of a topic, ns, and the samples (N, 3) of each sensor by kind."""
     if recording.topics[name].type == messages.MAGNETIC_FIELD:
         field = recording.magnetic(name)
@@ -257,7 +256,7 @@ def even_pieces(t: Array, values: Array) -> tuple[list[Array], float, int]:
     return pieces, interval, int(lost[fill].sum())
 
 
-def _lost(t: Array, interval: float) -> NDArray[np.intp]:
+def _lost(t: Array, interval: float) -> Index:
     """Return the number of samples lost between each sample and the next, (N-1,)."""
     out = np.zeros(len(t) - 1, dtype=np.intp)
     late = t - interval * np.arange(len(t))

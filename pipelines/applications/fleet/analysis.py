@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Mask
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.histories import History
 from alidade.pipelines.applications.fleet.statistics import Component, Spread, Trend
@@ -64,10 +63,10 @@ class Population:
     sigmas: Array
     spread: Spread | None
     z: Array
-    outlying: NDArray[np.bool_]
+    outlying: Mask
     drift: Trend | None
     drifts: bool
-    changed: NDArray[np.bool_]
+    changed: Mask
     population: Component | None
     repeatability: Component | None
 

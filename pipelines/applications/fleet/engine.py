@@ -94,14 +94,9 @@ def work_off(
     scheduler: str | None,
     jobs: int | None,
 ) -> bool:
-    """Pass the name and result of every task to `take`; return whether Ctrl-C came before the end.
+    """Pass the name and result of every task to `take` as they come; return whether Ctrl-C came before the end.
 
-    Args:
-        function: see `completed`.
-        tasks: name -> its arguments; without any there is no cluster.
-        take: is given the results as they come.
-        what: name of the work in the progress display.
-        scheduler, jobs: see `cluster`.
+    Progress is shown under the name `what`. Without tasks there is no cluster; see `cluster` and `completed`.
     """
     if not tasks:
         return False

@@ -123,15 +123,10 @@ def calibrate_fleet(
     jobs: int | None = None,
     names: str | None = None,
 ) -> Outcome:
-    """Calibrate every recording that has not been finished before with these settings and this version.
+    """Calibrate every recording, by name, that has not been finished before with these settings and this version.
 
-    Args:
-        recordings: by name.
-        settings: for all of them.
-        out: folder; results are kept there as they come.
-        scheduler: address; None works on this machine.
-        jobs: how many local workers.
-        names: pattern of the file names, see recordings.from_name.
+    Results are kept in the folder `out` as they come; `scheduler` and `jobs` are as `engine.cluster` has them, `names`,
+    a pattern of the file names, as `recordings.from_name`.
 
     Raises:
         InputError: out cannot be written to, no cluster can be had, or a name does not fit.
@@ -170,13 +165,8 @@ def calibrate_recording(
 ) -> RecordingResult | None:
     """Calibrate one recording on the worker; None if the known result was made from the same files.
 
-    A result without `sha256` is of a file that could not be read at all; the next run tries again.
-
-    Args:
-        recording: where it is.
-        settings: how.
-        unit: as the file's name has it.
-        known: SHA-256 of the recording and of the earlier calibration that the result known was made of.
+    A result without `sha256` is of a file that could not be read at all; the next run tries again. `unit` is as the
+    file's name has it; `known` are the SHA-256 of the recording and of the earlier calibration that were used before.
     """
     try:
         with local(recording.file, recording.is_bag) as path:

@@ -8,9 +8,8 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.pipelines.applications.fleet import statistics
 from alidade.pipelines.applications.fleet.analysis import Population, Unit, iso, sentence, units_of_interest
 from alidade.pipelines.applications.fleet.histories import History
@@ -223,9 +222,7 @@ def _add_recordings(out: Figure, p: Population, some: Any, factor: float, name: 
     out.points(dates, values, name, color, 6, shape=shape, texts=[f"{p.units[i]}, {p.recordings[i]}" for i in some])
 
 
-def _add_counts(
-    out: Figure, values: Array, edges: Array, name: str, color: str, below: NDArray[np.intp] | int = 0
-) -> NDArray[np.intp]:
+def _add_counts(out: Figure, values: Array, edges: Array, name: str, color: str, below: Index | int = 0) -> Index:
     """Draw a horizontal histogram, counted here so that the page does not grow with the fleet; return its ends."""
     ends = below + np.histogram(values, edges)[0]
     out.boxes(np.broadcast_to(below, ends.shape), ends, edges[:-1], edges[1:], name, color)
@@ -335,15 +332,8 @@ def _nees_plot(study: Study, solver: str) -> Plot:
 
 def _errors_plot(study: Study, solver: str) -> Plot:
     values = study.normalised(solver)
-    out = Figure("errors", "error, sigmas")
-    _histogram(
-        out,
-        np.clip(values, -5.0, 5.0),
-        -5.0,
-        5.0,
-        np.vectorize(NormalDist().pdf, otypes=[float]),
-        "normal distribution",
-    )
+    out, density = Figure("errors", "error, sigmas"), np.vectorize(NormalDist().pdf, otypes=[float])
+    _histogram(out, np.clip(values, -5.0, 5.0), -5.0, 5.0, density, "normal distribution")
     return Plot(
         f"{solver}: errors in sigmas",
         f"{len(values)} errors of all parameters; those beyond 5 sigmas stand in the outer bars.",

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.factors.chi_square import quantile, student
 from alidade.pipelines.diagnostics.device_changes import maximum_likelihood_sigma
 
@@ -171,7 +170,7 @@ class Component:
     upper: float
 
 
-def components(values: Array, sigmas: Array, units: NDArray[np.intp]) -> tuple[Component | None, Component | None]:
+def components(values: Array, sigmas: Array, units: Index) -> tuple[Component | None, Component | None]:
     """Variance components from unit to unit and from recording to recording: x = centre + unit + recording + noise.
 
     The second is estimated from differences to the mean of the unit, the first from these means, each by its
@@ -196,7 +195,7 @@ def components(values: Array, sigmas: Array, units: NDArray[np.intp]) -> tuple[C
     return _component(means, np.asarray(total**-0.5), np.zeros(len(means), dtype=np.intp)), recording
 
 
-def _component(values: Array, sigmas: Array, groups: NDArray[np.intp]) -> Component:
+def _component(values: Array, sigmas: Array, groups: Index) -> Component:
     """Return the scatter, beyond their sigmas, of values (n,) about the means of their groups (n,) of two or more."""
     groups = np.unique(groups, return_inverse=True)[1]
 
