@@ -31,13 +31,12 @@ from alidade.pipelines.diagnostics.change_test import (
     step_stability,
     with_change,
 )
-from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf, held_out_residuals, solve_segments, split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, prior_conflicts
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
 from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config, with_conflicts
-from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
 from alidade.pipelines.estimation.problem import (

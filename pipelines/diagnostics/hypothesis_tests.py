@@ -18,10 +18,10 @@ import numpy as np
 
 from alidade.factors.array import Array
 from alidade.pipelines import parallel
+from alidade.pipelines.diagnostics.cross_validation import Build, TrialFit, max_concurrent, score_trial, solve_trial
 from alidade.pipelines.diagnostics.diagnose import rejections
 from alidade.pipelines.diagnostics.fault_models import FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.observability import rejects_many
-from alidade.pipelines.diagnostics.trial_fit import Build, TrialFit, max_concurrent, score_trial, solve_trial
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Estimate, Residuals

@@ -17,11 +17,10 @@ from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics import hypothesis_tests, trial_fit
-from alidade.pipelines.diagnostics.cross_validation import split_halves
+from alidade.pipelines.diagnostics import cross_validation, hypothesis_tests
+from alidade.pipelines.diagnostics.cross_validation import held_out_residuals, solve_trial, split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.hypothesis_tests import TrialCase, find_hypotheses, misstatements, trial_cases
-from alidade.pipelines.diagnostics.trial_fit import held_out_residuals, solve_trial
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Estimate, Problem, Residuals, Step
 from alidade.pipelines.methods import Method, method
@@ -436,7 +435,7 @@ def test_a_trial_that_raises_ends_alone_and_is_logged(
         return (case for case in trial_cases(*of) if "y is wrong" in case.label or "deg/s, not" in case.label)
 
     monkeypatch.setattr(hypothesis_tests, "trial_cases", some)
-    with caplog.at_level(logging.DEBUG, trial_fit.__name__):
+    with caplog.at_level(logging.DEBUG, cross_validation.__name__):
         found = find_hypotheses(fragile, find.faults, flipped, config)
     assert found[0].evidence["label"] == "the sign of the helmet gyro's y is wrong"
     warnings = [record.message for record in caplog.records if record.levelno == logging.WARNING]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.diagnostics import hypothesis_tests
+from alidade.pipelines.diagnostics.cross_validation import TrialFit
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
-from alidade.pipelines.diagnostics.trial_fit import TrialFit
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import ChiSquare, Residuals

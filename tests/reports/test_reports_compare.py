@@ -11,9 +11,8 @@ import pytest
 from alidade.factors.array import Array
 from alidade.pipelines.applications.comparison import Comparison
 from alidade.pipelines.diagnostics import cross_validation
-from alidade.pipelines.diagnostics.cross_validation import SplitHalf, split_halves
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf, TrialFit, split_halves
 from alidade.pipelines.diagnostics.fault_models import FaultModel
-from alidade.pipelines.diagnostics.trial_fit import TrialFit
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.comparison_report import comparison_report
 from alidade.pipelines.reports.html import render_html
