@@ -29,7 +29,7 @@ import psutil
 
 from alidade.pipelines.applications.follow import follow as following
 from alidade.pipelines.applications.follow.follower import Settings
-from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websockets
+from alidade.pipelines.applications.follow.network import SUBPROTOCOLS, websockets
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.result import Calibration

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from mcap.writer import Writer
 
-from alidade.pipelines.applications.follow.protocol import (
+from alidade.pipelines.applications.follow.network import (
     MESSAGE_DATA,
     MESSAGE_HEAD,
     SUBPROTOCOLS,

@@ -80,12 +80,8 @@ class Settings:
 class Follower:
     """Calibrates a recording while it is being written.
 
-    Args:
-        source: of the recording.
-        settings: how.
-        show: is given the view of what is known whenever it changes.
-        say: is given sentences for the person recording.
-        stopped: whether to go on no longer; asked often.
+    `show` is given the view of what is known whenever it changes, `say` sentences for the person recording; `stopped`,
+    whether to go on no longer, is asked often.
     """
 
     def __init__(

@@ -28,8 +28,8 @@ from urllib.parse import urlsplit
 
 from pydantic_core import to_json
 
-from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, MAX_CONNECTIONS, Attempts, Gate
 from alidade.pipelines.applications.follow.guidance import WAITING, View
+from alidade.pipelines.applications.follow.network import HANDSHAKE_TIME_S, MAX_CONNECTIONS, Attempts, Gate
 from alidade.pipelines.errors import InputError, printable
 from alidade.pipelines.reports.result import Calibration
 

@@ -18,12 +18,13 @@ from typing import Any, NamedTuple
 
 from pydantic_core import to_json
 
-from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Gate
 from alidade.pipelines.applications.follow.guidance import View
-from alidade.pipelines.applications.follow.protocol import (
+from alidade.pipelines.applications.follow.network import (
+    HANDSHAKE_TIME_S,
     MESSAGE_DATA,
     MESSAGE_HEAD,
     SUBPROTOCOLS,
+    Gate,
     RefusedError,
     read_id,
     read_message,

@@ -23,17 +23,20 @@ import pytest
 from websockets.exceptions import InvalidStatus
 
 from alidade.pipelines.applications.follow.bridge import Bridge
-from alidade.pipelines.applications.follow.gate import (
+from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.applications.follow.network import (
     MAX_ATTEMPTS,
     MAX_CONNECTIONS,
     MAX_PER_ADDRESS,
+    MESSAGE_DATA,
+    MESSAGE_HEAD,
+    SUBPROTOCOLS,
     Attempts,
     Gate,
     network_of,
+    websockets,
 )
-from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.page import LivePage
-from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import MAX_SUBSCRIPTIONS, LiveServer
 from alidade.pipelines.applications.follow.sources import Spool
 from alidade.pipelines.estimation.problem import Quantity

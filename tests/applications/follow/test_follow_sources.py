@@ -19,7 +19,7 @@ import pytest
 
 from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
-from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websockets
+from alidade.pipelines.applications.follow.network import SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import LiveServer
 from alidade.pipelines.applications.follow.sources import Replay, Source, StandardInput, source_of
 from alidade.pipelines.errors import InputError

@@ -1,21 +1,34 @@
-"""Limits on the connections of a server of `follow`: in all and per address, trusted or not.
+"""What the client of a bridge and the servers of `follow` share: Foxglove's protocol, and limits on connections.
 
     gate.admit(connection, address, close)    # may close another one
     gate.trust(connection)                    # it has shown that it may read
     gate.release(connection)
 
-Those that have shown nothing yet and those that may read are counted apart, and of too many the oldest goes: idle
+Of foxglove-websocket v1 here is the part that both sides use. Connections to a server are counted in all and per
+address, those that have shown nothing yet and those that may read apart, and of too many the oldest goes: idle
 connections, however many, keep nobody out who says at once what it wants, nor do streams that a lost network left.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import struct
 import threading
 import time
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from typing import Any
 
+from pydantic_core import from_json
+
+from alidade.pipelines.errors import InputError
+
+SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+# Binary: opcode, subscription, time in ns, then the message.
+MESSAGE_DATA = 1
+MESSAGE_HEAD = struct.Struct("<BIQ")
+# Channels and subscriptions are numbered with 32 bits.
+LARGEST_ID = (1 << 32) - 1
 # Connections of either kind in all and from one address: a dozen devices, and what a lost network left of some; far
 # below the 1024 files that a process may have open.
 MAX_CONNECTIONS, MAX_PER_ADDRESS = 64, 16
@@ -23,6 +36,40 @@ MAX_CONNECTIONS, MAX_PER_ADDRESS = 64, 16
 HANDSHAKE_TIME_S = 5.0
 # Wrong tokens of one address at once, and s for each further one; addresses that are remembered.
 MAX_ATTEMPTS, ATTEMPT_PERIOD_S, MAX_ADDRESSES = 10, 10.0, 1024
+
+
+class RefusedError(Exception):
+    """Raised at a message from the other side that breaks the protocol, with the reason as text."""
+
+
+def read_message(text: str) -> dict[str, Any]:
+    """Parse a text message: a JSON object of numbers and Unicode text. Raises RefusedError."""
+    try:
+        content = from_json(text, allow_inf_nan=False)
+    except ValueError as error:
+        raise RefusedError("no JSON") from error
+    if not isinstance(content, dict):
+        raise RefusedError("no JSON object")
+    return content
+
+
+def read_id(value: Any) -> int:
+    """Check and return the number of a channel or a subscription. Raises RefusedError."""
+    if type(value) is not int or not 0 <= value <= LARGEST_ID:
+        raise RefusedError("a number of a channel that is none")
+    return value
+
+
+def websockets() -> Any:
+    """Import the library websockets. Raises InputError when it is not installed."""
+    try:
+        import websockets.sync.client
+        import websockets.sync.server
+    except ImportError as error:
+        raise InputError(
+            "ws:// and --serve need websockets, which is not installed: pip install 'alidade[live]'"
+        ) from error
+    return websockets
 
 
 @dataclass
