@@ -11,8 +11,9 @@ parameter.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -151,21 +152,21 @@ def plan(
     Raises:
         InputError: no such method, scenario or parameter, the config cannot be used, or a scenario without usable data.
     """
-    wanted, chosen = dict(require or {}), methods.method(method)
+    chosen = methods.method(method)
     settings = chosen.settings(None if scenario is None else str(scenario)).model_dump()
-    made: Made = {}
+    predicted = partial(predict, method, config_file=config, require=dict(require or {}), made={})
     with progress.doing("predicting"):
-        now = predict(method, settings, config, wanted, made=made)
+        now = predicted(settings)
     steps: list[Step] = []
     best = now
     while best.missing and len(steps) < most_steps:
-        found = list(progress.track(_candidates(chosen, best, config, wanted, made), "trying other motions"))
+        found = list(progress.track(_candidates(chosen, best, predicted), "trying other motions"))
         if not found:
             break
         step = max(found, key=lambda each: each.gain)
         if step.gain < _LEAST_GAIN:
             break
-        best = predict(method, step.prediction.scenario, config, wanted, made=made)
+        best = predicted(step.prediction.scenario)
         steps.append(replace(step, prediction=best))
     return Plan(method, now, tuple(steps))
 
@@ -184,13 +185,12 @@ def predict(
     again, and new ones are added; all else has to be the same. Raises InputError when the recording would be unusable.
     """
     made = {} if made is None else made
-    drawn = (
-        range(_DRAWS if methods.method(method_name).require_simulator().randomised else 1) if seeds is None else seeds
-    )
-    for seed in drawn:
+    if seeds is None:
+        seeds = range(_DRAWS if methods.method(method_name).require_simulator().randomised else 1)
+    for seed in seeds:
         if (repr(scenario), seed) not in made:
             made[repr(scenario), seed] = _predicted(method_name, scenario, config_file, require, seed)
-    each = [made[repr(scenario), seed] for seed in drawn]
+    each = [made[repr(scenario), seed] for seed in seeds]
     worst = max(each, key=lambda prediction: max(prediction.missing.values(), default=0.0))
     largest = np.max([np.sqrt(np.diag(prediction.covariance)) for prediction in each], axis=0)
     own = np.sqrt(np.diag(worst.covariance))
@@ -236,15 +236,13 @@ def requirements(given: Sequence[str]) -> dict[str, float]:
     return found
 
 
-def _candidates(
-    method: Method, before: Prediction, config_file: Settings, require: Mapping[str, float], made: Made
-) -> Iterator[Step]:
+def _candidates(method: Method, before: Prediction, predicted: Callable[..., Prediction]) -> Iterator[Step]:
     """Yield each possible change of the motion with its gain for the worst draw; skip those that cannot be recorded."""
     seeds = (before.worst,)
-    now = predict(method.name, before.scenario, config_file, require, seeds, made)
+    now = predicted(before.scenario, seeds=seeds)
     for change, scenario in method.guidance.variations(before.scenario):
         try:
-            after = predict(method.name, scenario, config_file, require, seeds, made)
+            after = predicted(scenario, seeds=seeds)
         except InputError:
             continue
         yield Step(change, _gain(now, after), after)

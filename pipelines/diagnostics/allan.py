@@ -51,9 +51,7 @@ class AllanCurve:
 def allan_curve(pieces: Sequence[Array], interval_s: float) -> AllanCurve:
     """Compute the overlapping Allan deviation at averaging times in octaves.
 
-    Args:
-        pieces: samples of a rate, each piece evenly spaced by interval_s; the differences of all are averaged.
-        interval_s: s.
+    Pieces are samples of a rate, each evenly spaced by interval_s; the differences of all are averaged.
     """
     longest = max(len(piece) for piece in pieces)
     factors = 2 ** np.arange(max(1, int(np.log2(max(2.0, _LONGEST * longest))) + 1))

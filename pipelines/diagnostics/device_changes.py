@@ -46,14 +46,7 @@ _ROUNDING = 1e-10
 
 @dataclass(frozen=True)
 class Change:
-    """Step of a parameter between a recording and the next one, SI.
-
-    Attributes:
-        name: of the number.
-        after: index of the last recording before it.
-        size: of the step.
-        sigma: of that.
-    """
+    """Step of a parameter, SI, between the recording with the index `after` and the next one."""
 
     name: str
     after: int
@@ -334,8 +327,7 @@ def check_calibration(
 
     Args:
         known: of the device, from the earlier calibration; no number is exactly known.
-        sqrt_info: information of the recording.
-        quantities: of the recording's graph.
+        sqrt_info, quantities: information of the recording, and what is estimated in its graph.
         inflations: by what the recording's sigmas are larger because noise is coloured.
     """
     by_name = {q.name: q for q in quantities}

@@ -84,13 +84,8 @@ def verdicts(
     """Verdict of each parameter with a required accuracy, or of the sensor's shape where that is required instead.
 
     Of a solution that rejected more than a quarter of a family, as its findings have it, nothing is `observable`: what
-    is left are the measurements that agree with it.
-
-    Args:
-        quantities: n of them.
-        covariance: (n, n) in their order.
-        findings: on the solution.
-        values: (n,) in their order.
+    is left are the measurements that agree with it. The covariance (n, n) and values (n,), SI, are in the order of the
+    quantities.
     """
     sigmas = np.sqrt(np.diag(covariance)).tolist()
     found = {q.name: verdict(q, sigma) for q, sigma in zip(quantities, sigmas, strict=True) if q.judged}
@@ -137,11 +132,7 @@ def derived(
 ) -> list[DerivedNumber]:
     """Compute scale and shape of sensors with a scale inseparable from the measured strength.
 
-    Args:
-        quantities: n of them.
-        covariance: (n, n), finite, in their order.
-        values: (n,), SI.
-        findings: on the solution.
+    The covariance (n, n), finite, and the values (n,), SI, are in the order of the quantities.
     """
     both = (each(one, quantities) for one in scalings(quantities, covariance, values) for each in (_scale, _shape))
     return [number._replace(verdict=number.verdict and doubted(number.verdict, findings)) for number in both]
@@ -297,12 +288,7 @@ def time_to_accuracy(
     """Time to the required accuracy of each estimated parameter, from the history of a filter.
 
     Information is the inverse of the variance less that of the prior; what a walking parameter loses counts as none
-    gained.
-
-    Args:
-        history: sigmas as they were at each time.
-        names: of the history's columns.
-        quantities: of which the result is wanted.
+    gained. The names are of the history's columns.
     """
     estimated = {q.name: q for q in quantities if q.prior_sigma != 0.0 and q.judged}
     found = {}

@@ -28,14 +28,7 @@ from alidade.pipelines.reports.plain_json import plain_json
 
 @dataclass(frozen=True, repr=False)
 class FleetResult:
-    """Results and report of a calibrated fleet.
-
-    Attributes:
-        outcome: the results by recording.
-        populations: of each parameter over the units.
-        histories: of each unit over its recordings.
-        written: the files.
-    """
+    """Results of a calibrated fleet: by recording, of parameters over units, of units over recordings; the files."""
 
     outcome: Outcome
     populations: Sequence[Population]
