@@ -68,16 +68,9 @@ _HEADERS = {
 class LivePage:
     """Context manager that serves the live page.
 
-    Raises InputError when starlette or uvicorn is not installed, or there is no such address or no port free there.
-
-    Attributes:
-        is_open: to others than this machine, by a token.
-
-    Args:
-        say: called with where the next device finds the page once a token has been used.
-        host: address of this machine to be reached by; the loopback one is for this machine alone.
-        port: 0: any that is free.
-        name: of the recording.
+    It is served at the address `host` of this machine, the loopback one for this machine alone, others by a token
+    (`is_open`); port 0 is any that is free. `say` is told where the next device finds the page once a token has been
+    used. Raises InputError when starlette or uvicorn is not installed, or there is no such address or no port free.
     """
 
     def __init__(self, say: Callable[[str], None], host: str = HOST, port: int = PORT, name: str = "") -> None:
