@@ -211,9 +211,9 @@ def _walks(alone: Sequence[Alone], rates: Mapping[str, float]) -> dict[str, Rate
     config = alone[0].calibration.config
     asked = {kind(name) for name in stated_walks(config, list(rates))}
     days = [each.day for each in alone]
-    sqrt_info = _changes(alone, join([each.sqrt_info for each in alone], rates, days)).rates if asked else {}
+    estimated = _changes(alone, join([each.sqrt_info for each in alone], rates, days)).rates if asked else {}
     stated = {kind(name): Rate(rate, rate) for name, rate in rates.items() if rate}
-    return {**stated, **{which: rate for which, rate in sqrt_info.items() if which in asked}}
+    return {**stated, **{which: rate for which, rate in estimated.items() if which in asked}}
 
 
 def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
@@ -312,8 +312,8 @@ def _calibration(
 def _with_extra(shares: Mapping[str, float], k: int, covariance: Array, extra: Array) -> dict[str, float]:
     """Return a parameter's variance shares by source, with the share of errors that its graph does not model."""
     beyond = float(extra[k, k] / covariance[k, k])
-    sqrt_info = {source: share * (1.0 - beyond) for source, share in shares.items()}
-    return {**sqrt_info, "not modelled": beyond} if beyond else sqrt_info
+    modelled = {source: share * (1.0 - beyond) for source, share in shares.items()}
+    return {**modelled, "not modelled": beyond} if beyond else modelled
 
 
 def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, float]) -> tuple[Parameter, ...]:
@@ -405,11 +405,11 @@ def _combined_levels(each: Sequence[Sequence[Level]]) -> tuple[Level, ...]:
 
 def _combined(levels: Sequence[Level]) -> Level:
     """Combine levels of one noise: estimates weighted by information, used levels by their mean."""
-    newest, sqrt_info = levels[-1], [(x.found, x.sigma) for x in levels if x.found is not None and x.sigma]
+    newest, known = levels[-1], [(x.found, x.sigma) for x in levels if x.found is not None and x.sigma]
     scale = float(np.mean([level.used for level in levels])) / newest.noise.stated if newest.noise.stated else 1.0
-    if not sqrt_info:
+    if not known:
         return replace(newest, scale=scale, found=None, sigma=None)
-    found, sigma = np.array(sqrt_info, dtype=float).T
+    found, sigma = np.array(known, dtype=float).T
     information = float((sigma**-2.0).sum())
     return replace(newest, scale=scale, found=float((found / sigma**2).sum()) / information, sigma=information**-0.5)
 

@@ -113,8 +113,6 @@ def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
 
 def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
     """Whether the findings call for tests of data faults, each of which solves the problem again."""
-    if estimate.solver == "published":
-        return False
     correlated = estimate.colours.keys()
     return any(finding.kind in _RESIDUAL and finding.severity == INCONSISTENT for finding in findings) or any(
         level.contradicted and (level.found or 0.0) > factor

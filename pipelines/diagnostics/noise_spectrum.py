@@ -270,8 +270,6 @@ def _bound(i: int, bins: _Bins, squares: Array, model: Mask) -> float:
     while high > 1.02 * low:
         middle = float(np.sqrt(max(low, 1e-12 * high) * high))
         low, high = (low, middle) if fallen(middle) else (middle, high)
-        if high < 1e-9 * start[i]:
-            break
     return high
 
 

@@ -292,8 +292,6 @@ def _turns_not(means: Array, forces: Array, lengths: Index, sigma: float) -> Mas
     Bias b and g-sensitivity G of means = b + G forces by least squares with Cauchy's weights, from the median on: a
     turn adds far more than gravity does.
     """
-    if not len(means):
-        return np.zeros(0, dtype=bool)
     middle = np.quantile(means, 0.5, axis=0, weights=lengths, method="inverted_cdf")
     allowed = _STEADY + 5.0 * sigma / np.sqrt(lengths)
     design = np.column_stack([np.ones(len(means)), forces])

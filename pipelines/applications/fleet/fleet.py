@@ -166,7 +166,9 @@ def calibrate_recording(
     """
     try:
         with local(recording.file, recording.is_bag) as path:
-            stated = _metadata(path)
+            stated = from_metadata(path)
+            if "date" in stated:
+                as_date(stated["date"])  # refused where it is none
             with _prior(settings, unit or stated.get("unit") or Path(recording.file.path).stem) as prior:
                 result: Any = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **stated}
                 if _inputs(result) == known:
@@ -199,11 +201,6 @@ def _earlier(address: str) -> Iterator[Path]:
     with local(fsspec.open(address)) as path:
         load_known(path)
         yield path
-
-
-def _metadata(path: Path) -> dict[str, str]:
-    """Return unit and date in the recording's own metadata, without a date that is none."""
-    return {key: value for key, value in from_metadata(path).items() if key != "date" or as_date(value)}
 
 
 def _calibration(path: Path, settings: Settings, prior: Path | None) -> Calibration:
