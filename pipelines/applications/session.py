@@ -248,11 +248,7 @@ class Session:
         return calibration
 
     def calibrations(
-        self,
-        solvers: Sequence[str],
-        window: float | None = 1.0,
-        check: bool = False,
-        report: bool = True,
+        self, solvers: Sequence[str], window: float | None = 1.0, check: bool = False, report: bool = True
     ) -> list[Calibration]:
         """Return a calibration of the recording by each solver; see `calibrate`."""
         if isinstance(solvers, str):
@@ -280,11 +276,7 @@ class Session:
         return deadline.usual(stop - start, online)
 
     def judged(
-        self,
-        solved: Iterable[Estimate],
-        seconds: Mapping[str, float],
-        check: bool = False,
-        report: bool = True,
+        self, solved: Iterable[Estimate], seconds: Mapping[str, float], check: bool = False, report: bool = True
     ) -> list[Calibration]:
         """Return a calibration for each estimate of the session's parameters: findings added, ready for reports.
 
@@ -315,19 +307,15 @@ class Session:
                 estimate = with_change(estimate, change)
             tables = self.method.report.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(estimate)
+            findings = [*self._findings(estimate, quantities, change, conflicts)]
+            findings += [*_remarks(problem, estimate, difference), *carried]
+            findings += map(remark, filter(None, [deadline.stopped()]))
             found.append(
                 Calibration(
                     method=self.method,
                     problem=problem,
                     estimate=estimate,
-                    findings=by_severity(
-                        [
-                            *self._findings(estimate, quantities, change, conflicts),
-                            *_remarks(problem, estimate, difference),
-                            *carried,
-                            *map(remark, filter(None, [deadline.stopped()])),
-                        ]
-                    ),
+                    findings=by_severity(findings),
                     recording=self.name,
                     sha256=sha256,
                     facts=facts,
