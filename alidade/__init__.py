@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from alidade.pipelines.applications.api import Config, calibrate, compare, follow, load, open, simulate
     from alidade.pipelines.applications.apply import apply
-    from alidade.pipelines.applications.fleet.write import fleet
+    from alidade.pipelines.applications.fleet.fleet import fleet
     from alidade.pipelines.applications.noise import noise
     from alidade.pipelines.applications.one_liners import hand_eye, imu_static, magcal
     from alidade.pipelines.applications.planning import plan
@@ -73,7 +73,7 @@ _MODULES = {
     "apply": "alidade.pipelines.applications.apply",
     "certificate": "alidade.pipelines.reports.certificate",
     "export": "alidade.pipelines.reports.export_formats",
-    "fleet": "alidade.pipelines.applications.fleet.write",
+    "fleet": "alidade.pipelines.applications.fleet.fleet",
     "noise": "alidade.pipelines.applications.noise",
     "plan": "alidade.pipelines.applications.planning",
     "validate": "alidade.pipelines.applications.validate",

@@ -28,11 +28,10 @@ import numpy as np
 
 from alidade.pipelines import methods
 from alidade.pipelines.applications.fleet.analysis import counting, populations
-from alidade.pipelines.applications.fleet.fleet import Outcome, Settings, calibrate_recording
+from alidade.pipelines.applications.fleet.fleet import Outcome, Settings, calibrate_recording, write_fleet
 from alidade.pipelines.applications.fleet.histories import histories, packed, unpacked
 from alidade.pipelines.applications.fleet.recordings import Recording, find, local
 from alidade.pipelines.applications.fleet.store import RecordingResult, Store, UnitResult
-from alidade.pipelines.applications.fleet.write import write_fleet
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.recording.recording import open_recording
 from benchmarks.measure import peak_mib

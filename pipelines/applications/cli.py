@@ -578,9 +578,8 @@ def montecarlo(
     Simulates and calibrates many recordings, and compares their errors with the sigmas (NEES, coverage). The same
     command resumes after an interruption.
     """
-    from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study
+    from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study, study_json, write_study
     from alidade.pipelines.applications.fleet.pages import study_report
-    from alidade.pipelines.applications.fleet.write import study_json, write_study
 
     folder = out or Path(f"{method}-montecarlo")
     chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
@@ -616,8 +615,8 @@ def fleet(
 
     The same command resumes after an interruption.
     """
-    from alidade.pipelines.applications.fleet.write import fleet as run
-    from alidade.pipelines.applications.fleet.write import fleet_json
+    from alidade.pipelines.applications.fleet.fleet import fleet as run
+    from alidade.pipelines.applications.fleet.fleet import fleet_json
 
     work = partial(run, recordings, out, method=method, config=config, solver=solver, window=parse_window(window))
     with progress.shown(quiet or as_json):

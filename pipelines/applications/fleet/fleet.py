@@ -1,13 +1,13 @@
-"""Calibration of many recordings, each of which is finished once and kept.
+"""Calibration of many recordings, each of which is finished once and kept, and its files.
 
-    outcome = calibrate_fleet(find(["recordings/*.mcap"]), Settings(), out, scheduler=None, jobs=2)
+    fleet(["recordings/*.mcap"], out, jobs=2).summary
 
 Each worker reads its own recording and sends back a small mapping; nothing else of a recording reaches this process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,25 +16,36 @@ from typing import TYPE_CHECKING, Any
 
 from alidade.pipelines import errors, methods
 from alidade.pipelines.applications.fleet import require_extra
+from alidade.pipelines.applications.fleet.analysis import (
+    Population,
+    counting,
+    populations,
+    sentence,
+    table,
+    units_of_interest,
+)
 from alidade.pipelines.applications.fleet.engine import Killed, source_version, work_off
-from alidade.pipelines.applications.fleet.histories import packed
-from alidade.pipelines.applications.fleet.recordings import Recording, from_metadata, from_name, local
+from alidade.pipelines.applications.fleet.histories import History, change_table, histories, packed
+from alidade.pipelines.applications.fleet.recordings import Recording, find, from_metadata, from_name, local
 from alidade.pipelines.applications.fleet.store import (
     RecordingResult,
     Store,
     UnitResult,
+    csv_text,
     failure,
     quarantined,
     run_isolated,
     settings_key,
+    write_parquet,
 )
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import as_date, load_yaml
+from alidade.pipelines.files import as_date, load_yaml, write_whole
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.reports.calibration import load_known
+from alidade.pipelines.reports.plain_json import plain_json
 
 if TYPE_CHECKING:
     from alidade.pipelines.estimation.problem import SqrtInformation
@@ -109,6 +120,50 @@ class Outcome:
         aside = [name for name, result in self.results.items() if result["exit_code"] == errors.EXIT_KILLED]
         lines += [f"quarantined, it kills workers: {name}" for name in aside]
         return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
+
+
+@dataclass(frozen=True, repr=False)
+class FleetResult:
+    """Results of a calibrated fleet: by recording, of parameters over units, of units over recordings; the files."""
+
+    outcome: Outcome
+    populations: Sequence[Population]
+    histories: Sequence[History]
+    written: tuple[Path, ...]
+
+    @property
+    def summary(self) -> list[str]:
+        """Summary: how many recordings with what verdicts, and which units need attention."""
+        units = units_of_interest(self.outcome.results, self.populations, self.histories)
+        return [*self.outcome.summary, sentence(units)]
+
+    def __repr__(self) -> str:
+        return f"<FleetResult: {self.outcome.summary[0]}>"
+
+
+def fleet(
+    recordings: Sequence[str | Path],
+    out: str | Path,
+    *,
+    method: str | None = None,
+    config: str | Path | None = None,
+    solver: str = "batch",
+    window: float | None = 1.0,
+    names: str | None = None,
+    prior: str | None = None,
+    scheduler: str | None = None,
+    jobs: int | None = None,
+) -> FleetResult:
+    """Calibrate recordings of many units (paths or patterns); writes fleet.html and tables to `out` and resumes there.
+
+    Raises:
+        InputError: a pattern matches nothing, or a setting cannot be used.
+    """
+    settings, out = Settings.of(method, None if config is None else Path(config), solver, window, prior), Path(out)
+    outcome = calibrate_fleet(find([str(each) for each in recordings]), settings, out, scheduler, jobs, names)
+    several = histories(outcome.results, {name: counting(result) for name, result in outcome.results.items()})
+    found = populations(outcome.results, several)
+    return FleetResult(outcome, found, several, write_fleet(out, outcome, found, several))
 
 
 def calibrate_fleet(
@@ -258,3 +313,40 @@ def _placed(name: str, result: RecordingResult, named: Mapping[str, str]) -> Uni
 def _sha256(path: Path) -> str:
     """Return the SHA-256 of a file, or of all files in a folder, hexadecimal."""
     return combined_sha256(map(file_sha256, sorted(path.iterdir()))) if path.is_dir() else file_sha256(path)
+
+
+def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> tuple[Path, ...]:
+    """Write a fleet's report and tables (CSV, Parquet), all of them or none; returns their paths."""
+    from alidade.pipelines.applications.fleet.pages import fleet_report
+    from alidade.pipelines.reports.html import render_html
+
+    rows = table(outcome.results, fleet)
+    return write_whole(
+        out,
+        {
+            "fleet.csv": csv_text(rows),
+            "fleet.parquet": partial(write_parquet, rows=rows),
+            "changes.csv": csv_text(change_table(found)),
+            "fleet.html": render_html(fleet_report(outcome, fleet, found)),
+        },
+    )
+
+
+def fleet_json(found: FleetResult) -> str:
+    """JSON of `fleet`: rows of fleet.csv and changes.csv, components of every parameter, who needs attention."""
+    outcome, fleet, histories = found.outcome, found.populations, found.histories
+    return plain_json(
+        "fleet",
+        {
+            "recordings": table(outcome.results, fleet),
+            "changes": change_table(histories),
+            "attention": units_of_interest(outcome.results, fleet, histories),
+            "parameters": [
+                {"name": p.name, "method": p.method, "of_device": p.of_device}
+                | {"population": p.population, "repeatability": p.repeatability}
+                for p in fleet
+            ],
+            "wanted": outcome.recordings,
+            "interrupted": outcome.interrupted,
+        },
+    )

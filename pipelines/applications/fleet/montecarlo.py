@@ -28,11 +28,14 @@ from alidade.pipelines.applications.fleet.store import (
     Row,
     RunResult,
     Store,
+    csv_text,
     quarantined,
     run_isolated,
     settings_key,
 )
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import write_whole
+from alidade.pipelines.reports.plain_json import plain_json
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -239,3 +242,33 @@ def _numbers(calibration: Calibration) -> dict[str, Any]:
             "chi_square_dof": calibration.estimate.chi_square.dof,
         }
     return numbers
+
+
+def study_json(study: Study) -> str:
+    """JSON of `montecarlo`: the rows of runs.csv and summary.csv."""
+    return plain_json(
+        "montecarlo",
+        {
+            "method": study.method,
+            "scenario": study.scenario,
+            "runs": run_table(study),
+            "summary": summary_table(study),
+            "wanted": study.seeds,
+            "interrupted": study.interrupted,
+        },
+    )
+
+
+def write_study(out: Path, study: Study) -> tuple[Path, ...]:
+    """Write runs.csv, summary.csv and montecarlo.html, all or none of them; return their paths."""
+    from alidade.pipelines.applications.fleet.pages import study_report
+    from alidade.pipelines.reports.html import render_html
+
+    return write_whole(
+        out,
+        {
+            "runs.csv": csv_text(run_table(study)),
+            "summary.csv": csv_text(summary_table(study)),
+            "montecarlo.html": render_html(study_report(study)),
+        },
+    )
