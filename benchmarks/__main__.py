@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.measure import Ratio, run, worse
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None, suite: Iterable[str] = SUITE) -
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
             found += process.submit(run, name).result()
     if options.json is not None:
-        options.json.write_text(json.dumps([ratio.to_json() for ratio in found], indent=1) + "\n")
+        options.json.write_text(json.dumps([asdict(ratio) for ratio in found], indent=1) + "\n")
     baseline: Mapping[str, float] = json.loads(options.baseline.read_text()) if options.baseline.exists() else {}
     if options.save:
         saved = {**baseline, **{ratio.name: float(f"{ratio.value:.3g}") for ratio in found}}

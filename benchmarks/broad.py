@@ -15,9 +15,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
@@ -25,8 +25,6 @@ from alidade.pipelines.methods.head.report import helmet_gyro
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 from datasets.broad import Trial, marker_attitudes, read_trial, score, to_session
-
-Array = NDArray[np.float64]
 
 DATA = Path("../shared/data/broad")
 # Hz, where the judge compares; s at the ends of a piece that its filter spoils, and the shortest piece it takes.

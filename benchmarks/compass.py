@@ -16,9 +16,9 @@ from functools import partial
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import method
@@ -29,8 +29,6 @@ from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 from alidade.pipelines.methods.tumble.turning import SCALE
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
-
-Array = NDArray[np.float64]
 
 # Amplitudes of roll, pitch and heading, deg.
 MOTIONS = {"wide": (5.0, 45.0, 360.0), "middle": (5.0, 5.0, 360.0), "low": (5.0, 45.0, 90.0)}

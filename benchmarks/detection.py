@@ -7,15 +7,13 @@ from functools import partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.simulation.rendering import Picture, Renderer, expose, tag_quad
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.tags import detect
 from benchmarks.measure import Ratio, costs, peak_mib
-
-Array = NDArray[np.float64]
 
 _FACING = so3.exp([np.pi, 0.0, 0.0])
 _SIZE = 0.1

@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Mask
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.methods.head import model as head
@@ -48,7 +47,7 @@ class _Measured:
     making: Array
     cost: Array
     pictures: Array
-    young: NDArray[np.bool_]
+    young: Mask
     memory: Array
 
     def against_goals(self, name: str, what: str) -> Iterator[Ratio]:

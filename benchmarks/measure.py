@@ -7,7 +7,7 @@ import importlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -67,10 +67,6 @@ class Ratio:
             sign = "<=" if self.better == "lower" else ">="
             target = f" ({sign} {self.wanted:g} wanted{'' if self.met else ': MISSED'})"
         return f"{self.name:24s} {self.value:8.3g}{target}  {self.compared}{f': {costs}' if costs else ''}"
-
-    def to_json(self) -> dict[str, Any]:
-        """All fields as plain data."""
-        return asdict(self)
 
 
 def costs(work: Sequence[Work], rounds: int = 3, warm: bool = True) -> list[Cost]:

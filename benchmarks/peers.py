@@ -11,11 +11,11 @@ from functools import partial
 import gtsam
 import numpy as np
 import pyceres
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
 from alidade.factors import so3
+from alidade.factors.array import Array, Index
 from alidade.factors.gyro import GyroIncrementFactor
 from alidade.factors.model import Model
 from alidade.factors.preintegration import GyroPath
@@ -28,8 +28,6 @@ from alidade.pipelines.solvers.engines import Compiled
 from benchmarks import static
 from benchmarks.batch import IDEAL, solve
 from benchmarks.measure import Ratio, costs
-
-Array = NDArray[np.float64]
 
 KEYFRAMES = 3_000
 _SAME = 1e-5  # rad, a tenth of the mounting angles' sigmas or less
@@ -111,7 +109,7 @@ class LosRows:
         return np.asarray(found.x[-(len(self.prior) - 3) :])
 
 
-def _block(values: Array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+def _block(values: Array, rows: Index, columns: Index) -> tuple[Array, Array, Array]:
     """Elements of (n, m, d) blocks whose first row and column are given, with their rows and columns."""
     _, m, d = values.shape
     row = np.broadcast_to(rows[:, None, None] + np.arange(m)[:, None], values.shape)
