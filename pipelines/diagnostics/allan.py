@@ -79,9 +79,7 @@ def allan_variance(tau: Array, squares: Array) -> Array:
 def confidence(curve: AllanCurve, squares: Array) -> tuple[Array, Array, Array]:
     """Equivalent degrees of freedom and 95 % interval (low, high) of each Allan deviation, (n,) each.
 
-    Args:
-        curve: the estimate.
-        squares: Q^2, N^2, B^2, K^2 of the noise, which the degrees of freedom depend on.
+    The degrees of freedom depend on the noise, `squares` Q^2, N^2, B^2, K^2.
     """
     dof = np.array([_degrees_of_freedom(curve, tau, squares) for tau in curve.tau])
     bounds = np.sqrt([interval(_CONFIDENCE, each) for each in dof])

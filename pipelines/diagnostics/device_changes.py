@@ -290,12 +290,7 @@ Verdict = Literal["holds", "changed", "unknown", "same"]
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """Result of a test whether an earlier calibration holds on a new recording.
-
-    Attributes:
-        changes: of the parameters between the two.
-        quantities: the parameters, by name.
-    """
+    """Result of a test whether an earlier calibration holds on a new recording: changes of the parameters, by name."""
 
     changes: Changes
     quantities: Mapping[str, Quantity]

@@ -97,10 +97,7 @@ def verdicts(
 
 
 def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
-    """Downgrade a verdict by the findings: no solution, or a solution that rejects many measurements.
-
-    Where there is no solution nothing is determined.
-    """
+    """Downgrade a verdict by the findings: no solution, or a solution that rejects many measurements."""
     if found != "fixed" and has_no_solution(findings):
         return "unobservable"
     return "weak" if found == "observable" and rejects_many(findings) else found

@@ -79,7 +79,7 @@ class Applied(Protocol):
 class Line:
     """A curve of errors over operating points: `error(applied, true)` (..., U), or vectors (..., U, d) for lengths.
 
-    `noise` is a variance per component, (U,); `color` from the palette, and `dash` as figures have it.
+    `noise` is a variance per component, (U,); `color` is one of the palette.
     """
 
     name: str

@@ -30,12 +30,7 @@ _PART = re.compile(r"live_(\d+)\.mcap")
 
 
 class Source(AbstractContextManager["Source"]):
-    """Recording that may still be written: a file, or a folder of its parts, which may not exist yet.
-
-    Attributes:
-        path: of the file or the folder.
-        name: what it is called in sentences.
-    """
+    """Recording that may still be written: a file, or a folder of its parts, which may not exist yet."""
 
     def __init__(self, path: Path, name: str | None = None) -> None:
         self.path, self.name = path, name or str(path)
