@@ -26,9 +26,16 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.recording.topics import SessionFacts, TopicFacts
 from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 
 # Data sheets of sensors without errors.
 IDEAL = Config.model_validate({"sensors": "ideal"}).sensors
+# Sway of a carrier, swift enough for a short recording.
+BRISK = EulerMotion(
+    roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
+    pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
+    yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
+)
 EPOCH_NS = 1_795_176_000_123_456_789
 MOUNT = np.array([0.03, -0.02, 0.5])
 NAMES = ("helmet_mount_x", "helmet_mount_y", "helmet_mount_z", "time_offset", "free", "pinned")

@@ -29,19 +29,13 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import ClockSheet
-from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers import incremental
 from benchmarks.initialisation import nees
-from tests.support.builders import IDEAL
+from tests.support.builders import BRISK, IDEAL
 from tests.support.command import Command
 from tests.support.solved import calibrate
 
 ROOT = Path(__file__).resolve().parents[3]
-BRISK = EulerMotion(
-    roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
-    pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
-    yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
-)
 SCENARIO = LosScenario(
     duration_s=11.0, carrier=BRISK, image_rate_hz=3.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL
 )

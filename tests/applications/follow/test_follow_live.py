@@ -23,16 +23,9 @@ from alidade.pipelines.methods.los.simulation import LosScenario, los_config, si
 from alidade.pipelines.recording.growing import GrowingFiles
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Sensors
-from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers import incremental
-from tests.support.builders import IDEAL
+from tests.support.builders import BRISK, IDEAL
 from tests.support.live import Bridge, Message, messages, paced, write
-
-BRISK = EulerMotion(
-    roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
-    pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
-    yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
-)
 
 
 def record(

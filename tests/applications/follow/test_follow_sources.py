@@ -27,21 +27,16 @@ from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 from alidade.pipelines.solvers import incremental
 from tests.support import forms
-from tests.support.builders import IDEAL
+from tests.support.builders import BRISK, IDEAL
 from tests.support.live import Bridge, messages, write
 from tests.support.solved import calibrate
 
 connect = websockets().sync.client.connect
 SCENARIO = LosScenario(
     duration_s=8.0,
-    carrier=EulerMotion(
-        roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
-        pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
-        yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
-    ),
+    carrier=BRISK,
     image_rate_hz=5.0,
     gyro_rate_hz=50.0,
     gimbal_rate_hz=50.0,
