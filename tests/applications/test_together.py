@@ -111,6 +111,14 @@ def _names(session: Session) -> list[str]:
 
 
 @pytest.mark.slow
+def test_one_recording_together_with_none_is_as_it_was() -> None:
+    (one,) = sessions("head", [1], "")
+    estimate = jointly([one]).estimate
+    np.testing.assert_allclose(estimate.sigmas, one.calibrate("batch").estimate.sigmas, rtol=1e-6)
+    assert estimate.converged
+    assert "moved last by 0 sigmas" in estimate.message
+
+
 def test_five_recordings_make_sigmas_smaller_by_their_root() -> None:
     """With ideal sensors and wide priors, of what is shared; what belongs to a recording stays nearly as it is."""
     opened = sessions("indexer", range(5), WIDE)
