@@ -36,7 +36,7 @@ from alidade.pipelines.solvers.chain import UNDETERMINED, IndeterminateStateErro
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import certain_ratio, sigma_ratio
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize, states_first
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.noise_estimation import apply_levels
 from alidade.pipelines.solvers.posterior import Reported
@@ -755,15 +755,15 @@ def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...
     return tuple(out) if found else None
 
 
-def _solution_at(linearization: Linearization, found: LikelihoodMaximum, config: LevenbergConfig) -> Solution:
-    """Minimise from a likelihood maximum, without outliers and with widened sigmas of the other measurements."""
+def _engine_at(linearization: Linearization, found: LikelihoodMaximum) -> Linearization:
+    """Linearisation at noise levels, without outliers and with widened sigmas of the other measurements."""
     used = [np.isfinite(wide) for wide in found.widening]
     engine = apply_levels(linearization, found.levels).counting(used)
     groups = [
         replace(group, weights=group.all_weights / np.where(own, wide, 1.0)[:, None]) if group.is_measurement else group
         for group, wide, own in zip(engine.groups, found.widening, used, strict=True)
     ]
-    return minimize(engine.with_groups(groups), found.values, config)
+    return engine.with_groups(groups)
 
 
 def solve_likelihood(
@@ -791,11 +791,11 @@ def solve_likelihood(
             used = [~(np.isin(g.model.time, times) & g.is_measurement) for g in engine.groups]
             found = LikelihoodMaximum(_with_parameters(compiled, known, found.values), found.levels, unwidened(used))
             # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
-            found = replace(found, values=_solution_at(engine, found, config).values)
+            found = replace(found, values=states_first(_engine_at(engine, found), found.values))
     for number in range(_MOST_SOLUTIONS):
         before = found.levels
         found = maximise_likelihood(engine, found, 1 if number else _ROUNDS, from_above=not number)
-        solution = _solution_at(engine, found, config)
+        solution = minimize(_engine_at(engine, found), found.values, config)
         found = replace(found, values=solution.values)
         changed = max((abs(np.log(a.scale / b.scale)) for a, b in zip(found.levels, before, strict=True)), default=0.0)
         if deadline.passed() or (number and changed < _STEADY):

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -28,9 +27,15 @@ from alidade.pipelines import deadline
 from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import DEFAULT, INITIAL_DAMPING, LevenbergConfig, Point, Solution, minimize
+from alidade.pipelines.solvers.levenberg import (
+    DEFAULT,
+    INITIAL_DAMPING,
+    LevenbergConfig,
+    Solution,
+    minimize,
+    states_first,
+)
 from alidade.pipelines.solvers.linearization import Group, Linearization, System
-from alidade.pipelines.solvers.posterior import followed
 
 # Decrease of chi-square per measurement at which plain least squares is near enough to begin with: residuals move by
 # .05 sigma yet; and its iterations at most: where they do not do outliers lead, and the surrogates begin anyhow.
@@ -60,7 +65,7 @@ def solve_robust(
     most = min(_ROUGH_ITERATIONS, config.max_iterations)
     tolerance = _ROUGH_TOLERANCE * max(count, 1)
     rough = replace(config, max_iterations=most, cost_tolerance=tolerance)
-    found = minimize(plain, _states_first(plain, values), rough)
+    found = minimize(plain, states_first(plain, values), rough)
     iterations = found.iterations
     truncated = engine.under(loss)
     start = min(values, found.values, key=truncated.cost) if np.isfinite(found.cost) else values
@@ -76,20 +81,6 @@ def solve_robust(
         iterations += again.iterations
         final = min(final, again, key=lambda each: truncated.cost(each.values))
     return replace(final, iterations=iterations)
-
-
-def _states_first(engine: Linearization, values: Values) -> Values:
-    """Move all states to where they are best at the first guess of the parameters, where the cost falls.
-
-    States aligned with single measurements repeat their noise. A parameter that multiplies a state would explain that
-    noise: of ten minutes of a gimbal the scale of LOS errors took a step of 12 prior sigmas.
-    """
-    here = Point.of(engine, values)
-    with suppress(IndeterminateStateError, np.linalg.LinAlgError):
-        last = np.zeros((len(here.factorization.root) - 1, 1))
-        there = engine.layout.retract(values, followed(here.factorization, last))
-        return min(values, there, key=engine.cost)
-    return values
 
 
 def _hardened(engine: Linearization, values: Values, loss: TruncatedLoss, config: LevenbergConfig) -> Values:
