@@ -170,7 +170,7 @@ class _Table:
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
         rate = next((found for line in self._form.preamble if (found := _RATE.search(line))), None)
         self._rate = float(rate[rate.lastindex or 0]) if rate else 0.0  # Hz, by its preamble
-        texts, _ = table.read(names, _ROWS)
+        texts, *_ = table.read(names, _ROWS)
         self._texts = list(texts.values())
         self._values = [self._numbers(i) for i in range(len(names))]
 

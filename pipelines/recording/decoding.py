@@ -33,7 +33,7 @@ _ROS: dict[str, tuple[Wire, Language]] = {
 }
 _TRANSLATED = ("protobuf/protobuf", "json/jsonschema")
 READABLE = (*_ROS, *_TRANSLATED)
-# Of a table of messages the column of the times at which these were recorded.
+# Of a table of messages the column of the times at which these were recorded, unless they have a field of that name.
 LOG_TIME = "log_time"
 # Encoding that is not read -> how to get one that is.
 _CONVERSIONS = {
@@ -285,7 +285,7 @@ class MessageFormat:
     def cells(self, block: MessageBlock) -> Iterator[dict[str, Any]]:
         """Yield a mapping from field path to number or word for each message of a block, whatever the type.
 
-        LOG_TIME is the time at which a message was recorded, Unix ns. Raises MessageError.
+        LOG_TIME is the time at which a message was recorded, Unix ns, or its own field. Raises MessageError.
         """
         assert self._schema is not None
         parse = parser(self._recorded if self._wire else self._schema)
@@ -295,7 +295,8 @@ class MessageFormat:
                     found = dict(cells(parse(block.message(i))))
                 except (ValueError, TypeError, AttributeError, OverflowError, RecursionError, MemoryError) as error:
                     raise MessageError(f"a message of {block.size[i]} bytes cannot be read ({error})") from error
-            yield found | {LOG_TIME: log_ns}
+            found.setdefault(LOG_TIME, log_ns)
+            yield found
 
     def texts(self, block: MessageBlock, names: Sequence[str]) -> list[NDArray[np.str_]]:
         """Return some of the `cells` of a block's messages as texts (N,) by name, empty where a message lacks one.
@@ -310,8 +311,9 @@ class MessageFormat:
                 if layout.agrees(rows).all():  # in words as well
                     first = next(self.cells(block))
                     words = {name: first.get(name, "") for name in names}
-                    columns = {name: np.full(len(rows), word) for name, word in words.items() if isinstance(word, str)}
-                    columns |= layout.numbers(names, rows) | {LOG_TIME: block.log_ns}
+                    columns: dict[str, NDArray[Any]] = {LOG_TIME: block.log_ns}
+                    columns |= {name: np.full(len(rows), word) for name, word in words.items() if isinstance(word, str)}
+                    columns |= layout.numbers(names, rows)
                     if columns.keys() >= set(names):
                         return [columns[name].astype(str) for name in names]
         each = [[cells.get(name, "") for name in names] for cells in self.cells(block)]

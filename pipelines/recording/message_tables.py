@@ -16,12 +16,13 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors.array import Stamps
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.container import Container, MessageBlock, MultiPartContainer
 from alidade.pipelines.recording.decoding import LOG_TIME, MessageFormat
 from alidade.pipelines.recording.messages import SENSORS, MessageError
 from alidade.pipelines.recording.table_values import unit_in
-from alidade.pipelines.recording.tables import MOST_COLUMNS, TableHead
+from alidade.pipelines.recording.tables import MOST_COLUMNS, Columns, TableHead
 
 # Messages whose fields are columns: the first may lack some.
 _FIRST = 100
@@ -70,8 +71,8 @@ class MessageTable:
         """First block of messages; None without any."""
         return next(self._container.blocks(set(self._formats)), None)
 
-    def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-        """Return the named columns as texts, empty where a message lacks the field; and no sentences.
+    def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], Stamps]:
+        """Return the named columns as texts, empty where a message lacks the field; no sentences; log times, Unix ns.
 
         Args:
             names: of the columns.
@@ -82,17 +83,17 @@ class MessageTable:
         """
         wanted = [self.form.names[self.form.index(name)] for name in names]
         parts: list[list[NDArray[np.str_]]] = []
-        count = 0
+        logged = [np.empty(0, np.int64)]
         for block in self._container.blocks(set(self._formats)):
             try:
                 parts.append(self._formats[block.channel].texts(block, wanted))
             except MessageError as error:
                 raise InputError(f"{self._container.path}: topic {self.name}: {error}") from error
-            count += len(block.start)
-            if most is not None and count >= most:
+            logged.append(block.log_ns)
+            if most is not None and sum(map(len, logged)) >= most:
                 break
         texts = [np.concatenate(column) for column in zip(*parts, strict=True)] or [np.empty(0, np.str_)] * len(names)
-        return dict(zip(names, texts, strict=True)), []
+        return dict(zip(names, texts, strict=True)), [], np.concatenate(logged)
 
 
 def _is_unix_ns(value: object) -> bool:

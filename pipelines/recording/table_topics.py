@@ -25,7 +25,6 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, MultiPartContainer
-from alidade.pipelines.recording.decoding import LOG_TIME
 from alidade.pipelines.recording.images import VideoFile
 from alidade.pipelines.recording.message_tables import WithTables, message_tables
 from alidade.pipelines.recording.table_values import (
@@ -143,7 +142,7 @@ class TableTopic(BaseModel):
         topic: str,
         form: TableHead,
         columns: Mapping[str, NDArray[np.str_]],
-        logged: NDArray[np.str_] | None = None,
+        logged: Stamps | None = None,
     ) -> tuple[series.Topic, Stamps | None, list[str]]:
         """Return a topic's series in SI units from the rows of a table, its log times (Unix ns) or None, and notes.
 
@@ -153,7 +152,7 @@ class TableTopic(BaseModel):
             topic: its name.
             form: the table.
             columns: texts of its columns, `names` at least.
-            logged: of a table of messages the log times.
+            logged: of a table of messages the log times, Unix ns.
         """
         path, given, notes = form.path, self._given, list[str]()
         columns = {name: columns[name] for name in self.names}
@@ -170,7 +169,7 @@ class TableTopic(BaseModel):
             unit = self._time_unit(form, notes)
             t_ns = nanoseconds(path, columns[self.time][filled], unit)
         values = {name: one[filled] for name, one in values.items()}
-        log_ns = None if logged is None else nanoseconds(path, logged[rows][filled], "ns")
+        log_ns = None if logged is None else logged[rows][filled]
         if log_ns is None:
             t_ns, values = _without_erased(path, t_ns, values, notes)
         if not self._is_slow and self.time is not None:
@@ -324,13 +323,11 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
     for name, topics in by_table.items():
         form = tables[name].form
         needed = [column for table in topics.values() for column in table.names]
-        texts, left_out = tables[name].read(list(dict.fromkeys([*needed, *([] if name in files else [LOG_TIME])])))
+        texts, left_out, recorded_ns = tables[name].read(list(dict.fromkeys(needed)))
         notes += left_out
         of[name] = {}
         for topic, table in topics.items():
-            of[name][topic], log_ns, concluded = table.to_series(
-                topic, form, texts, None if name in files else texts[LOG_TIME]
-            )
+            of[name][topic], log_ns, concluded = table.to_series(topic, form, texts, recorded_ns)
             logged |= {} if log_ns is None else {topic: log_ns}
             notes += concluded
     whole = _with_topics(container, of)

@@ -20,11 +20,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Stamps
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.table_values import TIME_NAME, bare_name, nanoseconds, unit_in, unit_named
+
+# Texts of a table's cells by the names of their columns.
+Columns = dict[str, NDArray[np.str_]]
 
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 # A line of a table of sensors is shorter, and has fewer columns.
@@ -109,8 +112,8 @@ class Table(Protocol):
     def form(self) -> TableHead:
         """Names and units of the columns."""
 
-    def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-        """Return the named columns of a table as texts, and a sentence about each kind of row left out."""
+    def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], Stamps | None]:
+        """Return the named columns as texts, a sentence about each kind of row left out, log times if there are any."""
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
@@ -138,9 +141,9 @@ class CsvFile(ArrayContainer):
         super().__init__(form.path, {}, [assumed], form.data)
         self.name, self.form = form.path.name, form
 
-    def read(self, names: Sequence[str], most: int | None = None) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
-        """Return the named columns of a table as texts, and a sentence about each kind of row left out."""
-        return read_columns(self.form, names, most)
+    def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], None]:
+        """Return the named columns as texts, a sentence about each kind of row left out, and no log times."""
+        return *read_columns(self.form, names, most), None
 
 
 def looks_like_text(start: bytes) -> bool:
@@ -220,9 +223,7 @@ def _check_decimal_commas(path: Path, above: Sequence[str], width: int) -> None:
         )
 
 
-def read_columns(
-    form: TableForm, names: Sequence[str], most: int | None = None
-) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+def read_columns(form: TableForm, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str]]:
     """Return the named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments

@@ -332,3 +332,24 @@ def test_a_column_of_a_file_may_be_called_log_time(tmp_path: Path) -> None:
     recording = open_recording(tmp_path / "log.csv").with_config((), columns)
     assert recording.topics["/imu"].count == 300
     assert recording.duration_s == pytest.approx(2.99)
+
+
+def test_a_field_called_log_time_is_the_messages_own(motion: Motion, tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("float64 log_time\nfloat64[3] rate\n", "lab_msgs/msg/Logged"))
+    with Ros2Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/lab/raw", "lab_msgs/msg/Logged", typestore=store)
+        for i in range(50):
+            message = store.types["lab_msgs/msg/Logged"](1.0 + 0.01 * i, motion.rates[i])
+            bag.write(topic, START + 10_000_000 * i + 3_000_000, store.serialize_cdr(message, "lab_msgs/msg/Logged"))
+    table = TableTopic(file="/lab/raw", time="log_time", unit="s", gyro=("rate[0]", "rate[1]", "rate[2]"))
+    recording = open_recording(tmp_path / "bag").with_config((), {"/imu": table})
+    np.testing.assert_allclose(recording.imu("/imu").t_ns, 10_000_000 * np.arange(100, 150), atol=1)
+    assert recording.times["/imu"][1][0] == START + 3_000_000, "logged when the container says"
+
+    def message_of(stamp: dict[str, int], fields: dict[str, Any]) -> bytes:
+        return json.dumps({"log_time": stamp["nanosec"], **fields}).encode()
+
+    path = write_mcap(tmp_path / "j.mcap", motion, "json", ("lab.Raw", "jsonschema", b"{}"), message_of)
+    texts, *_ = message_tables(open_container(path))["/lab/raw"].read(["log_time"])
+    assert texts["log_time"][1] == str((START + int(1e9 * motion.t[10])) % 1_000_000_000)
