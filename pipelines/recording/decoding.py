@@ -8,7 +8,7 @@ a topic has none; where only few messages lack one (sent before a clock was ther
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from alidade.factors.array import Array, Stamps
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.container import Channel, MessageBlock, Schema, byte_windows
+from alidade.pipelines.recording.container import Channel, Container, MessageBlock, Schema, byte_windows
 from alidade.pipelines.recording.messages import Definition, Language, Layout, Leaf, MessageError, Wire, at
-from alidade.pipelines.recording.translation import Translation, cells, is_foxglove, parser, ros_type
+from alidade.pipelines.recording.translation import Translation, cells, is_foxglove, is_known, parser, ros_type
 
 # Stamps and log times (N,), Unix ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
@@ -222,6 +222,17 @@ class MessageFormat:
         self.is_readable = self._wire is not None or self._is_translated
 
     @property
+    def is_doubtful(self) -> bool:
+        """Whether the type has the name of one of ROS in a package that is not known, and may be another."""
+        return self._is_translated and not is_known(self._recorded_type)
+
+    def check_fit(self, data: bytes) -> None:
+        """Take the type for what it was recorded as where a message of it, readable by its definition, is not ROS's."""
+        with suppress(MessageError):
+            if not self._translation.fits(data):
+                self._is_translated, self.type, self.is_readable = False, self._recorded_type, False
+
+    @property
     def advice(self) -> str:
         """End of a sentence: how to convert this encoding into one that is read; may be empty."""
         return f": {_CONVERSIONS[self.encoding]}" if self.encoding in _CONVERSIONS else ""
@@ -368,6 +379,18 @@ class MessageFormat:
             return _Plan(None, {})
         runs = {name: (layout.run(path), orders[name]) for name, path in table.fields.items()}
         return _Plan(layout, runs, _frame(message))
+
+
+def formats_of(container: Container) -> dict[int, MessageFormat]:
+    """Return the format of each channel; a doubtful type is one of ROS if its first message is."""
+    found = {
+        number: MessageFormat(channel, container.schemas.get(channel.schema_id))
+        for number, channel in container.channels.items()
+    }
+    doubtful = [number for number, each in found.items() if each.is_doubtful]
+    for number, block in container.first_blocks(doubtful).items():
+        found[number].check_fit(block.message(0))
+    return found
 
 
 @contextmanager

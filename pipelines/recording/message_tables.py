@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from alidade.factors.array import Stamps
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.container import Container, MessageBlock, MultiPartContainer
-from alidade.pipelines.recording.decoding import LOG_TIME, MessageFormat
+from alidade.pipelines.recording.decoding import LOG_TIME, MessageFormat, formats_of
 from alidade.pipelines.recording.messages import SENSORS, MessageError
 from alidade.pipelines.recording.table_values import unit_in
 from alidade.pipelines.recording.tables import MOST_COLUMNS, Columns, TableHead
@@ -123,8 +123,7 @@ class WithTables(MultiPartContainer):
 def message_tables(container: Container) -> dict[str, MessageTable]:
     """Return the topics of a recording as tables, by name."""
     formats: dict[str, dict[int, MessageFormat]] = {}
-    for number, channel in container.channels.items():
-        found = MessageFormat(channel, container.schemas.get(channel.schema_id))
+    for number, found in formats_of(container).items():
         if found.is_parsed and container.counts.get(number):
-            formats.setdefault(channel.topic, {})[number] = found
+            formats.setdefault(container.channels[number].topic, {})[number] = found
     return {name: MessageTable(container, name, own) for name, own in formats.items()}

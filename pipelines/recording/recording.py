@@ -41,8 +41,8 @@ from alidade.pipelines.recording.decoding import (
     READABLE,
     ColumnTable,
     DecodedMessage,
-    MessageFormat,
     Times,
+    formats_of,
     one_clock,
     with_log_times,
 )
@@ -116,10 +116,7 @@ class Recording:
         self._given_epoch_ns = epoch_ns
         if epoch_ns is not None:
             self.epoch_ns = epoch_ns
-        self._formats = {
-            number: MessageFormat(channel, container.schemas.get(channel.schema_id))
-            for number, channel in container.channels.items()
-        }
+        self._formats = formats_of(container)
         self.recorded = self._list_topics()
         self._sources: dict[str, TopicSource] = {}
         self._assumptions: tuple[str, ...] = ()

@@ -21,8 +21,9 @@ from alidade.pipelines.recording.container import Schema
 from alidade.pipelines.recording.messages import Definition, MessageError
 
 _HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
-# Last part of a type's name -> ROS 2 type.
+# Last part of a type's name -> ROS 2 type; packages in which such a type is that of ROS, whatever its fields.
 _ROS = {name.rpartition("/")[2]: name for name in messages.SENSORS}
+_PACKAGES = {"ros", *(name.partition("/")[0] for name in messages.SENSORS)}
 _FOXGLOVE = {
     "CompressedImage": messages.COMPRESSED_IMAGE,
     "CompressedVideo": messages.COMPRESSED_IMAGE,
@@ -45,6 +46,11 @@ def ros_type(name: str) -> str | None:
     """The ROS 2 type that messages of a type are translated into, None if there is none."""
     kind = name.replace(".", "/").rpartition("/")[2]
     return (_FOXGLOVE if is_foxglove(name) else _ROS).get(kind)
+
+
+def is_known(name: str) -> bool:
+    """Whether a type is of a package of ROS or Foxglove; another one may have fields of its own."""
+    return is_foxglove(name) or not _PACKAGES.isdisjoint(name.replace(".", "/").split("/"))
 
 
 def is_foxglove(name: str) -> bool:
@@ -73,6 +79,17 @@ class Translation:
             reason = " ".join(str(error).split())[:200]
             name = self._definition.name
             raise MessageError(f"a message of {len(data)} bytes does not translate into {name} ({reason})") from error
+
+    def fits(self, data: bytes) -> bool:
+        """Whether a message translates and has one of the ROS 2 type's fields, a header apart."""
+        try:
+            self(data)
+        except MessageError:
+            return False
+        own = {
+            name for name, what in self._definition.fields(self._definition.name) if what != (Nodetype.NAME, _HEADER)
+        }
+        return not own.isdisjoint(name.lower() for name, _ in _fields(self._parse(data)))
 
     def _message(self, kind: str, tree: Any) -> Any:
         if kind == _TIME:

@@ -353,3 +353,32 @@ def test_a_field_called_log_time_is_the_messages_own(motion: Motion, tmp_path: P
     path = write_mcap(tmp_path / "j.mcap", motion, "json", ("lab.Raw", "jsonschema", b"{}"), message_of)
     texts, *_ = message_tables(open_container(path))["/lab/raw"].read(["log_time"])
     assert texts["log_time"][1] == str((START + int(1e9 * motion.t[10])) % 1_000_000_000)
+
+
+@pytest.mark.parametrize(("package", "is_ros"), [("lab", False), ("sensor_msgs", True)])
+def test_fields_of_ones_own_make_a_type_with_the_name_of_one_of_ros_another(
+    package: str, is_ros: bool, motion: Motion, tmp_path: Path
+) -> None:
+    path = tmp_path / "j.mcap"
+
+    def message(stamp: dict[str, int], fields: dict[str, Any]) -> bytes:
+        return json.dumps({"header": {"stamp": stamp}, **fields}).encode()
+
+    write_mcap(path, motion, "json", (f"{package}.Imu", "jsonschema", b"{}"), message)
+    recording = open_recording(path)
+    assert recording.topics["/lab/raw"].type == ("sensor_msgs/msg/Imu" if is_ros else "lab.Imu")
+    assert (propose_columns(recording) is None) == is_ros
+    if not is_ros:
+        with pytest.raises(InputError, match=r"topic /lab/raw holds lab.Imu \(json/jsonschema\), needed is"):
+            recording.imu("/lab/raw")
+
+
+@pytest.mark.parametrize("rate", [{"x": 1.0, "y": 2.0, "z": 3.0}, [1.0, 2.0, 3.0]])
+def test_a_type_of_an_unknown_package_with_the_fields_of_ros_is_that_of_ros(
+    rate: Any, motion: Motion, tmp_path: Path
+) -> None:
+    path = tmp_path / "j.mcap"
+    data = json.dumps({"header": {"stamp": {"sec": 5, "nanosec": 0}}, "angular_velocity": rate}).encode()
+    write_mcap(path, motion, "json", ("lab.Imu", "jsonschema", b"{}"), lambda *_: data)
+    recording = open_recording(path)
+    assert (recording.topics["/lab/raw"].type == "sensor_msgs/msg/Imu") == isinstance(rate, dict)
