@@ -1,9 +1,9 @@
-"""Poses of a body of tags over a stream of pictures; attitudes of a helmet's tag board from them."""
+"""Attitudes of a helmet's tag board from a stream of pictures."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,16 +27,6 @@ MISFIT = "tags do not fit the layout"
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """View of a body in one picture: stamp, all tag ids, pose, and the reason if the pose is unusable."""
-
-    t_ns: int
-    ids: NDArray[np.int64]
-    pose: BodyPose | None
-    problem: str | None
-
-
-@dataclass(frozen=True, eq=False)
 class BoardAttitudes:
     """Attitudes of a tag board over time.
 
@@ -53,64 +43,53 @@ class BoardAttitudes:
     dropped: dict[str, int]
 
 
-def body_poses(
-    images: Iterable[tuple[int, bytes]], camera: Camera, body: TagBody, sigma_px: float | None = None
-) -> Iterator[Sight]:
-    """Yield the pose of a body of tags in each picture; the last unambiguous attitude guides the next.
-
-    Args:
-        images: stamps (ns) and encoded pictures (PNG, JPEG, ...), in time order.
-        camera: the camera; pictures of another size raise InputError.
-        body: the tags and where they are on the body.
-        sigma_px: as in `estimate_pose`.
-    """
-    last_t, last_cRb = 0, None
-    for t_ns, found in detections(images, body.family, camera):
-        if found is None:
-            yield Sight(t_ns, np.zeros(0, dtype=np.int64), None, UNREADABLE)
-            continue
-        fresh = last_cRb is not None and 0 <= t_ns - last_t <= _FRESH_NS
-        pose = estimate_pose(camera, body, found, sigma_px, expected=last_cRb if fresh else None)
-        problem = _problem(pose, found, sigma_px)
-        if pose is not None and problem is None and pose.decided:
-            last_t, last_cRb = t_ns, pose.cRb
-        yield Sight(t_ns, found.ids, pose, problem)
-
-
-def _problem(pose: BodyPose | None, found: Detections, sigma_px: float | None) -> str | None:
-    if pose is None:
-        return UNSEEN
+def _problem(pose: BodyPose, found: Detections, sigma_px: float | None) -> str:
+    """Return why a pose is not used; empty if it is."""
     corners = found.corners[np.isin(found.ids, pose.ids)]
     side = float(edge_lengths(corners).mean())
     if pose.rms_px > max(_MISFIT_SIGMAS * (sigma_px or 0.0), _MISFIT_PX, _MISFIT_SHARE * side):
         return MISFIT
-    return AMBIGUOUS if pose.ambiguous else None
+    return AMBIGUOUS if pose.ambiguous else ""
 
 
 def board_attitudes(
     images: Iterable[tuple[int, bytes]], camera: Camera, board: TagBody, sigma_px: float | None = None
 ) -> BoardAttitudes:
-    """Measure a helmet's tag board in pictures: attitudes in the camera's optical frame (arguments as in `body_poses`).
+    """Measure a helmet's tag board in pictures: attitudes in the camera's optical frame.
+
+    The last unambiguous attitude guides the next.
+
+    Args:
+        images: stamps (ns) and encoded pictures (PNG, JPEG, ...), in time order.
+        camera: the camera; pictures of another size raise InputError.
+        board: the tags and where they are on the board.
+        sigma_px: as in `estimate_pose`.
 
     Raises:
         InputError: no pictures, none that decodes, no tag of the board ever seen, or no attitude that can be used.
     """
-    t_ns: list[int] = []
-    attitudes: list[Array] = []
-    covariances: list[Array] = []
+    rows: list[tuple[int, Array, Array]] = []
     dropped: Counter[str] = Counter()
     seen: set[int] = set()
-    for sight in body_poses(images, camera, board, sigma_px):
-        seen.update(sight.ids.tolist())
-        if sight.problem is not None or sight.pose is None:
-            dropped[sight.problem or UNSEEN] += 1
+    last_t, last_cRh = 0, None
+    for t_ns, found in detections(images, board.family, camera):
+        if found is None:
+            dropped[UNREADABLE] += 1
             continue
-        t_ns.append(sight.t_ns)
-        attitudes.append(sight.pose.cRb)
-        covariances.append(sight.pose.covariance[:3, :3])
-    if not t_ns:
+        seen.update(found.ids.tolist())
+        fresh = last_cRh is not None and 0 <= t_ns - last_t <= _FRESH_NS
+        pose = estimate_pose(camera, board, found, sigma_px, expected=last_cRh if fresh else None)
+        problem = UNSEEN if pose is None else _problem(pose, found, sigma_px)
+        if pose is None or problem:
+            dropped[problem] += 1
+            continue
+        rows.append((t_ns, pose.cRb, pose.covariance[:3, :3]))
+        if pose.decided:
+            last_t, last_cRh = t_ns, pose.cRb
+    if not rows:
         raise InputError(_why_nothing(dropped, seen, board))
-    return BoardAttitudes(np.array(t_ns, dtype=np.int64), np.array(attitudes), np.array(covariances), dict(dropped))
+    stamps, attitudes, covariances = zip(*rows, strict=True)
+    return BoardAttitudes(np.array(stamps, dtype=np.int64), np.array(attitudes), np.array(covariances), dict(dropped))
 
 
 def _why_nothing(dropped: Counter[str], seen: set[int], board: TagBody) -> str:

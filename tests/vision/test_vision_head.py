@@ -13,10 +13,10 @@ from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
 from alidade.pipelines.vision import board as vision
-from alidade.pipelines.vision.board import Sight, board_attitudes, body_poses
+from alidade.pipelines.vision.board import board_attitudes
 from alidade.pipelines.vision.camera import Camera
-from alidade.pipelines.vision.pose import TagBody
-from alidade.pipelines.vision.tags import UNREADABLE
+from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose
+from alidade.pipelines.vision.tags import UNREADABLE, decode, detect, detections
 
 CAMERA = Camera(
     640,
@@ -105,9 +105,9 @@ def test_pictures_are_streamed(renderer: Renderer) -> None:
             taken += 1
             yield taken, picture
 
-    sights = body_poses(images(), CAMERA, BOARD)
-    next(sights)
-    next(sights)
+    found = detections(images(), BOARD.family, CAMERA)
+    next(found)
+    next(found)
     assert taken == 2
 
 
@@ -123,7 +123,7 @@ def test_cube_pictures_of_an_independent_simulator(shared_data: Path) -> None:
     cube = TagBody(
         np.arange(16, 22), np.full(6, 0.12), np.array([tags[i] for i in range(16, 22)]), 0.08 * np.rint(normals)
     )
-    camera, sights = None, list[Sight]()
+    camera, poses = None, list[BodyPose | None]()
     with (shared_data / "contract" / "cube_images.mcap").open("rb") as file:
         messages = make_reader(file).iter_messages(topics=["/camera/camera_info", "/camera/image/compressed"])
         for k, (schema, channel, message) in enumerate(messages):
@@ -134,8 +134,10 @@ def test_cube_pictures_of_an_independent_simulator(shared_data: Path) -> None:
             elif k % 20 == 0:
                 assert camera is not None
                 image = store.deserialize_cdr(message.data, schema.name)
-                sights += body_poses([(message.log_time, bytes(image.data))], camera, cube)
-    rms = [s.pose.rms_px for s in sights if s.pose is not None]
-    assert len(rms) == len(sights) > 20
+                picture = decode(bytes(image.data))
+                assert picture is not None
+                poses.append(estimate_pose(camera, cube, detect(picture, cube.family, camera)))
+    rms = [pose.rms_px for pose in poses if pose is not None]
+    assert len(rms) == len(poses) > 20
     assert np.median(rms) < 0.01
     assert max(rms) < 0.2
