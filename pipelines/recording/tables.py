@@ -237,41 +237,7 @@ def read_columns(form: TableForm, names: Sequence[str], most: int | None = None)
     Raises:
         InputError: a column is missing, or more rows are too short; the first of them is named.
     """
-    columns, notes = _whole_rows(form, [form.index(name) for name in names], most)
-    if form.decimal == ",":
-        columns = [np.char.replace(column, ",", ".") for column in columns]
-    return dict(zip(names, columns, strict=True)), notes
-
-
-def numbers(path: Path, columns: Mapping[str, NDArray[np.str_]], names: Sequence[str]) -> Array:
-    """Convert columns to numbers (N, len(names)), NaN for missing ones. Raises InputError, naming the cell, at text."""
-    return np.column_stack([_numbers(path, name, columns[name]) for name in names])
-
-
-def _numbers(path: Path, name: str, texts: NDArray[np.str_]) -> Array:
-    try:
-        return np.where(texts == "", "nan", texts).astype(float)
-    except ValueError:
-        pass
-    out = np.full(len(texts), np.nan)
-    for i, cell in enumerate(texts.tolist()):
-        if cell.lower() not in _ABSENT:
-            try:
-                out[i] = float(cell)
-            except ValueError:
-                raise InputError(f"{path}: row {i + 1}, column {name}: {cell[:40]!r} is no number") from None
-    return out
-
-
-def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Mask of cells that are neither empty nor a placeholder."""
-    return ~np.isin(np.char.lower(texts), list(_ABSENT))
-
-
-def _whole_rows(
-    form: TableForm, wanted: Sequence[int], most: int | None = None
-) -> tuple[list[NDArray[np.str_]], list[str]]:
-    """Return the wanted columns of whole rows, and sentences about rows that are left out; see `read_columns`."""
+    wanted = [form.index(name) for name in names]
     blocks: list[list[NDArray[np.str_]]] = [[] for _ in wanted]
     rows: list[list[str]] = []
     cut: list[tuple[int, int]] = []
@@ -300,7 +266,35 @@ def _whole_rows(
     notes = [f"{form.path.name}: rows cut short, the first in line {cut[0][0]}: {len(cut)} left out"] if cut else []
     if headers > 1:
         notes.append(f"{form.path.name}: its header is there {headers} times, as of a logger that was started again")
-    return [np.concatenate(blocks.pop(0)) for _ in wanted], notes
+    columns = [np.concatenate(blocks.pop(0)) for _ in wanted]
+    if form.decimal == ",":
+        columns = [np.char.replace(column, ",", ".") for column in columns]
+    return dict(zip(names, columns, strict=True)), notes
+
+
+def numbers(path: Path, columns: Mapping[str, NDArray[np.str_]], names: Sequence[str]) -> Array:
+    """Convert columns to numbers (N, len(names)), NaN for missing ones. Raises InputError, naming the cell, at text."""
+    return np.column_stack([_numbers(path, name, columns[name]) for name in names])
+
+
+def _numbers(path: Path, name: str, texts: NDArray[np.str_]) -> Array:
+    try:
+        return np.where(texts == "", "nan", texts).astype(float)
+    except ValueError:
+        pass
+    out = np.full(len(texts), np.nan)
+    for i, cell in enumerate(texts.tolist()):
+        if cell.lower() not in _ABSENT:
+            try:
+                out[i] = float(cell)
+            except ValueError:
+                raise InputError(f"{path}: row {i + 1}, column {name}: {cell[:40]!r} is no number") from None
+    return out
+
+
+def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Mask of cells that are neither empty nor a placeholder."""
+    return ~np.isin(np.char.lower(texts), list(_ABSENT))
 
 
 def _encoding(start: bytes) -> str:
@@ -421,6 +415,7 @@ def _trajectory(form: TableForm) -> series.PoseSeries | None:
             return None
     except ValueError:
         return None
-    columns = dict(zip(_TUM, _whole_rows(form, range(len(_TUM)))[0], strict=True))
+    texts, _ = read_columns(form, [f"column {i + 1}" for i in range(len(_TUM))])
+    columns = dict(zip(_TUM, texts.values(), strict=True))
     position, xyzw = (numbers(form.path, columns, names) for names in (_TUM[1:4], _TUM[4:]))
     return series.PoseSeries(nanoseconds(form.path, columns["t"], "s"), xyzw[:, [3, 0, 1, 2]], position)
