@@ -136,25 +136,14 @@ class Layout:
 
     def agrees(self, messages: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Mask (n,) of the messages (n, size) that have this layout."""
-        first = np.frombuffer(self.first, np.uint8)[None]
+        first = np.frombuffer(self.first, np.uint8)
         same = np.ones(len(messages), dtype=bool)
-        for run in self._fixed:
-            equal = run.of(messages) == run.of(first)
+        for start, end in self.fixed:
+            equal = messages[:, start:end] == first[start:end]
             # Nearly always all are, which is seen in less time than which.
             if not equal.all():
                 same &= equal.all(axis=1)
         return same
-
-    @cached_property
-    def _fixed(self) -> list[Leaf]:
-        """Runs of bytes in which messages have to agree, as the widest integers, which compare three times as fast."""
-        found = []
-        for start, end in self.fixed:
-            for width in (8, 4, 2, 1):
-                count = (end - start) // width
-                found.append(Leaf("", start, np.dtype(f"u{width}"), count))
-                start += count * width
-        return [run for run in found if run.count]
 
 
 class MessageError(Exception):
