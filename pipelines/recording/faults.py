@@ -136,14 +136,6 @@ def _runs(x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return np.concatenate([[0], change + 1]), np.concatenate([change, [len(x) - 1]])
 
 
-def _mask(size: int, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Mask:
-    """Mask (size,), True from each start to its stop, both included."""
-    edges = np.zeros(size + 1, dtype=int)
-    np.add.at(edges, starts, 1)
-    np.add.at(edges, stops + 1, -1)
-    return np.asarray(np.cumsum(edges[:-1]) > 0)
-
-
 def _edge(step: Array, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Array:
     """Return the larger of the absolute steps into and out of each run of equal readings."""
     return np.fmax(np.concatenate([[0.0], step])[starts], np.concatenate([step, [0.0]])[stops])
@@ -155,9 +147,9 @@ def _frozen(t: Array, x: Array, most: float = _MOST_REPEATED) -> Mask:
     long = (stops - starts + 1 >= _FROZEN_SAMPLES) & (t[stops] - t[starts] >= _FROZEN)
     step = np.abs(np.diff(x))
     usual = np.nanmedian(step[step > 0.0]) if np.any(step > 0.0) else 0.0
-    # The first reading of a run was a good one.
     jumps = long & (_edge(step, starts, stops) > _JUMP * usual)
-    out = _mask(len(x), starts[jumps] + 1, stops[jumps])
+    out = np.repeat(jumps, stops - starts + 1)
+    out[starts] = False  # the first reading of a run was a good one
     return out if out.mean() < most else np.zeros(len(x), dtype=bool)
 
 
@@ -208,7 +200,7 @@ def _at_end(x: Array) -> Mask:
     at_end &= np.abs(x[starts] - 0.5 * (low + high)) > _QUANTA * quantum
     # The rounded top of a smooth motion is entered and left by a quantum or two.
     at_end &= _edge(step, starts, stops) > 3.5 * quantum
-    out = _mask(len(x), starts[at_end], stops[at_end])
+    out = np.repeat(at_end, stops - starts + 1)
     inside = np.diff(x)[~out[1:]] == 0.0
     noisy = len(inside) > 0 and inside.mean() < _MOST_REPEATED
     return out if noisy else np.zeros(len(x), dtype=bool)
