@@ -80,13 +80,9 @@ class Block:
     is_damaged: bool = False
 
 
-class _AttachmentName:
-    """Fields of an attachment record up to its name."""
-
-    @staticmethod
-    def read(stream: ReadDataStream) -> str:
-        stream.read(16)  # times
-        return stream.read_prefixed_string()
+def _attachment_name(stream: ReadDataStream) -> str:
+    stream.read(16)  # times
+    return stream.read_prefixed_string()
 
 
 class McapFile(Container):
@@ -163,7 +159,7 @@ class McapFile(Container):
                 raise DamagedError("it is no attachment, or too large to be one of alidade's")
             if int.from_bytes(record[-4:], "little") not in (0, zlib.crc32(record[:-4])):
                 raise DamagedError("checksum")
-            return records.parse(mcap.records.Attachment, record).data
+            return records.parse(mcap.records.Attachment.read, record).data
         except DamagedError as damaged:
             if needed:
                 raise InputError(
@@ -295,9 +291,9 @@ class McapFile(Container):
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             self._define(opcode, stream.read(min(end - body, MAX_DEFINITION_BYTES + 1)))
         elif opcode == Opcode.ATTACHMENT:
-            self._attachment_offsets[records.parse(_AttachmentName, stream.read(min(end - body, 1 << 16)))] = position
+            self._attachment_offsets[records.parse(_attachment_name, stream.read(min(end - body, 1 << 16)))] = position
         elif opcode == Opcode.DATA_END:
-            self._data_end = position, records.parse(mcap.records.DataEnd, stream.read(4)).data_section_crc
+            self._data_end = position, records.parse(mcap.records.DataEnd.read, stream.read(4)).data_section_crc
         elif opcode < _PRIVATE_OPCODES and opcode not in (Opcode.HEADER, Opcode.METADATA):
             raise DamagedError(f"a record of unknown kind {opcode}")
 
@@ -308,11 +304,11 @@ class McapFile(Container):
         if len(record) > MAX_DEFINITION_BYTES:
             raise DamagedError(f"a definition of {len(record)} bytes")
         if opcode == Opcode.SCHEMA:
-            schema = records.parse(mcap.records.Schema, record)
+            schema = records.parse(mcap.records.Schema.read, record)
             self._definition_bytes += len(record) if schema.id not in self.schemas else 0
             self.schemas.setdefault(schema.id, Schema(schema.id, schema.name, schema.encoding, schema.data))
         else:
-            found = records.parse(mcap.records.Channel, record)
+            found = records.parse(mcap.records.Channel.read, record)
             channel = Channel(found.id, found.topic, found.message_encoding, found.schema_id)
             self.channels.setdefault(found.id, channel)
         if len(self.channels) > MAX_CHANNELS or self._definition_bytes > MAX_ALL_DEFINITION_BYTES:
@@ -391,9 +387,9 @@ class McapFile(Container):
 
     def _read_summary_record(self, opcode: int, record: bytes) -> None:
         if opcode == Opcode.STATISTICS:
-            self._stated = records.parse(mcap.records.Statistics, record).channel_message_counts
+            self._stated = records.parse(mcap.records.Statistics.read, record).channel_message_counts
         elif opcode == Opcode.ATTACHMENT_INDEX:
-            index = records.parse(mcap.records.AttachmentIndex, record)
+            index = records.parse(mcap.records.AttachmentIndex.read, record)
             if index.offset > self.size:
                 raise DamagedError("it says that an attachment lies behind the end of the file")
             self._attachment_offsets[index.name] = index.offset

@@ -9,9 +9,9 @@ from __future__ import annotations
 import bz2
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO
-from typing import BinaryIO, NamedTuple, Protocol, TypeVar
+from typing import BinaryIO, NamedTuple, TypeVar
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -66,12 +66,7 @@ class ChunkHead(NamedTuple):
     packed: slice
 
 
-_Record_co = TypeVar("_Record_co", covariant=True)
-
-
-class _RecordType(Protocol[_Record_co]):
-    @staticmethod
-    def read(stream: ReadDataStream) -> _Record_co: ...
+_Record = TypeVar("_Record")
 
 
 class _WholeFields(ReadDataStream):
@@ -84,10 +79,10 @@ class _WholeFields(ReadDataStream):
         return data
 
 
-def parse(kind: type[_RecordType[_Record_co]], record: bytes) -> _Record_co:
-    """Parse the bytes of a record as one of the kinds in mcap.records. Raises DamagedError."""
+def parse(read: Callable[[ReadDataStream], _Record], record: bytes) -> _Record:
+    """Parse the bytes of a record by the `read` of one of the kinds in mcap.records. Raises DamagedError."""
     try:
-        return kind.read(_WholeFields(BytesIO(record)))
+        return read(_WholeFields(BytesIO(record)))
     except EndOfFile as error:
         raise DamagedError("it is shorter than its fields") from error
     except UnicodeDecodeError as error:
