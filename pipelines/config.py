@@ -23,7 +23,6 @@ from alidade.pipelines.settings import (
     Config,
     Noise,
     NoiseOrZero,
-    Section,
     Sensors,
     Sheet,
     SigmaOrZero,
@@ -94,16 +93,11 @@ def model() -> type[Config]:
     fields: dict[str, Any] = {section.key: (section, section()) for section in sections}
     fields["method"] = (Literal[names] | None, None)
     own: dict[str, Any] = {spec.name: (NoiseOrZero | None, None) for each in declared for spec in each.noise}
-    fields["noise"] = _with_default(
-        create_model("Noise", __base__=Noise, __doc__=Noise.__doc__, **own) if own else Noise
-    )
+    noise = create_model("Noise", __base__=Noise, __doc__=Noise.__doc__, **own) if own else Noise
+    fields["noise"] = (noise, noise())
     sensors = _sensors(declared)
     fields["sensors"] = (sensor_sheets(sensors), sensors())
     return create_model("Config", __base__=Config, __doc__=Config.__doc__, **fields)
-
-
-def _with_default(section: type[Section]) -> tuple[type[Section], Section]:
-    return section, section()
 
 
 def _sensors(declared: Sequence[Method]) -> type[Sensors]:
@@ -115,7 +109,8 @@ def _sensors(declared: Sequence[Method]) -> type[Sensors]:
         figures = {figure for each in declared for figure in each.data_sheets.get(name, ())} - base.model_fields.keys()
         if figures:
             own: dict[str, Any] = dict.fromkeys(sorted(figures), (SigmaOrZero | None, None))
-            more[name] = _with_default(create_model(f"{name.capitalize()}Sheet", __base__=base, **own))
+            made = create_model(f"{name.capitalize()}Sheet", __base__=base, **own)
+            more[name] = (made, made())
     return create_model("Sensors", __base__=Sensors, __doc__=Sensors.__doc__, **more) if more else Sensors
 
 
