@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,9 +123,9 @@ def pair(
         return [_fit(one[inside], against) for one in of]
 
     way = int(np.argmax([share for share, _, _ in fits(offset)]))
-    middle = directions[way][stride // 2 :][: len(steps)][whole]
-    seen = _Seen(a, b, ways[way], so3.matrix(middle).swapaxes(1, 2))
-    offset = _refined(offset, seen, ours, [_Gyro(t_ns, rates, start) for t_ns, rates in others])
+    to_body = so3.matrix(directions[way][stride // 2 :][: len(steps)][whole]).swapaxes(1, 2)
+    carriers = [_Gyro(t_ns, rates, start) for t_ns, rates in others]
+    offset = _refined(offset, a, b, ways[way], to_body, ours, carriers)
     fit, angle, ratio = fits(offset)[way]
     if way == 1 and angle > MAX_MOUNT:
         # (x, y, z, w) read as (w, x, y, z) is exactly an inverse between two constant rotations.
@@ -139,31 +138,25 @@ def pair(
     return Pairing(correlation, offset, way == 1, fit, angle, ratio=ratio, at_its_stamps=together)
 
 
-class _Seen(NamedTuple):
-    """Mean rates (n, 3), rad/s, of an attitude from a to b (n,), s, and the rotations from its frame into the body."""
-
-    a: Array
-    b: Array
-    rates: Array
-    to_body: Array
-
-
-def _refined(offset: float, seen: _Seen, gyro: _Gyro, others: Sequence[_Gyro]) -> float:
+def _refined(
+    offset: float, a: Array, b: Array, rates: Array, to_body: Array, gyro: _Gyro, others: Sequence[_Gyro]
+) -> float:
     """Return the delay, s, at which the gyro's rates, less a carrier's if there is one, fit the attitude's rates best.
 
-    An attitude relative to a moving carrier has the rate of the gyro less the carrier's, in the body. The fit is linear
-    in the relative rotations of the sensors and in their biases.
+    The attitude has mean rates (n, 3), rad/s, from a to b (n,), s; `to_body` (n, 3, 3) turns its frame into the body's.
+    Relative to a moving carrier it has the rate of the gyro less the carrier's, in the body. The fit is linear in the
+    relative rotations of the sensors and in their biases.
     """
 
     def inside(one: _Gyro) -> NDArray[np.bool_]:
-        return one.covers(seen.a + offset - _WITHIN, seen.b + offset + _WITHIN)
+        return one.covers(a + offset - _WITHIN, b + offset + _WITHIN)
 
     rows = inside(gyro)
     others = [other for other in others if (inside(other) | ~rows).all()]
     if rows.sum() < _FEWEST:
         return offset
-    a, b, to_body = seen.a[rows], seen.b[rows], seen.to_body[rows]
-    rates, ones = seen.rates[rows].ravel(), np.tile(np.eye(3), (int(rows.sum()), 1))
+    a, b, to_body = a[rows], b[rows], to_body[rows]
+    rates, ones = rates[rows].ravel(), np.tile(np.eye(3), (int(rows.sum()), 1))
 
     def missed(delay: float, carrier: _Gyro | None) -> float:
         """Return the sum of the attitude's squared rates that the gyros do not explain at a delay, s."""
