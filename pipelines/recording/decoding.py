@@ -91,12 +91,9 @@ class _Plan(NamedTuple):
 
 
 class ColumnTable:
-    """Columns of a topic, filled block by block. A column whose values never change takes no memory.
+    """Columns of at most `count` messages of a type in NUMERIC_TYPES, filled block by block.
 
-    Args:
-        kind: message type, one of NUMERIC_TYPES.
-        count: largest number of messages.
-        joints: of a sensor_msgs/JointState those whose positions are read.
+    Of a sensor_msgs/JointState the positions of `joints` are read. A column whose values never change takes no memory.
 
     Attributes:
         fields: column -> path of the field in a message.

@@ -48,14 +48,8 @@ class PoseFit:
 def refine(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> PoseFit | None:
     """Refine a pose to the local minimum of the reprojection errors; None if there is none.
 
-    By pycolmap, or by ourselves where it has no wheel.
-
-    Args:
-        camera: with its distortion.
-        corners: (n, 3) in the body's frame, m.
-        pixels: (n, 2) where they are seen.
-        cRb: (4,) attitude of the body in the camera to begin with.
-        position: (3,) of its origin, m.
+    The body, of corners (n, 3), m, seen at pixels (n, 2), begins at the attitude cRb (4,) and position (3,), m, in the
+    camera. By pycolmap, or by ourselves where it has no wheel.
     """
     return (refine_by_pycolmap if _has_pycolmap() else refine_here)(camera, corners, pixels, cRb, position)
 
@@ -185,11 +179,7 @@ class TagBody:
 
     @classmethod
     def from_board(cls, board: Board) -> TagBody:
-        """Build the body from a config's `tags`.
-
-        Raises:
-            InputError: no tags, or one without a size.
-        """
+        """Build the body from a config's `tags`. Raises InputError: no tags, or one without a size."""
         tags = sorted(board.tags.items())
         if not tags:
             raise InputError("config: no tags are given; name them as {id: {size, rotation, position}}")
@@ -256,9 +246,7 @@ def estimate_pose(
     (T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", 2014; OpenCV's IPPE_SQUARE) are the starts.
 
     Args:
-        camera: the camera.
-        body: tags by id.
-        detections: tags in the picture.
+        camera, body, detections: tags of the body in a picture of the camera.
         sigma_px: standard deviation of corners, px per axis; None takes the detections' own, or what the misfit shows
             if that is more (a layout that is not exact).
         expected: (4,) attitude cRb expected beforehand; it settles a flip that the corners leave open if the one pose
@@ -334,12 +322,9 @@ def angles(p: Array, q: Array) -> Array:
 
 
 def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array, Array]:
-    """Both pose solutions of each single tag: cRt (n, 2, 4) and position in c (n, 2, 3), m.
+    """Both pose solutions of each single tag of size (n,), m, with corners at pixels (n, 4, 2).
 
-    Args:
-        camera: the camera.
-        size: (n,) m.
-        pixels: (n, 4, 2) corners.
+    Returns cRt (n, 2, 4) and position in c (n, 2, 3), m.
     """
     import cv2
 
