@@ -206,21 +206,8 @@ def _protobuf(schema: Schema) -> Callable[[bytes], Any]:
     from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
 
     try:
-        files = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file}
         pool = descriptor_pool.DescriptorPool()
-        added: set[str] = set()
-
-        def add(name: str) -> None:
-            """Add a file to the pool, after the files on which it depends."""
-            if name in added or name not in files:
-                return
-            added.add(name)
-            for needed in files[name].dependency:
-                add(needed)
-            pool.Add(files[name])
-
-        for name in files:
-            add(name)
+        message_factory.GetMessages(descriptor_pb2.FileDescriptorSet.FromString(schema.data).file, pool)
         kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
     except (message.Error, KeyError, TypeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]

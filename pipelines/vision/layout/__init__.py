@@ -13,6 +13,7 @@ from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from alidade.factors import so3
 from alidade.factors.array import Array
@@ -148,10 +149,8 @@ def _unconnected(views: Gathered, given: TagBody) -> dict[int, str]:
 
 def _reached(sights: Sights, tags: int) -> NDArray[np.bool_]:
     """Mask (n,) of tags connected to the first tag by a chain of common pictures."""
-    pictures, reached = joint(sights, tags) > 0, np.arange(tags) == 0
-    for _ in range(tags):
-        reached = reached | (pictures & reached).any(axis=1)
-    return reached
+    _, chain = connected_components(joint(sights, tags))
+    return np.asarray(chain == chain[0])
 
 
 def _unusable(views: Gathered, fit: Fit) -> dict[int, str]:
