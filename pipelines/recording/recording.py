@@ -13,7 +13,7 @@ The path of a sample, one module a step:
 
 The time of a sample is its header stamp; where that is zero the log time stands in, and the series counts those.
 Messages come in the order of their log times. Every method raises InputError, naming what is there, when the topic is
-missing or empty, has another type, cannot be decoded, or its clock was set in between (stamps.py). A damaged chunk is
+missing or empty, has another type, cannot be decoded, or its clock was set in between (checks.py). A damaged chunk is
 left out, see `Recording.notes`.
 """
 
@@ -34,6 +34,7 @@ from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages, series, single_messages
+from alidade.pipelines.recording.checks import check_clock, jitter_ns, stamp_notes
 from alidade.pipelines.recording.container import Container, MessageBlock
 from alidade.pipelines.recording.decoding import (
     ENCODING,
@@ -49,7 +50,6 @@ from alidade.pipelines.recording.decoding import (
 from alidade.pipelines.recording.messages import MessageError
 from alidade.pipelines.recording.opening import Where, open_container
 from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
-from alidade.pipelines.recording.stamps import check_clock, jitter_ns, stamp_notes
 from alidade.pipelines.recording.table_topics import TableTopic, described, tables_of
 from alidade.pipelines.recording.topics import TopicSource, along, inverted, joined
 

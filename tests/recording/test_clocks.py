@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.checks import find_clock_step
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.recording.stamps import find_clock_step
 from tests.support.raw_messages import STORE, T0, random_message, write_raw
 
 Stamps = NDArray[np.int64]
