@@ -203,8 +203,6 @@ def _detections(definition: Definition, found: series.DetectionSeries) -> Iterat
                     "apriltag_msgs/msg/AprilTagDetection",
                     family=str(found.family[k]),
                     id=int(found.tag_id[k]),
-                    hamming=int(found.hamming[k]),
-                    decision_margin=float(found.decision_margin[k]),
                     corners=corners,
                 )
             )

@@ -200,15 +200,13 @@ class DetectionSeries:
     """AprilTags found in pictures: M detections in N pictures.
 
     t_ns (N,) stamps of the pictures, frame (M,) index of the picture, tag_id (M,), corners (M, 4, 2) px in the order of
-    the AprilTag library, hamming (M,), decision_margin (M,), family (M,).
+    the AprilTag library, family (M,).
     """
 
     t_ns: Stamps
     frame: NDArray[np.int64]
     tag_id: NDArray[np.int64]
     corners: Array
-    hamming: NDArray[np.int64]
-    decision_margin: Array
     family: NDArray[np.str_]
     stamped_by_log: int = 0
     frame_id: str = ""

@@ -56,23 +56,20 @@ def _file(message: DecodedMessage, is_raw: bool) -> tuple[int | None, str, bytes
 def tag_detections(messages: Iterable[DecodedMessage]) -> series.DetectionSeries:
     """Detections of apriltag_msgs/AprilTagDetectionArray messages, with corners as points or as plain numbers."""
     stamps: list[tuple[int, bool]] = []
-    rows: list[tuple[int, int, Any, int, float, str]] = []
+    rows: list[tuple[int, int, Any, str]] = []
     for i, message in enumerate(message for message in messages if not message.left_out):
         stamps.append((message.t_ns, message.from_log_time))
         numbers = message.definition.numbers
         for found in message.content.detections:
             # (x, y) or (x, y, z) of each
             xy = numbers(found.corners).reshape(4, -1)[:, :2]
-            quality = int(found.hamming), float(found.decision_margin), found.family
-            rows.append((i, int(numbers(found.id)[0]), xy, *quality))
-    frame, tag_id, corners, hamming, margin, family = ([row[k] for row in rows] for k in range(6))
+            rows.append((i, int(numbers(found.id)[0]), xy, found.family))
+    frame, tag_id, corners, family = ([row[k] for row in rows] for k in range(4))
     return series.DetectionSeries(
         np.array([t_ns for t_ns, _ in stamps], dtype=np.int64),
         np.array(frame, dtype=np.int64),
         np.array(tag_id, dtype=np.int64),
         np.array(corners, dtype=float).reshape(-1, 4, 2),
-        np.array(hamming, dtype=np.int64),
-        np.array(margin, dtype=float),
         np.array(family, dtype=np.str_),
         sum(from_log for _, from_log in stamps),
     )

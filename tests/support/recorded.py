@@ -52,8 +52,6 @@ def session(n: int = 2000) -> dict[str, series.Topic]:
             frames,
             rng.integers(0, 500, count),
             rng.normal(size=(count, 4, 2)),
-            np.zeros(count, dtype=np.int64),
-            np.float32(rng.normal(size=count)).astype(float),
             np.full(count, "tag36h11"),
         ),
     }

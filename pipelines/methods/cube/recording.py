@@ -343,9 +343,6 @@ def _pictures_or_tags(seen: Sightings, epoch_ns: int, pictures: Iterable[bytes] 
     t_ns = nanoseconds(seen.t, epoch_ns)
     if pictures is not None:
         return {IMAGE.name: series.ImageSeries(t_ns, pictures, format="jpeg", frame_id="camera")}
-    m = len(seen.ids)
-    zero = np.zeros(m, dtype=np.int64)
-    found = series.DetectionSeries(
-        t_ns, seen.frame, seen.ids, seen.corners, zero, np.zeros(m), np.full(m, "tag36h11"), frame_id="camera"
-    )
+    family = np.full(len(seen.ids), "tag36h11")
+    found = series.DetectionSeries(t_ns, seen.frame, seen.ids, seen.corners, family, frame_id="camera")
     return {TAG_DETECTIONS.name: found}
