@@ -159,14 +159,12 @@ class FixSeries(Series):
         "latitude_deg": Column("latitude", ()),
         "longitude_deg": Column("longitude", ()),
         "height": Column("altitude", ()),
-        "cov": Column("position_covariance", (3, 3)),
         "status": Column("status.status", ()),
     }
 
     latitude_deg: Array
     longitude_deg: Array
     height: Array = _FILLED_IN
-    cov: Array = _FILLED_IN
     status: Array = _FILLED_IN
 
 
