@@ -25,7 +25,7 @@ from alidade.pipelines.recording.message_tables import message_tables
 from alidade.pipelines.recording.messages import IMU
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.table_topics import TableTopic, tables_of
+from alidade.pipelines.recording.table_topics import Table, TableTopic, tables_of
 from alidade.pipelines.recording.table_values import (
     COMPATIBLE,
     TIME_NAME,
@@ -36,7 +36,7 @@ from alidade.pipelines.recording.table_values import (
     unit_named,
     unit_of,
 )
-from alidade.pipelines.recording.tables import Table, numbers
+from alidade.pipelines.recording.tables import numbers
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
 

@@ -26,7 +26,7 @@ from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, MultiPartContainer
 from alidade.pipelines.recording.images import VideoFile
-from alidade.pipelines.recording.message_tables import WithTables, message_tables
+from alidade.pipelines.recording.message_tables import MessageTable, WithTables, message_tables
 from alidade.pipelines.recording.table_values import (
     COMPATIBLE,
     TIME_UNITS,
@@ -36,9 +36,11 @@ from alidade.pipelines.recording.table_values import (
     of_rate,
     unit_of,
 )
-from alidade.pipelines.recording.tables import CsvFile, Table, TableHead, numbers, numbers_or_times
+from alidade.pipelines.recording.tables import CsvFile, TableHead, numbers, numbers_or_times
 from alidade.pipelines.recording.topics import Axes, along
 
+# Rows of named columns: a text file, or the messages of a topic.
+Table = CsvFile | MessageTable
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _ThreeOrNone = Annotated[tuple[str | None, str | None, str | None], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]

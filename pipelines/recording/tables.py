@@ -15,12 +15,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array, Stamps
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
@@ -99,21 +98,6 @@ class TableForm(TableHead):
     decimal: str
     first: int
     width: int
-
-
-class Table(Protocol):
-    """Rows of named columns: a text file, or the messages of a topic."""
-
-    @property
-    def name(self) -> str:
-        """Name by which `file`, under `columns:` in the config, chooses the table."""
-
-    @property
-    def form(self) -> TableHead:
-        """Names and units of the columns."""
-
-    def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], Stamps | None]:
-        """Return the named columns as texts, a sentence about each kind of row left out, log times if there are any."""
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
