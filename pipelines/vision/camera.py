@@ -25,24 +25,12 @@ if TYPE_CHECKING:
 # Number of coefficients that each distortion model may come with; missing ones are zero.
 _COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 4, 5, 8), "equidistant": (0, 4)}
 # Other names of the same formulas, lower case: Kalibr, older ROS calibrators, RealSense, drivers.
+_PLUMB_BOB = ("", "none", "pinhole", "plumb bob", "radtan", "radial-tangential", "radial_tangential")
+_FISHEYE = ("fisheye", "equi", "kannala_brandt", "kannala_brandt4", "kannala_brandt8", "opencv_fisheye")
 _SYNONYMS = {
-    "": "plumb_bob",
-    "none": "plumb_bob",
-    "pinhole": "plumb_bob",
-    "plumb bob": "plumb_bob",
-    "radtan": "plumb_bob",
-    "radial-tangential": "plumb_bob",
-    "radial_tangential": "plumb_bob",
-    "brown_conrady": "plumb_bob",
-    "brown-conrady": "plumb_bob",
-    "opencv": "plumb_bob",
+    **dict.fromkeys((*_PLUMB_BOB, "brown_conrady", "brown-conrady", "opencv"), "plumb_bob"),
     "rational": "rational_polynomial",
-    "fisheye": "equidistant",
-    "equi": "equidistant",
-    "kannala_brandt": "equidistant",
-    "kannala_brandt4": "equidistant",
-    "kannala_brandt8": "equidistant",
-    "opencv_fisheye": "equidistant",
+    **dict.fromkeys(_FISHEYE, "equidistant"),
 }
 _RATIONAL = "; eight are those of rational_polynomial"
 # What to do about another model.
