@@ -5,7 +5,7 @@ the next chunk, and notes a `DataLoss`; only positions stay in memory. The summa
 checksum holds: it repeats the definitions and states the number of messages.
 
 The message index after a chunk states which channels the chunk holds and where. It is outside every checksum, so it is
-used only where it names every message of the chunk; otherwise the chunk is searched.
+used only where it names every record of the chunk; otherwise the chunk is searched.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ class McapFile(Container):
     def _locate(
         self, stream: BinaryIO, block: Block, buffer: NDArray[np.uint8]
     ) -> tuple[dict[int, NDArray[np.int64]], list[tuple[int, bytes]]]:
-        """Return channel -> offsets of its messages in the buffer, and other records if the index is not complete."""
+        """Return channel -> offsets of its messages in the buffer, and the other records."""
         index = {}
         for number, at in block.index_offsets.items():
             stream.seek(at)
@@ -204,8 +204,6 @@ class McapFile(Container):
         try:
             buffer = self._load(stream, block)
             offsets, others = self._locate(stream, block, buffer)
-            if block.index_offsets and not block.index_offsets.keys() <= self.channels.keys():
-                _, others = records.locate_messages(buffer)
             for opcode, record in others:
                 self._define(opcode, record)
         except DamagedError as damaged:
