@@ -179,13 +179,10 @@ class TagBody:
 
     @classmethod
     def from_board(cls, board: Board) -> TagBody:
-        """Build the body from a config's `tags`. Raises InputError: no tags, or one without a size."""
+        """Build the body from a config's `tags`. Raises InputError without tags."""
         tags = sorted(board.tags.items())
         if not tags:
             raise InputError("config: no tags are given; name them as {id: {size, rotation, position}}")
-        for i, tag in tags:
-            if not tag.size > 0:
-                raise InputError(f"config: size of tag {i} is {tag.size}; it must be the black square's edge in m")
         return cls(
             ids=np.array([i for i, _ in tags], dtype=np.int64),
             size=np.array([tag.size for _, tag in tags], dtype=float),

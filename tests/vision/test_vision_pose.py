@@ -166,9 +166,6 @@ def test_bodies_from_the_config() -> None:
     np.testing.assert_allclose(body.corners[0], expected, atol=1e-15)
     with pytest.raises(InputError, match="no tags"):
         TagBody.from_board(SimpleNamespace(tag_family="36h11", tags={}))  # type: ignore[arg-type]
-    tag.size = 0.0
-    with pytest.raises(InputError, match="tag 17"):
-        TagBody.from_board(SimpleNamespace(tag_family="36h11", tags={17: tag}))  # type: ignore[arg-type]
 
 
 RATIONAL = Camera(1280, 960, K, "rational_polynomial", np.array([-0.2, 0.1, 1e-3, -5e-4, 0.02, 0.02, 0.01, 1e-3]))
