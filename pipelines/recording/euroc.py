@@ -65,8 +65,7 @@ def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, seri
         )
         return {name: imu}
     if len(chosen("q")) == 4:
-        position = of("p") if len(chosen("p")) == 3 else None
-        return {name: series.PoseSeries(t_ns, of("q"), np.zeros(3) if position is None else position)}
+        return {name: series.PoseSeries(t_ns, of("q"), of("p") if len(chosen("p")) == 3 else np.zeros(3))}
     if "filename" in names:
         files = [table.parent / "data" / Path(file).name for file in columns["filename"].tolist()]
         form = files[0].suffix.lstrip(".") if files else ""

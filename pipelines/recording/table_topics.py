@@ -169,7 +169,8 @@ class TableTopic(BaseModel):
         log_ns = None if logged is None else logged[rows][filled]
         if log_ns is None:
             t_ns, values = _without_erased(path, t_ns, values, notes)
-        if not self._is_slow and self.time is not None:
+        is_slow = any(getattr(self, name) is not None for name in _SLOW)
+        if not is_slow and self.time is not None:
             check_steps(path, topic, t_ns, unit, SLOWEST_GYRO_S if self.gyro else SLOWEST_S)
         scales = {name: self._scale(name, form, notes) for name in values}
         values = {
@@ -202,10 +203,6 @@ class TableTopic(BaseModel):
     def _given(self) -> dict[str, list[str]]:
         """Quantity -> names of its columns."""
         return {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
-
-    @property
-    def _is_slow(self) -> bool:
-        return any(getattr(self, name) is not None for name in _SLOW)
 
     def _rows(self, path: Path, columns: Mapping[str, NDArray[np.str_]]) -> NDArray[np.bool_]:
         """Mask of the rows that have the values of `where`. Raises InputError where no row has them."""
