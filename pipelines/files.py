@@ -103,6 +103,13 @@ def dump_yaml(content: object, width: int = 80, is_sorted: bool = True) -> str:
     return text.getvalue()
 
 
+def plain_json(kind: str, content: Mapping[str, Any]) -> str:
+    """JSON text of a command's result, SI, under its schema `alidade.<kind>/1`; null where a number is not finite."""
+    from pydantic_core import to_json
+
+    return to_json({"schema": f"alidade.{kind}/1", **content}, indent=1, inf_nan_mode="null").decode()
+
+
 def yaml_float(value: float) -> str:
     """Return a float as YAML 1.1 reads it as one: 5.0e-05, since 5e-05 is a string there."""
     text = repr(value)

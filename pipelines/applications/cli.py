@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 
 from alidade.pipelines import deadline, errors, parallel, progress
 from alidade.pipelines.errors import InputError, nearest_three, printable
-from alidade.pipelines.files import require_room, write_file, write_whole
+from alidade.pipelines.files import plain_json, require_room, write_file, write_whole
 from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
@@ -364,8 +364,7 @@ def validate(
     """
     from alidade.pipelines.applications.validate import validate as run
     from alidade.pipelines.reports.html import render_html
-    from alidade.pipelines.reports.plain_json import validation_json
-    from alidade.pipelines.reports.validation_report import validation_report
+    from alidade.pipelines.reports.validation_report import validation_json, validation_report
 
     folder = out or _default_folder(session, "validation")
     require_room(folder)
@@ -414,7 +413,6 @@ def scenarios(
     from alidade.pipelines import methods
     from alidade.pipelines.display.table import Column, Table
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.plain_json import plain_json
     from alidade.pipelines.simulation.scenario import summary
 
     known = methods.scenarios()
@@ -455,8 +453,7 @@ def plan(
     from alidade.pipelines.applications.planning import plan as planned_motion
     from alidade.pipelines.applications.planning import requirements
     from alidade.pipelines.reports.html import render_html
-    from alidade.pipelines.reports.plain_json import plan_json
-    from alidade.pipelines.reports.plan_report import plan_report
+    from alidade.pipelines.reports.plan_report import plan_json, plan_report
 
     with progress.shown(quiet or as_json):
         planned = planned_motion(method, scenario, config=config, require=requirements(require or []))
@@ -489,7 +486,6 @@ def info(
     from alidade.pipelines.config import configured
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.plain_json import facts_json
 
     with progress.shown(quiet), progress.doing("reading"):
         recording, settings = configured(open_recording(session, strict), config)
@@ -499,7 +495,7 @@ def info(
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
-        print(facts_json(facts, found, left, columns))
+        print(terminal.facts_json(facts, found, left, columns))
     else:
         terminal.print_facts(session.name, facts, found, left, columns)
 
@@ -644,7 +640,6 @@ def export(
     """
     from alidade.pipelines.reports.calibration import load_calibration
     from alidade.pipelines.reports.export_formats import export as exported
-    from alidade.pipelines.reports.plain_json import plain_json
 
     saved = load_calibration(calibration)
     text = exported(saved, form)
@@ -677,7 +672,7 @@ def apply(
     Gyro, accelerometer, magnetometer: /imu/data becomes /imu/data_calibrated beside it.
     """
     from alidade.pipelines.applications.apply import apply as run
-    from alidade.pipelines.reports.plain_json import applied_json
+    from alidade.pipelines.reports.terminal import applied_json
 
     with progress.shown(quiet or as_json):
         applied = run(

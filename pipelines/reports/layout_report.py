@@ -12,7 +12,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.display.figure import COLORS, Figure, Plot
 from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.display.units import to_digits_of
-from alidade.pipelines.reports.plain_json import plain_json
+from alidade.pipelines.files import plain_json
 from alidade.pipelines.reports.report import Block, Bullets, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.sentences import capital
 

@@ -15,7 +15,7 @@ from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
 from alidade.pipelines.display.figure import AXES, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import significant
-from alidade.pipelines.reports.plain_json import plain_json
+from alidade.pipelines.files import plain_json
 from alidade.pipelines.reports.report import Bullets, Code, Plots, Report, Section, Summary
 from alidade.pipelines.reports.result import software_versions
 

@@ -8,15 +8,54 @@ from alidade.pipelines import methods
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, rounded
+from alidade.pipelines.files import plain_json
 from alidade.pipelines.reports.calibration_report import direction_blocks
 from alidade.pipelines.reports.report import Code, Plots, Report, Section, Summary, Text
-from alidade.pipelines.reports.sentences import capital, limits
+from alidade.pipelines.reports.sentences import capital, label, limits
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.planning import Plan
 
 # Bars of the plot end at so many times the requirement.
 _MAX_RATIO = 3.0
+
+
+def plan_json(plan: Plan) -> str:
+    """JSON of `plan`: predicted sigmas now and with all changes, with their budget; what is missing; changes."""
+    now, best = plan.now, plan.best
+    return plain_json(
+        "plan",
+        {
+            "method": plan.method,
+            "status": now.status,
+            "duration_s": now.duration,
+            "parameters": [
+                {
+                    "name": q.name,
+                    "unit": q.unit,
+                    "require": q.require,
+                    "sigma": now.sigmas[q.name],
+                    "sigma_with_changes": best.sigmas[q.name],
+                    "verdict": now.verdicts[q.name],
+                    "budget": dict(best.budget.get(q.name, {})),
+                }
+                for q in now.quantities
+                if q.judged
+            ],
+            "directions": [
+                {
+                    "verdict": d.severity.name.lower(),
+                    "label": label(d.evidence["weights"]),
+                    "advice": d.evidence["advice"],
+                }
+                for d in now.directions
+            ],
+            "changes": [{"change": step.change, "gain": step.gain} for step in plan.steps],
+            "missing": now.missing,
+            "missing_with_changes": best.missing,
+            "scenario": plan.scenario_text,
+        },
+    )
 
 
 def plan_report(plan: Plan) -> Report:

@@ -1,10 +1,11 @@
-"""Reports in a terminal: tables whose cells are never broken, sentences, and what is to be copied last."""
+"""Reports in a terminal: tables whose cells are never broken, sentences, last what is to be copied; facts as JSON."""
 
 from __future__ import annotations
 
 import re
 import textwrap
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Literal
 
 from rich.box import SIMPLE_HEAD
@@ -16,9 +17,11 @@ from rich.text import Text as RichText
 
 from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import printable
+from alidade.pipelines.files import plain_json
 from alidade.pipelines.reports.report import Block, Bullets, Card, Code, Details, Heading, Report, Tables, Text, Tiles
 
 if TYPE_CHECKING:
+    from alidade.pipelines.applications.apply import Applied
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.recording.topics import SessionFacts
@@ -242,3 +245,44 @@ def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
     for method, missing in facts.missing.items():
         if missing and method not in whole:
             _paragraph(f"{method}: missing {_TYPE.sub('', '; '.join(missing))}")
+
+
+def facts_json(
+    facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str], columns: Columns | None = None
+) -> str:
+    """JSON of `info`: the facts, and what each method has, lacks and could use."""
+    suggested = {suggestion.method: suggestion for suggestion in found}
+    content = asdict(facts)
+    proposed = content.pop("proposed")
+    content["methods"] = {
+        name: {
+            "served": not missing,
+            "missing": missing,
+            "proposed": proposed.get(name, ()),
+            "suggested": {key: source.model_dump() for key, source in suggested[name].topics.items()}
+            if name in suggested
+            else {},
+            "reasons": suggested[name].reasons if name in suggested else (),
+            "still_missing": suggested[name].missing if name in suggested else missing,
+        }
+        for name, missing in content.pop("missing").items()
+    }
+    if columns is not None:
+        tables = {topic: table.model_dump(exclude_defaults=True) for topic, table in columns.columns.items()}
+        content["columns"] = {"columns": tables, "reasons": list(columns.reasons), "doubts": list(columns.doubts)}
+    return plain_json("info", content | {"unused": list(unused)})
+
+
+def applied_json(applied: Applied) -> str:
+    """JSON of `apply`: the file, its corrected topics, notes."""
+    topics = [
+        {
+            "name": topic.name,
+            "recorded": topic.recorded,
+            "sensors": topic.sensors,
+            "messages": len(topic.messages),
+            "frame_id": topic.messages.frame_id,
+        }
+        for topic in applied.topics
+    ]
+    return plain_json("applied", {"file": str(applied.path), "topics": topics, "notes": applied.notes})

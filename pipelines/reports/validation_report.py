@@ -12,6 +12,7 @@ from alidade.pipelines.diagnostics.cross_validation import Validation, peak, rms
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Interval, Table
 from alidade.pipelines.display.units import human_unit, minute, significant, to_digits_of
+from alidade.pipelines.files import plain_json
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
 from alidade.pipelines.reports.sentences import capital
@@ -35,6 +36,35 @@ _ANSWERS: Mapping[str, tuple[str, Tone, tuple[str, ...]]] = {
     "unknown": ("cannot say", "warn", ("Record a motion as for a calibration, so that the parameters can be seen.",)),
     "same": ("cannot say", "fixed", ("Validate on another recording of the device.",)),
 }
+
+
+def validation_json(validated: Validated) -> str:
+    """JSON of `validate`: the verdict, what changed, and RMS and peak of every kind of error, before and after."""
+    others = {"device": {v.name: v for v in validated.device}, "expected": {v.name: v for v in validated.best}}
+    found = validated.held.changes.found if validated.held else ()
+    return plain_json(
+        "validation",
+        {
+            "recording": validated.recording,
+            "method": validated.calibration.method,
+            "verdict": validated.verdict,
+            "headline": validated.sentence,
+            "parameters": [
+                {"name": s.name, "change": s.size, "sigma": s.sigma, "changed": s in found}
+                for s in (validated.held.steps if validated.held else ())
+            ],
+            "validations": [
+                {"name": v.name, "unit": v.unit}
+                | {
+                    size.__name__: {"before": size(v.before), "after": size(v.after)}  # both of lengths of errors
+                    | {what: size(each[v.name].after) for what, each in others.items() if v.name in each}
+                    for size in (rms, peak)
+                }
+                for v in validated.validations
+            ],
+            "notes": validated.notes,
+        },
+    )
 
 
 def validation_report(validated: Validated) -> Report:

@@ -20,8 +20,7 @@ from alidade.pipelines.methods.cube.simulation import CubeScenario, Resting, Sid
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.reports.html import render_html
-from alidade.pipelines.reports.plain_json import plan_json
-from alidade.pipelines.reports.plan_report import plan_report
+from alidade.pipelines.reports.plan_report import plan_json, plan_report
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing

@@ -41,11 +41,10 @@ from alidade.pipelines.applications.fleet.store import (
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import as_date, load_yaml, write_whole
+from alidade.pipelines.files import as_date, load_yaml, plain_json, write_whole
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.reports.calibration import load_known
-from alidade.pipelines.reports.plain_json import plain_json
 
 if TYPE_CHECKING:
     from alidade.pipelines.estimation.problem import SqrtInformation

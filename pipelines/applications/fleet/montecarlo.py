@@ -34,8 +34,7 @@ from alidade.pipelines.applications.fleet.store import (
     settings_key,
 )
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import write_whole
-from alidade.pipelines.reports.plain_json import plain_json
+from alidade.pipelines.files import plain_json, write_whole
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
