@@ -1,12 +1,18 @@
-"""Pictures of motions, for the person who holds the device: SVG, drawn from the data of a motion.
+"""Pictures of motions, for the person who holds the device, and of frames: SVG, drawn from numbers.
 
 Lines have the colour of the text around them; what moves or matters has the accent: the page's
 CSS variable --accent; its --paper is what is behind.
+
+The sketch of a method's frames is an SVG file. Where it has `<g class="found" data-turn="M" data-x="12" data-y="34">`,
+the axes of the child of that transform of calibration.yaml are drawn dashed from that point, where the parent's are,
+enlarged where they would not show. With `data-axes="camera"` the parent is drawn as a camera, z forward.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from html import escape
 
@@ -14,6 +20,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.array import Array
+from alidade.pipelines.display.units import rounded
 
 # Where the eye is: of the world behind, to the right and above; of a body's axes where all three come towards it.
 BEHIND, _BEFORE = (0.42, -0.78, 0.46), (0.72, 0.5, 0.48)
@@ -25,6 +32,17 @@ _NAMES = "xyz"
 _NEAR = np.deg2rad(30.0)
 # Directions closer together than this are drawn as one, rad.
 _SAME = np.deg2rad(6.0)
+# Where x, y, z of a frame point in a sketch, as columns, and how long they are, px.
+_DIRECTIONS = {
+    "body": np.array([[-0.52, 0.95, 0.0], [0.42, 0.10, -1.0]]),
+    "camera": np.array([[0.95, 0.0, -0.52], [0.10, 1.0, 0.42]]),
+}
+_LENGTH = 62.0
+# What rounding leaves of a mount that is fixed straight, rad.
+_NOTHING = 1e-9
+# A turn of less than this, rad, is drawn so many times as large.
+_SMALL, _ENLARGED = math.radians(3.0), 10.0
+_PLACE = re.compile(r'<g class="found" data-turn="(\w+)" data-x="(\d+)" data-y="(\d+)"(?: data-axes="(\w+)")?>')
 
 
 class Drawing:
@@ -217,6 +235,38 @@ def covered(directions: Array, what: str) -> str:
     )
 
 
+def sketch_with(svg: str, turns: Mapping[str, Array]) -> str:
+    """Return a sketch with rotation vectors (3,), rad, drawn in their places, by name; other places are unchanged."""
+
+    def drawn(match: re.Match[str]) -> str:
+        if match[1] not in turns:
+            return match[0]
+        turn = turns[match[1]] * (_ENLARGED if _is_enlarged(turns[match[1]]) else 1.0)
+        ends = _LENGTH * (_DIRECTIONS[match[4] or "body"] @ so3.matrix(so3.exp(turn)))
+        lines = "".join(
+            f'<path d="M{match[2]} {match[3]}l{x:.1f} {y:.1f}" stroke="var(--{axis})" stroke-width="2" '
+            'stroke-dasharray="3 3" fill="none"/>'
+            for axis, (x, y) in zip(_NAMES, ends.T, strict=True)
+        )
+        return f"{match[0]}<g>{lines}</g>"
+
+    return _PLACE.sub(drawn, svg)
+
+
+def rotation_text(turn: Array) -> str:
+    """Return a rotation vector (3,), rad, as text: the angle, the vector, and whether it is drawn larger than it is."""
+    angle = float(np.linalg.norm(turn))
+    if angle < _NOTHING:
+        return "not turned"
+    numbers = ", ".join(rounded(float(v), 3) for v in np.rad2deg(turn))
+    scale = "; drawn ten times as large" if _is_enlarged(turn) else ""
+    return f"{rounded(math.degrees(angle), 3)} deg, rotation vector [{numbers}] deg{scale}"
+
+
+def _is_enlarged(turn: Array) -> bool:
+    return bool(_NOTHING < np.linalg.norm(turn) < _SMALL)
+
+
 def _side(out: Drawing, nRb: Array, normal: Array, name: str, lit: bool) -> None:
     """Draw a side of a cube in the attitude nRb (4,), with its name as upright as possible."""
     edges = so3.rotate(nRb, np.delete(_AXES, _NAMES.index(name[1]), axis=0))
@@ -228,19 +278,15 @@ def _side(out: Drawing, nRb: Array, normal: Array, name: str, lit: bool) -> None
 
 def _block_with_axes(out: Drawing, half: Array, lit: str = "") -> None:
     """Draw a block with its three axes as arrows towards the eye; lit axes have arrows of rotation both ways."""
-
-    def draw(k: int) -> None:
-        axis, is_lit = _AXES[k], _NAMES[k] in lit
-        end = half[k] + (1.0 if is_lit else 0.6)
-        out.line([half[k] * axis, end * axis], is_lit, 3.0 if is_lit else 1.5, "end")
-        out.word((end + 0.28) * axis, _NAMES[k], is_lit, 17.0)
-        if is_lit:
-            out.arc(axis, (half[k] + 0.55) * axis, 0.38, (-130.0, 130.0), "start end")
-
     for k in range(3):
         corners = np.full((4, 3), half[k])
         for column, signs in zip(((k + 1) % 3, (k + 2) % 3), ((1, 1, -1, -1), (1, -1, -1, 1)), strict=True):
             corners[:, column] = half[column] * np.array(signs)
         out.face(corners)
-    for k in range(3):
-        draw(k)
+    for k, axis in enumerate(_AXES):
+        is_lit = _NAMES[k] in lit
+        end = half[k] + (1.0 if is_lit else 0.6)
+        out.line([half[k] * axis, end * axis], is_lit, 3.0 if is_lit else 1.5, "end")
+        out.word((end + 0.28) * axis, _NAMES[k], is_lit, 17.0)
+        if is_lit:
+            out.arc(axis, (half[k] + 0.55) * axis, 0.38, (-130.0, 130.0), "start end")

@@ -76,7 +76,7 @@ class Method:
         proposed: recording, config -> config keys that the recording suggests, each with the reason.
         parameters: unit, default prior, accuracy wanted, data sheet and description of every parameter.
         simulator, guidance, report: see these classes.
-        frames: SVG of the frames for the report; `alidade.pipelines.reports.sketch` states what it may contain.
+        frames: SVG of the frames for the report; `alidade.pipelines.display.drawing` states what it may contain.
         fallback: chosen automatically only for recordings that no other method can use.
     """
 

@@ -6,9 +6,11 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
+from alidade.factors import so3
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import has_no_solution
 from alidade.pipelines.diagnostics.use import UseBands
+from alidade.pipelines.display.drawing import rotation_text, sketch_with
 from alidade.pipelines.display.figure import Dash, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Columns, Row, Table
 from alidade.pipelines.display.units import human_unit, noise_unit, rounded, signed, to_digits_of
@@ -56,7 +58,6 @@ from alidade.pipelines.reports.results_table import (
     result_table,
 )
 from alidade.pipelines.reports.sentences import limits
-from alidade.pipelines.reports.sketch import enlarged, rotation_text, sketch_with
 from alidade.pipelines.reports.snippets import c_code, python_code
 
 # Effects of fixed inputs that are named: the smallest, in sigmas of the parameter, and how many.
@@ -383,16 +384,15 @@ def _frames(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     if c.method.frames is None:
         return ()
     svg = c.method.frames.read_text(encoding="utf-8")
-    shown = {name: each for name, each in file.transforms.items() if f'data-turn="{name}"' in svg}
+    shown = {name: so3.log(each.wxyz) for name, each in file.transforms.items() if f'data-turn="{name}"' in svg}
     drawing = Svg(sketch_with(svg, shown))
     if not shown:
         return (Card((drawing,), style="sketch"),)
-    lines = tuple(
-        f"{name}, {each.child} to {each.parent}: {rotation_text(each)}"
-        f"{'; drawn ten times as large' if enlarged(each) else ''}"
-        for name, each in shown.items()
+    lines = (
+        f"{name}, {file.transforms[name].child} to {file.transforms[name].parent}: {rotation_text(turn)}"
+        for name, turn in shown.items()
     )
-    return (Card((drawing, Bullets(lines), Text("Dashed: the axes as estimated.")), style="sketch"),)
+    return (Card((drawing, Bullets(tuple(lines)), Text("Dashed: the axes as estimated.")), style="sketch"),)
 
 
 def _parameters(c: Calibration, nuisance: bool = False) -> tuple[Block, ...]:
