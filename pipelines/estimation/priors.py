@@ -110,13 +110,7 @@ def rotation_prior(parameter: Parameter) -> Factor:
 def vector_about(key: int, mean: Array, sigmas: Array | float, family: str = "prior") -> Factor:
     """Prior on a vector variable (d,) about `mean`, with sigmas in its own units."""
     R = np.diag(1.0 / np.broadcast_to(np.asarray(sigmas, dtype=float), mean.shape))
-    return gaussian_about(key, mean, R, family)
-
-
-def gaussian_about(key: int, mean: Array, sqrt_information: Array, family: str = "prior") -> Factor:
-    """Prior on a vector variable (d,) about `mean`, with square-root information (m, d)."""
-    model = LinearModel(np.zeros(1), (sqrt_information @ mean)[None], sqrt_information[None])
-    return Factor.process_of(family, model.on(key))
+    return Factor.process_of(family, LinearModel(np.zeros(1), (R @ mean)[None], R[None]).on(key))
 
 
 def rotation_about(key: int, mean: Array, sqrt_information: Array, family: str = "prior") -> Factor:

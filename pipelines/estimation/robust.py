@@ -25,33 +25,22 @@ def fitted(
     """Iterate robust least-squares steps until convergence; return x (m,) and its covariance (m, m).
 
     Args:
-        near: what misses, as `improved` has it, near some x.
+        near: what misses (n, d), as a function of x near some x.
         x: where it begins.
-        prior, sigma: as `improved` has them.
+        prior: (m,) inverse sigmas of x about zero.
+        sigma: the least that what misses is taken to scatter by.
         most: steps.
     """
     for _ in range(most):
-        before = x
-        x, covariance = improved(near(x), x, prior, sigma)
-        if (np.abs(x - before) < _SETTLED * np.sqrt(np.diag(covariance))).all():
+        miss = near(x)
+        error = miss(x)
+        size = np.linalg.norm(error, axis=1)
+        scale = max(float(np.median(size)), sigma)
+        weight = 1.0 / (scale * np.sqrt(1.0 + (size / (3.0 * scale)) ** 2))[:, None]
+        columns = [(weight * (miss(x + d) - error)).ravel() / _STEP for d in _STEP * np.eye(len(x))]
+        A = np.vstack([np.stack(columns, axis=1), np.diag(prior)])
+        step = np.linalg.lstsq(A, np.concatenate([(weight * error).ravel(), prior * x]))[0]
+        x, covariance = x - step, np.linalg.inv(A.T @ A)
+        if (np.abs(step) < _SETTLED * np.sqrt(np.diag(covariance))).all():
             break
     return x, covariance
-
-
-def improved(miss: Callable[[Array], Array], x: Array, prior: Array, sigma: float) -> tuple[Array, Array]:
-    """Improve x (m,) by one robust least-squares step; return x and its covariance (m, m).
-
-    Args:
-        miss: what misses (n, d) at some x.
-        x: where it is linearised.
-        prior: (m,) inverse sigmas of x about zero.
-        sigma: the least that what misses is taken to scatter by.
-    """
-    error = miss(x)
-    size = np.linalg.norm(error, axis=1)
-    scale = max(float(np.median(size)), sigma)
-    weight = 1.0 / (scale * np.sqrt(1.0 + (size / (3.0 * scale)) ** 2))[:, None]
-    columns = [(weight * (miss(x + d) - error)).ravel() / _STEP for d in _STEP * np.eye(len(x))]
-    A = np.vstack([np.stack(columns, axis=1), np.diag(prior)])
-    x = x - np.linalg.lstsq(A, np.concatenate([(weight * error).ravel(), prior * x]))[0]
-    return x, np.linalg.inv(A.T @ A)
