@@ -15,7 +15,7 @@ from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.display.figure import AXES, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameter_problem import parameter_problem
 from alidade.pipelines.estimation.parameters import ParameterSpec, scalar

@@ -12,7 +12,7 @@ import numpy as np
 from alidade.factors.array import Array
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.display.figure import AXES
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 
 # A turn within this time, s, counts as motion about an axis.
 _STRETCH = 5.0

@@ -12,8 +12,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from alidade.factors.array import Array, Index
-from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.finding import Finding, Motion, Severity
 from alidade.pipelines.estimation.problem import CommonFactor, History, Quantity
 
 Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]

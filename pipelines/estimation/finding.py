@@ -1,6 +1,7 @@
-"""Findings: what a reader must know before using an estimate, as numbers; `reports/sentences.py` puts them in words.
+"""Findings: what a reader must know before using an estimate, as numbers, and motions that would improve it.
 
-The status of a result is that of its most severe finding. All values are SI; sigmas are one standard deviation.
+`reports/sentences.py` puts findings in words. The status of a result is that of its most severe finding. All values are
+SI; sigmas are one standard deviation.
 """
 
 from __future__ import annotations
@@ -86,3 +87,23 @@ def status(findings: Iterable[Finding]) -> Status:
     """Status of a result: that of its most severe finding."""
     statuses: tuple[Status, ...] = ("calibrated", "weak", "inconsistent", "unobservable")
     return statuses[max((finding.severity for finding in findings), default=Severity.NOTE)]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion of the device that would improve the recording.
+
+    Attributes:
+        words: a sentence, without its capital and its full stop.
+        picture: of it, SVG as `alidade.pipelines.display.drawing` draws it; empty: none.
+        why: what it is for; empty: that goes without saying.
+    """
+
+    words: str
+    picture: str = ""
+    why: str = ""
+
+    @property
+    def advice(self) -> str:
+        """Advice as a sentence: why, and which motion."""
+        return f"{self.why}: {self.words}" if self.why else self.words

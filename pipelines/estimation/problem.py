@@ -19,7 +19,7 @@ from alidade.factors import so3
 from alidade.factors.array import Array, Mask
 from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.gaussian_prior import GaussianPrior
 

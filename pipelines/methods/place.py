@@ -9,7 +9,7 @@ import numpy as np
 from alidade.factors.array import Array
 from alidade.factors.earth import magnetic_field
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.parameters import ParameterSpec, stated
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.recording import Recording

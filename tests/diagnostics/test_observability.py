@@ -11,7 +11,7 @@ from scipy import stats
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest
 from alidade.pipelines.diagnostics.observability import time_to_accuracy
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.problem import ChiSquare, History, Quantity, Residuals
 from tests.support.judged import Judged, judge
 

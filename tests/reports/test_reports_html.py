@@ -13,8 +13,7 @@ import alidade
 from alidade.factors import so3
 from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.display.units import human_unit, to_digits_of
-from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.finding import Finding, Motion, Severity
 from alidade.pipelines.estimation.problem import Attitudes, Parameter, Quantity, Residuals
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.head.recording import HeadData

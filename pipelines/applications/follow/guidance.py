@@ -15,8 +15,7 @@ from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.diagnose import misfits
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
-from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.finding import Finding, by_severity, status
+from alidade.pipelines.estimation.finding import Finding, Motion, by_severity, status
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.solvers.incremental import IncrementalSolver

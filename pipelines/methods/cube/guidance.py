@@ -15,7 +15,7 @@ from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.fault_models import ExactInput, FaultModel, ScaleFactor
 from alidade.pipelines.display.drawing import covered, resting, swaying
 from alidade.pipelines.display.figure import AXES
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData
 from alidade.pipelines.methods.cube.simulation import SIDES, CubeScenario, Resting, Side, attitudes

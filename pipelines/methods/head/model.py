@@ -22,9 +22,9 @@ from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
 from alidade.pipelines.estimation.error_map import ErrorMap
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import DEAD_BAND, acting

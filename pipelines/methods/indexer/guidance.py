@@ -14,7 +14,7 @@ from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.fault_models import ExactInput, FaultModel
 from alidade.pipelines.display.drawing import BEHIND, Drawing
 from alidade.pipelines.display.figure import AXES
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.windows import axis_motion

@@ -30,7 +30,7 @@ from alidade.factors.indexer import (
     mounting_angles,
 )
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about, vector_prior
 from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Parameter, Problem, Step

@@ -26,9 +26,9 @@ from alidade.factors.model import Model
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.through_gimbal import GimbalErrors, ThroughGimbalFactor
 from alidade.pipelines.display.drawing import swaying
-from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
 from alidade.pipelines.estimation.error_map import ErrorMap
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, as_slice
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import DEAD_BAND, acting

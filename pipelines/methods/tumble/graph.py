@@ -26,7 +26,7 @@ from alidade.factors.loss import TruncatedLoss
 from alidade.factors.turned import FieldFactor, UpFactor
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.gyro_chain import LAYOUT
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import SENSOR_NAMES

@@ -12,7 +12,7 @@ from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.display.drawing import along, covered, resting
 from alidade.pipelines.display.sphere_map import described, share_near, widest_gap
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.methods import Guidance, Scenario
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import TumbleData

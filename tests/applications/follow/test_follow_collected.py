@@ -14,7 +14,7 @@ from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.observability import weak_directions
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.cube.guidance import next_pose

@@ -33,7 +33,7 @@ from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.display.drawing import covered, swaying
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import simulate
 from tests.support.browser import DESKTOP, PHONE, needs_browser
