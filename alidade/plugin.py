@@ -17,8 +17,7 @@ from alidade.pipelines.display.table import Column, Table
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.parameter_problem import parameter_problem
-from alidade.pipelines.estimation.parameters import ParameterSpec, scalar
+from alidade.pipelines.estimation.parameters import ParameterSpec, parameter_problem, scalar
 from alidade.pipelines.estimation.problem import ChainLayout, Estimate, Factor, Parameter, Problem, Step
 from alidade.pipelines.methods import Correction, Guidance, Method, Report, Scenario, Simulator, deferred
 from alidade.pipelines.methods.formula import Formula, apply

@@ -12,13 +12,12 @@ from alidade.factors.array import Array
 from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import UNCHANGED, Advise, verdict, weak_directions
-from alidade.pipelines.estimation.disturbances import intervals
 from alidade.pipelines.estimation.error_map import UNIT
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import prior_z_scores
 from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate, Quantity
-from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.estimation.robust import intervals, robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
 # Kinds about the residuals, as opposed to priors and requirements.

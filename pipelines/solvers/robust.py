@@ -24,7 +24,7 @@ import numpy as np
 from alidade.factors.array import Array, Mask
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines import deadline
-from alidade.pipelines.estimation.disturbances import onsets
+from alidade.pipelines.estimation.robust import onsets
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import (

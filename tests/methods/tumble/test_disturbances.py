@@ -12,8 +12,8 @@ import pytest
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.diagnose import disturbances
-from alidade.pipelines.estimation.disturbances import onsets
 from alidade.pipelines.estimation.problem import Estimate, Residuals
+from alidade.pipelines.estimation.robust import onsets
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.tumble.simulation import TumbleScenario
 from alidade.pipelines.simulation.scenario import Simulated
