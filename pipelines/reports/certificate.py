@@ -133,7 +133,9 @@ def certificate(
     """
     path, earlier_path = Path(results), None if before is None else Path(before)
     path = path / "result.json" if path.is_dir() else path
-    result, stated = read_result(path), _read_fields(fields)
+    result = read_result(path)
+    given = None if fields is None else load_yaml(read_bytes(Path(fields), MAX_YAML_BYTES), str(fields))
+    stated = validated(Fields, given or {}, fields)
     if result.status in ("inconsistent", "unobservable"):
         raise InputError(f"{path}: is {result.status}, there is nothing to certify: {result.headline}")
     earlier = {} if earlier_path is None else load_known(earlier_path).of_method(result.method).values
@@ -154,11 +156,6 @@ def certificate(
         "certificate.json": json.dumps(content, indent=1, allow_nan=False) + "\n",
     }
     return write_whole(path.parent if out is None else Path(out), files), missing
-
-
-def _read_fields(path: str | Path | None) -> Fields:
-    content = None if path is None else load_yaml(read_bytes(Path(path), MAX_YAML_BYTES), str(path))
-    return validated(Fields, content or {}, path)
 
 
 def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[Row]:

@@ -55,6 +55,8 @@ if TYPE_CHECKING:
     from alidade.pipelines.reports.html import Page
 
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
+# An error in use below this, in the unit shown, is rounding: nothing that was estimated has to do with that use.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, repr=False)
@@ -155,7 +157,17 @@ class Calibration(SensorValues):
     @cached_property
     def uses(self) -> tuple[UseBands, ...]:
         """Uses of the calibration, with the error before and after it and the 95 % band; none without a solution."""
-        return () if has_no_solution(self.findings) else _uses_of(self)
+        solved = self.estimate.converged and np.isfinite(self.covariance).all()
+        if has_no_solution(self.findings) or not solved:
+            return ()
+        posterior, noise = posterior_of(self), {noise.name: noise.used for noise in self.noises}
+        known = {**self.problem.constants, **self.values}
+        true = Truth([*known], np.array([*known.values()]))
+        found = []
+        for use in self.method.report.uses(true, self.config, noise):
+            with suppress(KeyError):  # its formulas need what this graph has not got
+                found.append(use_bands(use, posterior))
+        return tuple(each for each in found if max(each.before, each.after) > _ROUNDING)
 
     def plot(self, name: str | None = None) -> Page:
         """The figures of the report, which a notebook shows: all, those of a use, or the plot with a title.
@@ -417,10 +429,6 @@ def software_versions() -> dict[str, str]:
     return versions
 
 
-# An error in use below this, in the unit shown, is rounding: nothing that was estimated has to do with that use.
-_ROUNDING = 1e-9
-
-
 class AppliedFormulas:
     """Formulas with values of parameters; parameters without a value count as zero."""
 
@@ -433,21 +441,6 @@ class AppliedFormulas:
         """Compute the formulas from measured arrays, at the first temperature."""
         found = results(self._formulas, self._all, {**measured, **self._first})
         return {name: value.array for name, value in found.items()}
-
-
-def _uses_of(calibration: Calibration) -> tuple[UseBands, ...]:
-    """Return the error bands of all uses of the method; none without a solution."""
-    c = calibration
-    if not c.estimate.converged or not np.isfinite(c.covariance).all():
-        return ()
-    posterior, noise = posterior_of(c), {noise.name: noise.used for noise in c.noises}
-    known = {**c.problem.constants, **c.values}
-    true = Truth([*known], np.array([*known.values()]))
-    found = []
-    for use in c.method.report.uses(true, c.config, noise):
-        with suppress(KeyError):  # its formulas need what this graph has not got
-            found.append(use_bands(use, posterior))
-    return tuple(each for each in found if max(each.before, each.after) > _ROUNDING)
 
 
 def posterior_of(c: Calibration) -> Posterior:

@@ -73,10 +73,7 @@ class ParameterResult(_Record):
 
 
 class NoiseResult(_Record):
-    """A noise in its unit: stated by whom, estimated from the recording with sigma (null: not asked), and used.
-
-    `inflation` is by what the sigma of a mean of its measurements is larger than if they were independent.
-    """
+    """A noise in its unit: stated by whom, estimated from the recording with sigma (null: not asked), and used."""
 
     name: str
     unit: str
@@ -172,13 +169,10 @@ class TruthResult(_Record):
 
 
 class SensitivityResult(_Record):
-    """Effect of a fixed input: parameter -> change, SI, per unit of the input.
-
-    `step` is what the input is usually off by, one sigma; unit "1" is a share of the input itself.
-    """
+    """Effect of a fixed input: parameter -> change, SI, per unit of the input."""
 
     unit: str  # of the input; 1: a share of itself
-    step: float  # what it is usually off by
+    step: float  # what it is usually off by, one sigma
     parameters: dict[str, float]  # parameter: change per unit, SI
 
 
@@ -216,12 +210,7 @@ class PartParameter(_Record):
 
 
 class PartResult(_Record):
-    """One recording of a joint calibration.
-
-    `parameters` are its own numbers, and the device's that walk, from all recordings; `alone` is what it says of the
-    device by itself, `status` and `headline` are its own. `dof` are the degrees of freedom of its noise estimate;
-    null where that was stated.
-    """
+    """One recording of a joint calibration; its status and headline are its own."""
 
     recording: str  # name of the file
     sha256: str
@@ -229,8 +218,8 @@ class PartResult(_Record):
     duration_s: float
     status: Status
     headline: str
-    dof: float | None  # of the noise estimate
-    parameters: list[PartParameter]  # its own, and the device's that walk
+    dof: float | None  # degrees of freedom of its noise estimate; null: that was stated
+    parameters: list[PartParameter]  # its own, and the device's that walk, from all recordings
     alone: list[PartParameter]  # what it says of the device by itself
 
 
