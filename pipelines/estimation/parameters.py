@@ -35,6 +35,7 @@ from alidade.pipelines.estimation.problem import (
     Quantity,
     Step,
     rotation_vector_coordinates,
+    vector_coordinates,
 )
 from alidade.pipelines.settings import Config, check_names
 
@@ -354,7 +355,7 @@ def parameter_problem(
         Parameter(
             int(gtsam.symbol("P", i)),
             quantities(spec, config),
-            **({"coordinates": rotation_vector_coordinates} if spec.rotation else {}),
+            rotation_vector_coordinates if spec.rotation else vector_coordinates,
         )
         for i, spec in enumerate(specs)
     )

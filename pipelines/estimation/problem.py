@@ -50,12 +50,6 @@ def vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
     return vector, np.eye(len(vector))
 
 
-def rotation_vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
-    """Coordinates of a Rot3 variable: its rotation vector, rad."""
-    phi = so3.log(so3.from_gtsam([values.atRot3(key)])[0])
-    return phi, so3.right_jacobian_inverse(phi)
-
-
 @dataclass(frozen=True)
 class NearRotationVector:
     """Coordinates of a Rot3 variable: its rotation vector nearest to a given one, modulo full turns, rad.
@@ -70,13 +64,16 @@ class NearRotationVector:
 
     def __call__(self, values: gtsam.Values, key: int) -> tuple[Array, Array]:
         """Rotation vector (3,), rad, and its Jacobian by the variable."""
-        phi, J = rotation_vector_coordinates(values, key)
+        phi = so3.log(so3.from_gtsam([values.atRot3(key)])[0])
         angle = float(np.linalg.norm(phi))
         turns = round((float(phi @ self.reference) / angle - angle) / (2.0 * np.pi)) if angle > 0.0 else 0
-        if turns == 0:
-            return phi, J
-        phi = phi * (1.0 + 2.0 * np.pi * turns / angle)
+        if turns != 0:
+            phi = phi * (1.0 + 2.0 * np.pi * turns / angle)
         return phi, so3.right_jacobian_inverse(phi)
+
+
+# Coordinates of a Rot3 variable: its rotation vector, of at most half a turn, rad.
+rotation_vector_coordinates = NearRotationVector((0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -182,7 +179,7 @@ class Parameter:
     @property
     def is_rotation(self) -> bool:
         """Whether the parameter is a rotation, reported as a rotation vector."""
-        return self.coordinates is rotation_vector_coordinates or isinstance(self.coordinates, NearRotationVector)
+        return isinstance(self.coordinates, NearRotationVector)
 
     def near(self, numbers: Mapping[str, float]) -> Parameter:
         """Return the parameter with rotations reported by the rotation vector nearest to given numbers."""
