@@ -233,14 +233,9 @@ class _PriorFactors:
         concerned = [*earlier, *new]
         places = [self._places(p) for p in concerned]
         order = [place for _, own in places for place in own]
-        quantities = {q.name: q for p in concerned for q in p.quantities}
-        names = [self.gaussian_prior.names[i] for i in order]
-        sigmas = np.array(
-            [
-                sigma or pinned(quantities[name])
-                for name, sigma in zip(names, self.gaussian_prior.sigmas[order], strict=True)
-            ]
-        )
+        fixed = {q.name: pinned(q) for p in concerned for q in p.quantities}
+        names, given = [self.gaussian_prior.names[i] for i in order], self.gaussian_prior.sigmas[order]
+        sigmas = np.array([sigma or fixed[name] for name, sigma in zip(names, given, strict=True)])
         count = sum(len(self._places(p)[1]) for p in new)
         root = conditional_root(self.gaussian_prior.covariance[np.ix_(order, order)], sigmas)[-count:]
         mean = self.gaussian_prior.mean[order]

@@ -34,7 +34,7 @@ def comparison_report(comparison: Comparison) -> Report:
     calibrations = sorted(comparison.calibrations, key=lambda c: c.estimate.solver == "published")
     first, halves = calibrations[0], comparison.halves
     quantities = [q for q in first.problem.quantities if q.prior_sigma != 0.0]
-    z = _z_scores(calibrations, quantities)
+    z = _z_scores(calibrations)
     by_solver = dict(zip((c.estimate.solver for c in calibrations), z, strict=True))
     if halves:
         by_solver["halves"] = {name: half.z for name, half in halves.items()}
@@ -104,24 +104,19 @@ def _solver_table(
     return Table("", caption, tuple(columns), tuple(rows), style="small", most_rows=None)
 
 
-def _z_scores(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[dict[str, float]]:
+def _z_scores(calibrations: Sequence[Calibration]) -> list[dict[str, float]]:
     """Return for each solver parameter -> z: error over sigma where the truth is known, else difference from batch."""
     errors = [truth_errors(c) for c in calibrations]
     if any(errors):
         return [{name: e.error_sigmas for name, e in each.items() if e.error_sigmas is not None} for each in errors]
-    far = ([(q.name, _from_batch(c, calibrations, q.name)) for q in quantities] for c in calibrations)
-    return [{name: z for name, z in each if z is not None} for each in far]
-
-
-def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], name: str) -> float | None:
-    """Return the difference of a solver's value from batch's, in batch's sigmas; None where not comparable."""
     batch = next((c for c in calibrations if c.estimate.solver == "batch"), None)
-    if batch is None or batch is calibration:
-        return None
-    own, reference = calibration.parameters.get(name), batch.parameters.get(name)
-    if own is None or reference is None or reference.sigma == 0.0:
-        return None
-    return (own.value - reference.value) / reference.sigma
+    return [{} if batch is None or c is batch else _from_batch(c, batch) for c in calibrations]
+
+
+def _from_batch(calibration: Calibration, batch: Calibration) -> dict[str, float]:
+    """Return parameter -> difference of a solver's value from batch's, in batch's sigmas, where that is not fixed."""
+    both = ((p, batch.parameters[name]) for name, p in calibration.parameters.items() if name in batch.parameters)
+    return {own.name: (own.value - other.value) / other.sigma for own, other in both if other.sigma != 0.0}
 
 
 def comparison_summary(comparison: Comparison) -> Summary:
@@ -155,8 +150,8 @@ def _solvers_agree(comparison: Comparison) -> str:
     published, batch = comparison.of("published"), comparison.of("batch")
     if published is None or batch is None:
         return f"{said}."
-    common = [name for name in published.parameters if batch.values.keys() >= {name}]
-    far = [name for name in common if abs(_from_batch(published, comparison.calibrations, name) or 0.0) > _FAR]
+    common = published.parameters.keys() & batch.parameters.keys()
+    far = [z for z in _from_batch(published, batch).values() if abs(z) > _FAR]
     return f"{said}; published differs by more than {_FAR:g} sigma in {len(far)} of {len(common)} parameters."
 
 
