@@ -20,7 +20,7 @@ from alidade.pipelines.estimation.parameters import SENSOR_NAMES
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.triads import TRIADS, numeric_jacobian, parts_of, sensor_model
 from alidade.pipelines.reports.plots import variables
-from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import truth_errors
 
 _G, _DEG = 9.80665, math.degrees(1.0)
@@ -164,9 +164,8 @@ def _rows(card: ResultCard) -> Iterator[Row]:
 
 def group_of(c: Calibration, title: str, unit: str, names: Sequence[str]) -> ResultGroup:
     """Return parameters of one kind as a group, in the given unit or else in their usual one."""
-    quantities = {q.name: q for q in quantities_of(c.problem, c.estimate)}
     known = (unit, _CARD_UNITS[unit]) if unit in _CARD_UNITS else None
-    human, factor = known or human_unit(quantities[names[0]])
+    human, factor = known or human_unit(c.quantities[names[0]])
     errors = truth_errors(c)
     rows = []
     for name in names:
@@ -176,7 +175,7 @@ def group_of(c: Calibration, title: str, unit: str, names: Sequence[str]) -> Res
             name.rpartition("_")[2],
             *(p.value, p.sigma, p.require, p.observability, error, (name,)),
             hint=f"{name}: {c.method.describe(name)}",
-            known=p.sigma < MAX_SIGMA_OVER_PRIOR * quantities[name].scale,
+            known=p.sigma < MAX_SIGMA_OVER_PRIOR * c.quantities[name].scale,
         )
         rows.append(row.times(factor))
     return ResultGroup(title, human, tuple(rows))
