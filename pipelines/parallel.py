@@ -33,16 +33,12 @@ _jobs = 1
 def processes(jobs: int | None) -> Iterator[None]:
     """Allow `jobs` processes within the block; None: one per core."""
     global _jobs
-    before, _jobs = _jobs, jobs or _cores()
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    before, _jobs = _jobs, jobs or cores
     try:
         yield
     finally:
         _jobs = before
-
-
-def _cores() -> int:
-    """Number of cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def allowed() -> int:

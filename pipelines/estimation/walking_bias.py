@@ -98,34 +98,15 @@ class WalkingBias:
         """Add a node to a step, with `guess` (3,) rad/s; the caller adds factors that determine the first node."""
         step.initial.insert(self.key(node), guess)
         if node > 0:
-            step.factors.append(self._walk_factor(node))
+            spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
+            sigma = float(np.hypot(self.walk * np.sqrt(spacing), _SLACK * self._unknown(spacing)))
+            blocks = {self.key(node - 1): -np.eye(3), self.key(node): np.eye(3)}
+            step.factors.append(Factor.process_of("bias walk", linear_factor(blocks, sigma)))
 
     def end(self, step: Step, node: int, guess: Array) -> None:
         """Add the mean bias up to the end of a node's segment to a step; the first node is its own mean."""
-        if node > 0:
-            step.initial.insert(self.mean_key(node), guess)
-            step.factors.append(self._mean_factor(node))
-
-    def keep(self, step: Step, nodes: range, means: range) -> None:
-        """Keep nodes and means in a smoother's window until the step's time; a single node never leaves it."""
-        if self.nodes > 1:
-            keys = [*map(self.key, nodes), *map(self.mean_key, means)]
-            step.timestamps.update(dict.fromkeys(keys, step.time))
-
-    def _walk_factor(self, node: int) -> Factor:
-        """Random-walk factor between a node and its predecessor."""
-        spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
-        step = self.walk * np.sqrt(spacing)
-        sigma = float(np.hypot(step, _SLACK * self._unknown(spacing)))
-        blocks = {self.key(node - 1): -np.eye(3), self.key(node): np.eye(3)}
-        return Factor.process_of("bias walk", linear_factor(blocks, sigma))
-
-    def _unknown(self, segment: float) -> float:
-        """Sigma of a segment's mean bias by gyro noise alone, rad/s; `segment` in s."""
-        return self.density / float(np.sqrt(segment))
-
-    def _mean_factor(self, node: int) -> Factor:
-        """Factor that defines the mean bias at the end of a node's segment, from the previous mean and the node."""
+        if node == 0:
+            return
         end = self.stop if node == self.nodes - 1 else self.edges[node + 1]
         whole, segment = end - self.edges[0], end - self.edges[node]
         share = float(segment / whole)
@@ -134,4 +115,15 @@ class WalkingBias:
         sigma = float(np.hypot(departure, _MEAN_SLACK * self._unknown(segment) * share))
         blocks = {self.mean_key(node): 1.0, self.mean_key(node - 1): share - 1.0, self.key(node): -share}
         factor = linear_factor({key: scale * np.eye(3) for key, scale in blocks.items()}, sigma)
-        return Factor.process_of("definition", factor)
+        step.initial.insert(self.mean_key(node), guess)
+        step.factors.append(Factor.process_of("definition", factor))
+
+    def keep(self, step: Step, nodes: range, means: range) -> None:
+        """Keep nodes and means in a smoother's window until the step's time; a single node never leaves it."""
+        if self.nodes > 1:
+            keys = [*map(self.key, nodes), *map(self.mean_key, means)]
+            step.timestamps.update(dict.fromkeys(keys, step.time))
+
+    def _unknown(self, segment: float) -> float:
+        """Sigma of a segment's mean bias by gyro noise alone, rad/s; `segment` in s."""
+        return self.density / float(np.sqrt(segment))
