@@ -89,10 +89,11 @@ def _residuals(family: str, residuals: Residuals, names: Sequence[str], innovati
     for i, (name, color) in enumerate(zip(names, _colors(names), strict=False)):
         out.points(residuals.time[used], residuals.whitened[used, i], name, color, 3)
     if not used.all():
-        low, high = _view(residuals.whitened[used])
-        far = np.minimum(np.linalg.norm(residuals.whitened[~used], axis=1), 0.97 * high)
+        # All used residuals are shown, with room for rejected ones above them.
+        reach = max(5.0, 1.2 * float(np.abs(residuals.whitened[used]).max(initial=0.0)))
+        out.y_range = (-reach, 2.0 * reach)
+        far = np.minimum(np.linalg.norm(residuals.whitened[~used], axis=1), 0.97 * out.y_range[1])
         out.points(residuals.time[~used], far, "rejected (length)", REJECTED, 6, shape="x")
-        out.y_range = (low, high)
     out.levels((-3.0, 3.0))
     share = float((np.abs(residuals.whitened[used]) > 3.0).mean()) if used.any() else 0.0
     return Plot(
@@ -107,12 +108,6 @@ def _colors(names: Sequence[str]) -> Iterable[str]:
     """Return the colours of the axes for names that end in x, y, z, else the palette's in turn."""
     axes = [name.rpartition("_")[2] for name in names]
     return axes if set(axes) <= set(AXES) and len(set(axes)) == len(axes) else cycle(COLORS)
-
-
-def _view(used: Array) -> tuple[float, float]:
-    """Return the range of an axis that shows all used residuals, with room for rejected ones above them."""
-    reach = max(5.0, 1.2 * float(np.abs(used).max(initial=0.0)))
-    return -reach, 2.0 * reach
 
 
 def _squares(family: str, residuals: Residuals) -> Plot:
