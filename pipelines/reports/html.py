@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from markupsafe import Markup
 
 from alidade.factors.array import Array
 from alidade.pipelines.display.figure import PALETTE, Figure, Mark, Plot
@@ -92,15 +93,11 @@ def environment() -> Environment:
 
 def _coded(text: str) -> str:
     """Return a text as HTML, with text between backquotes as code."""
-    from markupsafe import Markup, escape
-
-    return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
+    return Markup(_CODE.sub(r"<code>\1</code>", str(Markup.escape(text))))
 
 
 def _classes(cell: Cell, column: Column, table: Table) -> str:
     """Return the attribute `class` of a cell in HTML."""
-    from markupsafe import Markup
-
     short = column.kind == "number" and len(cell.text) < _SHORT and table.style in ("", "lines", "lines many")
     chosen = {"text": column.kind == "text", "long": column.kind == "prose", "wide": column.wide, "short": short}
     names = [*(name for name, applies in chosen.items() if applies), *([cell.tone] if cell.tone else [])]

@@ -30,6 +30,7 @@ from alidade.pipelines.estimation.noise import Source
 from alidade.pipelines.files import MAX_RESULT_BYTES, read_bytes
 
 if TYPE_CHECKING:
+    from alidade.pipelines.diagnostics.device_changes import Changes
     from alidade.pipelines.reports.result import Calibration
 
 
@@ -369,7 +370,8 @@ def result(calibration: Calibration) -> Result:
             },
             "constants": c.problem.constants or None,
             "recordings": c.recordings or None,
-            "changes": c.changes and {"level": c.changes.level, "steps": _steps(c), "rates": c.changes.rates},
+            "changes": c.changes
+            and {"level": c.changes.level, "steps": _steps(c.changes, c.recordings), "rates": c.changes.rates},
             "uses": [
                 {
                     "name": found.use.name,
@@ -435,19 +437,16 @@ def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
     return found
 
 
-def _steps(c: Calibration) -> list[ChangeResult]:
+def _steps(changes: Changes, parts: Sequence[PartResult]) -> list[ChangeResult]:
     """Return all tested steps of the device's parameters; those found are estimated with all found, others alone."""
-    if c.changes is None:
-        return []
-    names = [part.recording for part in c.recordings]
     return [
         ChangeResult(
             parameter=step.name,
-            before=names[step.after],
-            after=names[step.after + 1],
+            before=parts[step.after].recording,
+            after=parts[step.after + 1].recording,
             step=step.size,
             sigma=step.sigma,
-            found=step in c.changes.found,
+            found=step in changes.found,
         )
-        for step in c.changes.judged
+        for step in changes.judged
     ]
