@@ -20,7 +20,7 @@ from alidade.factors.array import Array
 from alidade.factors.error_map import ErrorMapFactor
 from alidade.factors.model import Model
 from alidade.factors.through_gimbal import GimbalMap, ThroughGimbalFactor
-from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.priors import prior_of
 from alidade.pipelines.estimation.problem import (
     Estimate,
     Factor,
@@ -142,9 +142,9 @@ class ErrorMap:
         for number, step in enumerate(steps):
             factors, initial = [self._with_map(factor, parameter.key) for factor in step.factors], step.initial
             if number == 0:
-                zeros, initial = np.zeros(len(parameter.quantities)), gtsam.Values(step.initial)
-                initial.insert(parameter.key, zeros)
-                factors.append(vector_prior(parameter, zeros))
+                initial = gtsam.Values(step.initial)
+                initial.insert(parameter.key, np.zeros(len(parameter.quantities)))
+                factors.append(prior_of(parameter))
             yield replace(step, initial=initial, factors=factors)
 
     def _with_map(self, factor: Factor, key: int) -> Factor:

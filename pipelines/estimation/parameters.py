@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from alidade.factors import so3
 from alidade.factors.array import Array
-from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
+from alidade.pipelines.estimation.priors import prior_of
 from alidade.pipelines.estimation.problem import (
     ChainLayout,
     Estimate,
@@ -371,15 +371,9 @@ def parameter_problem(
             step = Step(time=float(time[rows.stop - 1]), keyframes=range(rows.start, rows.stop))
             if begin == 0:
                 step.initial.insert(values)
-                step.factors.extend(_prior(each) for each in parameters)
+                step.factors.extend(map(prior_of, parameters))
             some = replace(model, **{name: getattr(model, name)[rows] for name in model.stacked})
             step.factors.append(Factor.of(family, some.on(*(each.key for each in parameters))))
             yield step
 
     return Problem(method, parameters, steps, steps_after=lambda after: steps(1, after), layout=ChainLayout(), **fields)
-
-
-def _prior(parameter: Parameter) -> Factor:
-    if parameter.is_rotation:
-        return rotation_prior(parameter)
-    return vector_prior(parameter, np.zeros(len(parameter.quantities)))

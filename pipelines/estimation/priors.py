@@ -97,14 +97,12 @@ def pinned(quantity: Quantity) -> float:
     return _PINNED * min(quantity.require, quantity.prior_scale)
 
 
-def vector_prior(parameter: Parameter, mean: Array) -> Factor:
-    """Prior on a vector parameter about `mean`, in its own units."""
-    return vector_about(parameter.key, mean, prior_sigmas(parameter))
-
-
-def rotation_prior(parameter: Parameter) -> Factor:
-    """Prior on a Rot3 parameter about the identity, sigmas per component of the rotation vector, rad."""
-    return rotation_about(parameter.key, so3.identity(), np.diag(1.0 / prior_sigmas(parameter)))
+def prior_of(parameter: Parameter) -> Factor:
+    """Prior on a parameter about zero, in its own units; on a Rot3 about the identity, in its rotation vector, rad."""
+    sigmas = prior_sigmas(parameter)
+    if parameter.is_rotation:
+        return rotation_about(parameter.key, so3.identity(), np.diag(1.0 / sigmas))
+    return vector_about(parameter.key, np.zeros(len(sigmas)), sigmas)
 
 
 def vector_about(key: int, mean: Array, sigmas: Array | float, family: str = "prior") -> Factor:

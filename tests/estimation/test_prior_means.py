@@ -22,7 +22,7 @@ from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.prior_replacement import with_priors
-from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.priors import prior_of
 from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Quantity, Step
 from alidade.pipelines.gaussian_prior import GaussianPrior, independent
 from alidade.pipelines.methods import method
@@ -166,7 +166,7 @@ def _begins_twice() -> Problem:
             for p in parameters:
                 if k == 3 * (p.key == SECOND):
                     values.insert(p.key, np.zeros(1))
-                    factors.append(vector_prior(p, np.zeros(1)))
+                    factors.append(prior_of(p))
             if k >= 3:
                 seen = Sum(np.array([float(k)]), np.array([0.7]))
                 factors.append(Factor.of("seen", seen.on(FIRST, SECOND)))

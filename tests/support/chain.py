@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from alidade.factors.array import Array
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Block, Model, Residuals
-from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.priors import prior_of
 from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Quantity, Step
 
 PARAMETER = int(gtsam.symbol("p", 0))
@@ -72,7 +72,7 @@ class Walk:
         first = self.step(range(1), loss)
         first.initial.insert(PARAMETER, np.zeros(self.h.shape[1]))
         start = gtsam.PriorFactorVector(state(0), np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, START))
-        prior = vector_prior(self.parameter, np.zeros(self.h.shape[1]))
+        prior = prior_of(self.parameter)
         yield replace(first, factors=[prior, Factor("start", start), *first.factors])
         for begin in range(1, len(self.z), chunk):
             yield self.step(range(begin, min(begin + chunk, len(self.z))), loss)

@@ -25,7 +25,7 @@ from alidade.pipelines.estimation.parameters import (
     scalar,
     stated,
 )
-from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
+from alidade.pipelines.estimation.priors import prior_of, prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.recording import CubeConfig, RawConversion
 from alidade.pipelines.methods.place import FIELD, known_field
@@ -189,8 +189,7 @@ def first_priors(parameters: Parameters) -> list[Factor]:
     for name, own in parameters.triads.items():
         prior = TriadPriorFactor(np.zeros(1), mean[None], parameters.priors[name][None])
         factors.append(Factor.process_of("prior", prior.on(own.key)))
-    factors += [rotation_prior(p) for p in parameters.rotations]
-    factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in parameters.zeros]
+    factors += map(prior_of, (*parameters.rotations, *parameters.zeros))
     return factors if parameters.field_prior is None else [*factors, parameters.field_prior[1]]
 
 
@@ -284,7 +283,7 @@ def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Factor
         known = FieldPriorFactor(np.zeros(1), mean[None], np.array([along]), np.array([across]))
         prior = Factor.process_of("prior", known.on(FIELD_KEY))
     else:
-        prior = vector_prior(Parameter(FIELD_KEY, plain), mean)
+        prior = vector_about(FIELD_KEY, mean, prior_sigmas(Parameter(FIELD_KEY, plain)))
     return Parameter(FIELD_KEY, with_factor("mag", plain, config, _GAIN[1])), (mean, prior)
 
 

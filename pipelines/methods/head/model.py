@@ -29,7 +29,7 @@ from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Tru
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import DEAD_BAND, acting
 from alidade.pipelines.estimation.parameters import stated as stated_figure
-from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
+from alidade.pipelines.estimation.priors import prior_of
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.formula import clock_constants
@@ -383,15 +383,14 @@ def _begin(model: _Model, step: Step) -> None:
     p = model.parameters
     step.initial.insert(p.helmet.key, so3.to_gtsam(model.helmet_guess))
     step.initial.insert(p.camera.key, so3.to_gtsam(model.camera_guess))
-    step.factors.extend([vector_prior(p.bias, np.zeros(3)), rotation_prior(p.helmet), rotation_prior(p.camera)])
+    step.factors.extend(map(prior_of, (p.bias, p.helmet, p.camera)))
     for vector in (p.picture, p.gyro, p.platform):
         if vector is not None:
-            zeros = np.zeros(len(vector.quantities))
-            initial = zeros.copy()
+            initial = np.zeros(len(vector.quantities))
             if vector is p.picture and p.has_picture_errors:
                 initial[[OFFSET_COLUMN, SKEW_COLUMN]] = model.clock.offset, model.clock.skew
             step.initial.insert(vector.key, initial)
-            step.factors.append(vector_prior(vector, zeros))
+            step.factors.append(prior_of(vector))
 
 
 def _pictures(model: _Model, keyframes: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -32,7 +32,7 @@ from alidade.factors.indexer import (
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.noise import Level, Noise
-from alidade.pipelines.estimation.priors import prior_sigmas, vector_about, vector_prior
+from alidade.pipelines.estimation.priors import prior_of, prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Parameter, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.estimation.walking_bias import NODES, WalkingBias
@@ -223,7 +223,7 @@ def _begin(model: _Model, step: Step) -> None:
             continue
         if parameter.key != FIRST_BIAS:
             step.initial.insert(parameter.key, np.zeros(size))
-        step.factors.append(vector_prior(parameter, np.zeros(size)))
+        step.factors.append(prior_of(parameter))
 
 
 def _add_bias(model: _Model, i: int, step: Step) -> None:

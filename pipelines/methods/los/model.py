@@ -33,7 +33,7 @@ from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Tru
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import DEAD_BAND, acting
 from alidade.pipelines.estimation.parameters import stated as stated_figure
-from alidade.pipelines.estimation.priors import rotation_about, vector_prior
+from alidade.pipelines.estimation.priors import prior_of, rotation_about
 from alidade.pipelines.estimation.problem import Estimate, Factor, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods import temperature
@@ -368,7 +368,7 @@ def _step(model: _Model, keyframes: range) -> Step:
             step.initial.insert(p.sight.key, sight)
         if p.gyro is not None:
             step.initial.insert(p.gyro.key, np.zeros(len(p.gyro.quantities)))
-        step.factors.extend(vector_prior(each, np.zeros(len(each.quantities))) for each in p.all)
+        step.factors.extend(map(prior_of, p.all))
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step, keyframes)
     step.factors[:] = [_whitened(model, factor) for factor in step.factors]

@@ -30,7 +30,7 @@ from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.gyro_chain import LAYOUT
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import SENSOR_NAMES
-from alidade.pipelines.estimation.priors import rotation_about, vector_prior
+from alidade.pipelines.estimation.priors import prior_of, rotation_about
 from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import STRENGTH_ADVICE
@@ -256,11 +256,10 @@ def _begin(graph: _Graph, step: Step) -> None:
         step.initial.insert(variable.parameter.key, variable.start)
         step.factors.append(variable.prior)
     turned = graph.turning
-    step.factors.append(vector_prior(turned.bias, np.zeros(3)))
+    step.factors.append(prior_of(turned.bias))
     for parameter in turned.parameters[1:]:
-        zeros = np.zeros(len(parameter.quantities))
-        step.initial.insert(parameter.key, zeros)
-        step.factors.append(vector_prior(parameter, zeros))
+        step.initial.insert(parameter.key, np.zeros(len(parameter.quantities)))
+        step.factors.append(prior_of(parameter))
     chain = turned.chain
     about_field = _ANY_ATTITUDE if "accel" in graph.sensors else _FIXED
     sigmas = np.array([_ANY_ATTITUDE, about_field, _ANY_ATTITUDE])
