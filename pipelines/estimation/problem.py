@@ -197,40 +197,39 @@ class Factor:
     Attributes:
         family: "vision", "gyro", "prior", ...
         native: a gtsam factor; None: it is a vectorised one.
-        measurement: the vectorised factor behind it when it is a measurement that may be an outlier: the incremental
-            solver gates its innovation, reports plot its residuals.
-        process: the vectorised factor behind it when it is none.
+        bound: the vectorised model behind it; None: it is a native one.
+        is_measurement: whether it may be an outlier: the incremental solver gates its innovation, reports plot its
+            residuals.
         beside: (n,) what a unit of the noise beside its own adds to the whitened residuals, see Noise.beside.
         fixed: (n,) part of the variance by which it is whitened that is no noise, and that no level scales.
     """
 
     family: str
     native: gtsam.NonlinearFactor | None = None
-    measurement: BoundModel | None = None
-    process: BoundModel | None = None
+    bound: BoundModel | None = None
+    is_measurement: bool = False
     beside: Array | None = None
     fixed: Array | None = None
 
     @classmethod
     def of(cls, family: str, measurement: BoundModel, beside: Array | None = None) -> Factor:
         """Build the factor of a measurement, which may be an outlier."""
-        return cls(family, measurement=measurement, beside=beside)
+        return cls(family, bound=measurement, is_measurement=True, beside=beside)
 
     @classmethod
     def process_of(
         cls, family: str, process: BoundModel, beside: Array | None = None, fixed: Array | None = None
     ) -> Factor:
         """Build the factor of a process, which joins variables and is never an outlier."""
-        return cls(family, process=process, beside=beside, fixed=fixed)
+        return cls(family, bound=process, beside=beside, fixed=fixed)
 
     @property
     def factor(self) -> gtsam.NonlinearFactor:
         """The gtsam factor; a vectorised factor builds a new one at every call."""
-        if self.native is not None:
-            return self.native
-        bound = self.bound
-        assert bound is not None
-        return bound.factor
+        if self.bound is not None:
+            return self.bound.factor
+        assert self.native is not None
+        return self.native
 
     @property
     def keys(self) -> list[int]:
@@ -238,13 +237,13 @@ class Factor:
         return list(self.factor.keys()) if self.bound is None else self.bound.keys
 
     @property
-    def bound(self) -> BoundModel | None:
-        """The vectorised model behind the factor, measurement or process."""
-        return self.measurement or self.process
+    def measurement(self) -> BoundModel | None:
+        """The vectorised model of a measurement; None for any other factor."""
+        return self.bound if self.is_measurement else None
 
     def rebound(self, bound: BoundModel) -> Factor:
         """Return the factor with another vectorised model."""
-        return replace(self, process=bound) if self.measurement is None else replace(self, measurement=bound)
+        return replace(self, bound=bound)
 
     def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
         """Linearise the factor about the values."""

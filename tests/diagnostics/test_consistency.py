@@ -453,7 +453,7 @@ def test_without_residual_families_there_is_no_worst_segment_and_no_crash(head: 
 
         def steps(chunk: int) -> Iterator[Step]:
             for step in built.steps(chunk):
-                factors = [replace(f, measurement=None, process=f.measurement or f.process) for f in step.factors]
+                factors = [replace(f, is_measurement=False) for f in step.factors]
                 yield replace(step, factors=factors)
 
         return replace(built, steps=steps, loss=None)

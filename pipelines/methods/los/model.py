@@ -395,7 +395,7 @@ def _start_factor(model: _Model, k: int) -> Factor:
 
 def _whitened(model: _Model, factor: Factor) -> Factor:
     """Wrap gyro increment factors so that gimbal errors leave their noise unchanged; return other factors as is."""
-    increments, sight, around = factor.process, model.parameters.sight, model.around
+    increments, sight, around = factor.bound, model.parameters.sight, model.around
     if increments is None or sight is None or around is None or factor.family != "gyro":
         return factor
     at = np.searchsorted(model.chain.time, increments.model.time)
