@@ -721,8 +721,8 @@ def cube_layout(
     From pictures of all sides; ids and sizes come from the config.
     """
     from alidade.pipelines.config import configured
-    from alidade.pipelines.methods.cube.layout import cube_layout as estimate
-    from alidade.pipelines.methods.cube.layout import layout_yaml
+    from alidade.pipelines.methods.cube.tags import cube_layout as estimate
+    from alidade.pipelines.methods.cube.tags import layout_yaml
     from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.layout_report import layout_json, layout_report

@@ -12,7 +12,7 @@ import pytest
 from alidade.factors import so3
 from alidade.pipelines.config import configured
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods.cube.layout import cube_layout
+from alidade.pipelines.methods.cube.tags import cube_layout
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.camera import Camera
 from alidade.pipelines.vision.layout import Layout, Shots, estimate_layout
@@ -435,8 +435,8 @@ def test_a_real_cube_of_18_tags(shared_data) -> None:  # type: ignore[no-untyped
     assert layout.rms_px < 0.35
     # Its shutter does not roll.
     assert abs(layout.line_time[0]) < 3.0 * layout.line_time_sigma[0]
-    from alidade.pipelines.methods.cube.layout import _shots
     from alidade.pipelines.methods.cube.recording import CubeConfig
+    from alidade.pipelines.methods.cube.tags import _shots
 
     shots, given = _shots(recording, config), TagBody.from_board(config.section(CubeConfig))
     assert shots.time is not None

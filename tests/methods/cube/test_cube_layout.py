@@ -13,7 +13,6 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.cube.layout import cube_layout, layout_yaml
 from alidade.pipelines.methods.cube.recording import CubeConfig
 from alidade.pipelines.methods.cube.simulation import (
     CubeCamera,
@@ -23,6 +22,7 @@ from alidade.pipelines.methods.cube.simulation import (
     cube_config,
     simulate_cube,
 )
+from alidade.pipelines.methods.cube.tags import cube_layout, layout_yaml
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.vision.layout import Layout
 from tests.support.browser import fits
