@@ -17,12 +17,12 @@ _HOMES = {
     "loss": ("TruncatedLoss",),
     "model": ("POSE3", "ROT3", "Model"),
     "preintegration": ("GyroPath", "Increments"),
-    "tags": ("TagAttitudeFactor",),
     "triad": (
         "AccelFactor",
         "FieldPriorFactor",
         "GyroStaticFactor",
         "MagFactor",
+        "TagAttitudeFactor",
         "TriadPriorFactor",
     ),
     "turns": ("GyroRotationFactor",),

@@ -11,13 +11,13 @@ from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.factors.earth import earth_rate
 from alidade.factors.model import Block, Model, dimension, retract
-from alidade.factors.tags import TagAttitudeFactor
 from alidade.factors.testing import assert_jacobians
 from alidade.factors.triad import (
     AccelFactor,
     FieldPriorFactor,
     GyroStaticFactor,
     MagFactor,
+    TagAttitudeFactor,
     TriadPriorFactor,
     calibration,
     parts,

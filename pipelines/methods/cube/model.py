@@ -26,8 +26,7 @@ from alidade.factors.chi_square import gate
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
-from alidade.factors.tags import TagAttitudeFactor
-from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor
+from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor, TagAttitudeFactor
 from alidade.factors.turns import GyroRotationFactor, Samples, Turns
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import Level
