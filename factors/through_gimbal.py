@@ -88,7 +88,7 @@ class GimbalErrors(Stacked):
 
 @dataclass(frozen=True)
 class GimbalMap(Stacked):
-    """LOS error map over the gimbal angles, see alidade.factors.error_map.
+    """LOS error map over the gimbal angles: errors of phx and phz that are linear in given functions of these.
 
     Attributes:
         functions: (n, k) of each measurement.

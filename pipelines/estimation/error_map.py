@@ -11,14 +11,13 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
 
 from alidade.factors.array import Array
-from alidade.factors.error_map import ErrorMapFactor
-from alidade.factors.model import Model
+from alidade.factors.model import Block, Model, Residuals, WrappedModel
 from alidade.factors.through_gimbal import GimbalMap, ThroughGimbalFactor
 from alidade.pipelines.estimation.priors import prior_of
 from alidade.pipelines.estimation.problem import (
@@ -39,6 +38,44 @@ _LEAST = 0.01
 SHEET, UNIT = "camera.map", "rad"
 # Of a variance, in the budget.
 SOURCE = "errors by where measurements are made"
+
+
+@dataclass(frozen=True)
+class ErrorMapFactor(WrappedModel):
+    """Measurement model plus an error linear in given functions of attitude or gimbal angles.
+
+    The first `axes` numbers of measurement i are larger by e_i = sum_j f_ij c_j, so that its residual is that of the
+    model less sqrt_information e_i; of a rotation to first order in e_i times the noise. Blocks: those of the model,
+    then c, k times `axes` numbers, function by function, in the unit of the measurements.
+
+    Attributes:
+        model: of n measurements, with their `sqrt_information`, (n, m, m).
+        functions: (n, k) f_ij.
+        axes: how many numbers of a measurement have such errors.
+    """
+
+    functions: Array
+    axes: int
+    stacked: ClassVar = ("model", "functions")
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Blocks of the model, then the map's coefficients c."""
+        return (*self.model.blocks, self.functions.shape[1] * self.axes)
+
+    def __call__(self, *blocks: Array) -> Residuals:
+        """Residual (n, m) of the model minus the map's error, with Jacobians."""
+        *own, c = blocks
+        residuals, jacobians = self.model(*own)
+        weight = self.model.sqrt_information[:, :, : self.axes]
+        n, k = self.functions.shape
+        error = np.einsum("nk,nka->na", self.functions, c.reshape(n, k, self.axes))
+
+        def all_jacobians() -> tuple[Array, ...]:
+            by_c = -weight[:, :, None] * self.functions[:, None, :, None]
+            return (*jacobians(), by_c.reshape(n, self.rows, -1))
+
+        return residuals - np.einsum("nma,na->nm", weight, error), all_jacobians
 
 
 @dataclass(frozen=True, eq=False)

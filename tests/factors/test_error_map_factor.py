@@ -6,9 +6,9 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.attitude import VisionAttitudeFactor
-from alidade.factors.error_map import ErrorMapFactor
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
+from alidade.pipelines.estimation.error_map import ErrorMapFactor
 
 N, K = 8, 3
 
