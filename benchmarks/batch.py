@@ -51,7 +51,7 @@ def los_problem(keyframes: int, sensors: Sensors | None = None) -> Problem:
 def los_recording(keyframes: int) -> tuple[LosScenario, LosData]:
     """A scenario and its recording."""
     scenario = LosScenario(duration_s=keyframes / IMAGES_PER_S, gyro_rate_hz=1000.0, image_rate_hz=IMAGES_PER_S)
-    return scenario, simulate_los(scenario, 0)[0]
+    return scenario, simulate_los(scenario, 0).data
 
 
 def head_recording(frames: int) -> tuple[HeadData, Config]:

@@ -75,7 +75,7 @@ def _followed(seconds: float, images_hz: float, rate_hz: float, speed: float) ->
         scenario = LosScenario(
             duration_s=seconds, carrier=_BRISK, image_rate_hz=images_hz, gyro_rate_hz=rate_hz, gimbal_rate_hz=rate_hz
         )
-        method("los").write_data(whole, *simulate_los(scenario, 2), los_config(scenario))
+        method("los").write(whole, simulate_los(scenario, 2))
         config.write_text(los_config(scenario))
         spawn = multiprocessing.get_context("spawn")
         began: Synchronized[float] = spawn.Value("d", 0.0)

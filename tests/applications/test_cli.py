@@ -31,7 +31,7 @@ def scenario() -> HeadScenario:
 
 @pytest.fixture(scope="module")
 def data(scenario: HeadScenario) -> HeadData:
-    return simulate_head(scenario, 1)[0]
+    return simulate_head(scenario, 1).data
 
 
 @pytest.fixture(scope="module")

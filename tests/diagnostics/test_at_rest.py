@@ -24,11 +24,11 @@ LOS = LosScenario(duration_s=10.0, carrier=STILL, image_rate_hz=10.0, gyro_rate_
 
 
 def head_at_rest(seed: int) -> Problem:
-    return head.problem(simulate_head(HEAD, seed)[0], load_config(head_config(HEAD).encode()))
+    return head.problem(simulate_head(HEAD, seed).data, load_config(head_config(HEAD).encode()))
 
 
 def los_at_rest(seed: int) -> Problem:
-    return los.problem(simulate_los(LOS, seed)[0], load_config(los_config(LOS).encode()))
+    return los.problem(simulate_los(LOS, seed).data, load_config(los_config(LOS).encode()))
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 5))])
@@ -54,7 +54,7 @@ def test_vision_better_than_the_gyro_tells_no_time_offset_at_rest(seed: int) -> 
     """Gyro noise turns what is seen by the time offset: 320 pictures of 50 urad once gave it to 2 ms."""
     noise = HEAD.noise.model_copy(update={"vision_attitude": 5e-5})
     clean = HEAD.model_copy(update={"duration_s": 8.0, "vision_rate_hz": 40.0, "noise": noise})
-    problem = head.problem(simulate_head(clean, seed)[0], load_config(head_config(clean).encode()))
+    problem = head.problem(simulate_head(clean, seed).data, load_config(head_config(clean).encode()))
     estimate = solve_batch(problem)
     assert estimate.converged, estimate.message
     offset = estimate.names.index("time_offset")

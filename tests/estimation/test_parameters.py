@@ -21,12 +21,12 @@ from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
 from alidade.pipelines.methods.head.parameters import PARAMETERS, VISION_MAP
-from alidade.pipelines.methods.head.recording import HeadData, read_head
+from alidade.pipelines.methods.head.recording import read_head
 from alidade.pipelines.methods.head.report import findings
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.recording import open_recording
-from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.simulation.scenario import Simulated, load_scenario
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
 from tests.support.judged import judge
@@ -106,7 +106,7 @@ EFFECTS = {
 
 
 @cache
-def _recording() -> tuple[HeadData, dict[str, float]]:
+def _recording() -> Simulated:
     return simulate_head(_scenario(), 1)
 
 
@@ -159,7 +159,7 @@ def test_without_acceleration_g_sensitivity_is_fixed_with_a_finding(tmp_path: Pa
 
 def test_result_and_report_tell_assumptions_apart(alidade: Command, tmp_path: Path) -> None:
     brief = HeadScenario(duration_s=4.0, vision_rate_hz=10.0, gyro_rate_hz=50.0)
-    method("head").write_data(tmp_path / "s.mcap", *simulate_head(brief, 1), head_config(brief))
+    method("head").write(tmp_path / "s.mcap", simulate_head(brief, 1))
     alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out")
     parameters = {p["name"]: p for p in json.loads((tmp_path / "out" / "result.json").read_text())["parameters"]}
     scale, mount = parameters["gyro_scale_x"], parameters["helmet_mount_x"]

@@ -47,7 +47,7 @@ def _cases(simulate: Any, scenario: Any, specs: tuple[ParameterSpec, ...]) -> It
 )
 def test_an_error_changes_what_is_measured(simulate: Callable[..., Any], scenario: Any, name: str, size: float) -> None:
     exact, wrong = (
-        simulate(scenario.model_copy(update={"sensors": None, "effects": effects}), 1)[0]
+        simulate(scenario.model_copy(update={"sensors": None, "effects": effects}), 1).data
         for effects in ({}, {name: size})
     )
     pairs = list(zip(_numbers(exact), _numbers(wrong), strict=True))

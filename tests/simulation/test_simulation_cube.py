@@ -83,7 +83,7 @@ def test_the_gyro_leads_from_pose_to_pose() -> None:
     assert last is not None
     start, stop = np.searchsorted(data.imu_t, [poses.span[0, 0], poses.span[-1, 0]])
     dt = float(np.median(np.diff(data.imu_t)))
-    attitude = so3.multiply(_nRC(data.reference_wxyz[0], config), first.pose.cRb)  # type: ignore[index]
+    attitude = so3.multiply(_nRC(data.reference_wxyz[0], config), first.pose.cRb)
     # Mean rates over intervals centred on the stamps: half an interval at both ends.
     weights = np.full(stop - start + 1, dt)
     weights[[0, -1]] *= 0.5
@@ -91,7 +91,7 @@ def test_the_gyro_leads_from_pose_to_pose() -> None:
         attitude = so3.multiply(attitude, so3.exp((K @ rate + b) * weight))
     turned = earth_rate(float(np.deg2rad(EXACT.place.latitude_deg))) * (poses.span[-1, 0] - poses.span[0, 0])
     attitude = so3.multiply(so3.exp(-turned), attitude)
-    expected = so3.multiply(_nRC(data.reference_wxyz[0], config), last.pose.cRb)  # type: ignore[index]
+    expected = so3.multiply(_nRC(data.reference_wxyz[0], config), last.pose.cRb)
     assert np.linalg.norm(so3.log(so3.multiply(so3.inverse(attitude), expected))) < 2e-4
 
 
@@ -111,7 +111,7 @@ def test_noise_is_as_stated() -> None:
 
 def test_field_and_heading_are_drawn_as_their_priors_have_them() -> None:
     """Sigmas over seeds: 500 nT each way across the model's field and along it, 10 mrad of heading."""
-    truths = [simulate_cube(CubeScenario(poses=1, static_s=0.5), seed)[1] for seed in range(60)]
+    truths = [simulate_cube(CubeScenario(poses=1, static_s=0.5), seed).truth for seed in range(60)]
     field = np.array([[truth[f"field_{axis}"] for axis in "enu"] for truth in truths])
     place = CubeScenario().place
     latitude, longitude = np.deg2rad([place.latitude_deg, place.longitude_deg])

@@ -154,7 +154,7 @@ def test_bias_walk_grows_with_the_square_root_of_time() -> None:
     noise = HeadNoise(gyro_density=0, gyro_bias_walk=1e-3, platform_gyro_density=0, vision_attitude=0)
     scenario = quiet("head_turntable", noise=noise, duration_s=16.0, gyro_rate_hz=100.0)
     clean, _ = simulate_head(quiet("head_turntable", duration_s=16.0, gyro_rate_hz=100.0), seed=0)
-    ends = [simulate_head(scenario, seed)[0].head_gyro[-1] - clean.head_gyro[-1] for seed in range(100)]
+    ends = [simulate_head(scenario, seed).data.head_gyro[-1] - clean.head_gyro[-1] for seed in range(100)]
     assert np.std(ends) == pytest.approx(1e-3 * np.sqrt(16.0), rel=0.15)
 
 

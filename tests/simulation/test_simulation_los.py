@@ -168,7 +168,7 @@ def test_long_recordings_are_simulated_block_by_block(
 
 def test_a_slow_gyro_is_the_mean_of_a_loop_at_200_hz() -> None:
     """Its rates are those of the fast one, averaged, and the gimbal turns without the kinks of a loop at 25 Hz."""
-    slow, fast = (simulate_los(LosScenario(**IDEAL, gyro_rate_hz=hz, gimbal_rate_hz=200), 1)[0] for hz in (25, 200))
+    slow, fast = (simulate_los(LosScenario(**IDEAL, gyro_rate_hz=hz, gimbal_rate_hz=200), 1).data for hz in (25, 200))
     np.testing.assert_allclose(slow.gyro_t, fast.gyro_t[: 8 * len(slow.gyro_t)].reshape(-1, 8).mean(axis=1))
     np.testing.assert_allclose(slow.gyro, fast.gyro[: 8 * len(slow.gyro_t)].reshape(-1, 8, 3).mean(axis=1))
     np.testing.assert_allclose(slow.gimbal, fast.gimbal)

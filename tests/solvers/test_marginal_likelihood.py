@@ -33,7 +33,7 @@ def made(data: HeadData) -> Problem:
 @cache
 def chain() -> tuple[LinearChain, tuple[Level, ...]]:
     """A recording about its solution, and its noises as stated."""
-    compiled = Compiled.of(made(simulate_head(SCENARIO, 1)[0]), "chain")
+    compiled = Compiled.of(made(simulate_head(SCENARIO, 1).data), "chain")
     assert isinstance(compiled.engine, Linearization)
     solution = solve_robust(compiled.engine, compiled.initial, compiled.problem.loss)
     return LinearChain.of(compiled.engine, solution.values), compiled.problem.noises

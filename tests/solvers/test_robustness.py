@@ -14,7 +14,7 @@ from alidade.factors import so3
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.cube import model as cube
-from alidade.pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube, simulated
+from alidade.pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 from alidade.pipelines.methods.indexer import model as indexer
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from alidade.pipelines.methods.los import model as los
@@ -53,7 +53,7 @@ def _far_indexer() -> Made:
 
 def _far_cube() -> Made:
     """The whole device turned in the cube: what it reads is turned, and K turns it back."""
-    found = simulated(CUBE, 1)
+    found = simulate_cube(CUBE, 1)
     data, truth = found.data, dict(found.truth)
     R = so3.matrix(so3.exp(np.deg2rad([30.0, -30.0, 30.0])))
     assert data.mag is not None

@@ -283,7 +283,7 @@ def test_where_measurements_do_not_fit_steps_get_the_right_length(pictures_hz: f
         | {"temperature": {"rise_k": 20.0, "time_constant_s": 10.0}}
         | {"effects": {f"gyro_temperature_{axis}": slope for axis, slope in zip("xyz", WARMING, strict=True)}}
     )
-    data = replace(simulate_los(scenario, 1)[0], temperature=None)
+    data = replace(simulate_los(scenario, 1).data, temperature=None)
     problem = los.problem(data, load_config(los_config(scenario).encode()))
     compiled = Compiled.of(problem)
     engine, config = compiled.engine.under(None), levenberg.LevenbergConfig()
@@ -307,7 +307,7 @@ def test_a_roll_that_pictures_do_not_determine_does_not_swing(duration_s: float,
     From states that are aligned with single pictures, whose noise the scale of LOS errors then explains, 5 and 13.
     """
     scenario = LosScenario(duration_s=duration_s, gyro_rate_hz=200.0, image_rate_hz=50.0)
-    problem = los.problem(simulate_los(scenario, seed)[0], load_config(los_config(scenario).encode()))
+    problem = los.problem(simulate_los(scenario, seed).data, load_config(los_config(scenario).encode()))
     compiled = Compiled.of(problem)
     found = minimum(compiled, problem.noises)
     assert found.iterations <= most

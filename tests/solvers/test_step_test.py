@@ -36,7 +36,7 @@ def problem(data: HeadData) -> Problem:
 
 @cache
 def recorded(seed: int) -> HeadData:
-    return simulate_head(SCENARIO, seed)[0]
+    return simulate_head(SCENARIO, seed).data
 
 
 def slipped(data: HeadData, deg: float, time: float, axis: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> HeadData:

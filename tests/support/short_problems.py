@@ -34,9 +34,9 @@ COARSE: dict[str, Any] = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0, **FOUR_
 
 @cache
 def los_problem() -> Problem:
-    return los.problem(simulate_los(LOS, 3)[0], load_config(los_config(LOS).encode()))
+    return los.problem(simulate_los(LOS, 3).data, load_config(los_config(LOS).encode()))
 
 
 @cache
 def head_problem() -> Problem:
-    return head.problem(simulate_head(HEAD, 3)[0], load_config(head_config(HEAD).encode()))
+    return head.problem(simulate_head(HEAD, 3).data, load_config(head_config(HEAD).encode()))

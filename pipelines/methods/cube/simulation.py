@@ -244,14 +244,8 @@ _SQUARE = 0.5 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 _LEAST_COSINE = 0.3
 
 
-def simulate_cube(scenario: CubeScenario, seed: int) -> tuple[CubeData, dict[str, float]]:
-    """Simulate a session with tag detections; return it with the true parameters (a walking bias as its mean)."""
-    world = _World(scenario, seed)
-    return world.data(), world.truth
-
-
-def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
-    """Simulate a session in memory, with pictures instead of detections if requested."""
+def simulate_cube(scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
+    """Simulate a session with tag detections, or pictures if requested; the truth of a walking bias is its mean."""
     world = _World(scenario, seed)
     known = strength_measured(world.field, scenario.field.measured, seed) if scenario.magnetometer else {}
     config = cube_config(scenario, images, **known)
@@ -559,4 +553,4 @@ def drawn_motion(s: CubeScenario, rng: np.random.Generator) -> Motion:
     return Motion(start, start + s.static_s, nRb, place, wobble, 0.05 * rng.standard_normal((n - 1, 3)))
 
 
-SIMULATOR = Simulator(scenario=CubeScenario, simulate=simulated, randomised=True, has_camera=True)
+SIMULATOR = Simulator(scenario=CubeScenario, simulate=simulate_cube, randomised=True, has_camera=True)

@@ -175,8 +175,12 @@ class HeadScenario(ScenarioPart):
         return self
 
 
-def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str, float]]:
-    """Simulate a session; return it with the true parameters (rad/s, rad, s; a walking bias as its mean)."""
+def simulate_head(scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
+    """Simulate a session in memory, with pictures if requested; the truth of a walking bias is its mean.
+
+    Raises:
+        InputError: its pictures cannot be drawn.
+    """
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     noise = scenario.noise
@@ -214,7 +218,8 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
         head_force=force + _white(noise.accel_density, scenario.gyro_rate_hz, len(head_t), rng_of_sensors),
         temperature=measured(scenario.temperature, scenario.duration_s),
     )
-    return data, {**_truth(scenario, bias), **effects}
+    pictures = simulate_pictures(scenario, seed) if images else None
+    return Simulated(data, {**_truth(scenario, bias), **effects}, head_config(scenario, images), pictures)
 
 
 def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
@@ -329,15 +334,6 @@ def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
     return by_axis(gyro_bias=bias.mean(axis=0), **mounts) | {"time_offset": scenario.time_offset_s}
 
 
-def simulated(scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
-    """Simulate a head session in memory, with pictures if requested.
-
-    Raises:
-        InputError: its pictures cannot be drawn.
-    """
-    data, truth = simulate_head(scenario, seed)
-    pictures = simulate_pictures(scenario, seed) if images else None
-    return Simulated(data, truth, head_config(scenario, images), pictures)
-
-
-SIMULATOR = Simulator(scenario=HeadScenario, simulate=simulated, default_with_images="head_pictures", has_camera=True)
+SIMULATOR = Simulator(
+    scenario=HeadScenario, simulate=simulate_head, default_with_images="head_pictures", has_camera=True
+)

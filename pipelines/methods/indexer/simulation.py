@@ -118,8 +118,8 @@ class _Drive:
         return np.asarray(np.sign(self.angle) * 0.5 * self.acceleration * (s**2 - even**2 - braking**2))
 
 
-def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData, dict[str, float]]:
-    """Simulate a session; return it with the true parameters (rad, rad/s; a walking bias as its mean)."""
+def simulate_indexer(scenario: IndexerScenario, seed: int, _images: bool = False) -> Simulated:
+    """Simulate a session in memory; the truth is in rad and rad/s, that of a walking bias its mean."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng = np.random.default_rng(seed)
     rng_of_sensors = np.random.default_rng([seed, 1])
@@ -156,12 +156,7 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
         noise.gyro_density or None,
         temperature=measured(scenario.temperature, duration),
     )
-    return data, {**_truth(scenario, bias), **effects}
-
-
-def simulated(scenario: IndexerScenario, seed: int, _images: bool = False) -> Simulated:
-    """Simulate an indexer session in memory."""
-    return Simulated(*simulate_indexer(scenario, seed), indexer_config(scenario))
+    return Simulated(data, {**_truth(scenario, bias), **effects}, indexer_config(scenario))
 
 
 def indexer_config(scenario: IndexerScenario) -> str:
@@ -269,4 +264,4 @@ def _truth(scenario: IndexerScenario, bias: Array) -> dict[str, float]:
     return truth | {"axis_nonperpendicularity": float(scenario.axis_nonperpendicularity_arcsec * ARCSEC)}
 
 
-SIMULATOR = Simulator(scenario=IndexerScenario, simulate=simulated)
+SIMULATOR = Simulator(scenario=IndexerScenario, simulate=simulate_indexer)

@@ -176,8 +176,12 @@ class LosMotion:
         return np.asarray((t >= self.edges[0]) & (t <= self.edges[-1]))
 
 
-def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, float]]:
-    """Simulate a session; return it with the true parameters (rad, rad/s, s; a walking bias as its mean)."""
+def simulate_los(scenario: LosScenario, seed: int, images: bool = False) -> Simulated:
+    """Simulate a session in memory, with pictures if requested; the truth of a walking bias is its mean.
+
+    Raises:
+        InputError: its pictures cannot be drawn.
+    """
     rng_of_sensors = np.random.default_rng([seed, 1])
     motion, rng = _drawn(scenario, seed, rng_of_sensors)
     averaged = averaged_samples(scenario.gyro_rate_hz)
@@ -208,7 +212,8 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
         force=force,
         temperature=measured(scenario.temperature, scenario.duration_s),
     )
-    return data, _truth(scenario, motion)
+    pictures = simulate_pictures(scenario, seed) if images else None
+    return Simulated(data, _truth(scenario, motion), los_config(scenario, images), pictures)
 
 
 def _drawn(
@@ -299,17 +304,6 @@ def camera_attitude(scenario: LosScenario, gimbal: Array, effects: Mapping[str, 
         _about(2, effects["collimation"]),
         _about(1, effects["camera_roll"]),
     )
-
-
-def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulated:
-    """Simulate a los session in memory, with pictures if requested.
-
-    Raises:
-        InputError: its pictures cannot be drawn.
-    """
-    data, truth = simulate_los(scenario, seed)
-    pictures = simulate_pictures(scenario, seed) if images else None
-    return Simulated(data, truth, los_config(scenario, images), pictures)
 
 
 def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
@@ -476,4 +470,4 @@ def _truth(scenario: LosScenario, motion: LosMotion) -> dict[str, float]:
     return {**truth, **by_axis(gyro_bias=bias), **motion.effects}
 
 
-SIMULATOR = Simulator(scenario=LosScenario, simulate=simulated, default_with_images="los_images", has_camera=True)
+SIMULATOR = Simulator(scenario=LosScenario, simulate=simulate_los, default_with_images="los_images", has_camera=True)

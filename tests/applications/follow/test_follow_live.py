@@ -40,7 +40,7 @@ def record(
         gimbal_rate_hz=rate_hz,
         sensors=sensors,
     )
-    method("los").write_data(path / "whole.mcap", *simulate_los(scenario, 2), los_config(scenario))
+    method("los").write(path / "whole.mcap", simulate_los(scenario, 2))
     (path / "c.yaml").write_text(los_config(scenario))
     return path / "whole.mcap", path / "c.yaml"
 

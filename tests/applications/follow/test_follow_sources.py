@@ -55,7 +55,7 @@ def _few_batch_solutions() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    method("los").write_data(path, *simulate_los(SCENARIO, 2), los_config(SCENARIO))
+    method("los").write(path, simulate_los(SCENARIO, 2))
     return path
 
 
@@ -167,7 +167,7 @@ def test_a_ros_1_bag_is_followed_killed_and_resumed_when_it_is_closed(tmp_path: 
     """What tells a bag from others is not its head, which is written anew when the bag is closed."""
     scenario = SCENARIO.model_copy(update={"duration_s": 75.0, "image_rate_hz": 3.0, "gyro_rate_hz": 25.0})
     whole, config = tmp_path / "whole.mcap", tmp_path / "c.yaml"
-    method("los").write_data(whole, *simulate_los(scenario, 2), los_config(scenario))
+    method("los").write(whole, simulate_los(scenario, 2))
     config.write_text(los_config(scenario))
     closed = forms.rosbag1(whole, tmp_path / "closed.bag", chunk=8_000).read_bytes()
     path, settings = tmp_path / "s.bag", Settings(config=config, checkpoint=tmp_path / "s.checkpoint")

@@ -159,8 +159,8 @@ def test_a_field_far_from_its_model_is_named_and_has_room_where_stated() -> None
 
 def test_a_stated_field_is_drawn_as_stated() -> None:
     stated = {"sensors": {"field": {"model_error": 5e-6}}, "poses": 1, "static_s": 0.5}
-    field = [simulate_cube(_scenario(**stated), seed)[1] for seed in range(40)]
-    middle = simulate_cube(_scenario(poses=1, static_s=0.5, field={"direction": 0.0, "strength": 0.0}), 0)[1]
+    field = [simulate_cube(_scenario(**stated), seed).truth for seed in range(40)]
+    middle = simulate_cube(_scenario(poses=1, static_s=0.5, field={"direction": 0.0, "strength": 0.0}), 0).truth
     off = np.array([[each[f"field_{a}"] - middle[f"field_{a}"] for a in "enu"] for each in field])
     assert np.sqrt((off**2).mean()) == pytest.approx(5e-6, rel=3.0 / np.sqrt(2 * off.size))
 

@@ -26,7 +26,7 @@ CONFIG = cube_config(SCENARIO)
 
 @pytest.fixture(scope="module")
 def data() -> CubeData:
-    return simulate_cube(SCENARIO, 1)[0]
+    return simulate_cube(SCENARIO, 1).data
 
 
 def _refused(alidade: Command, folder: Path, message: str) -> None:

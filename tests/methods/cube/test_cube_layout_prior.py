@@ -102,9 +102,9 @@ def test_tags_beside_where_the_drawing_has_them(size: float) -> None:
     """
     off = {"tag_18_px": size, "tag_19_py": -size, "tag_21_pz": 0.7 * size}
     scenario = _scenario(16, 3e-3).model_copy(update={"effects": off})
-    cube = method("cube")
-    found = Session.of(cube, Simulated(*simulate_cube(scenario, 2), cube_config(scenario))).calibrate(report=False)
-    truth = simulate_cube(scenario, 2)[1]
+    data, truth = simulate_cube(scenario, 2)
+    simulated = Simulated(data, truth, cube_config(scenario))
+    found = Session.of(method("cube"), simulated).calibrate(report=False)
     errors = {n: (p.value - truth[n]) / p.sigma for n, p in found.parameters.items() if n in truth and p.sigma > 0.0}
     assert max(map(abs, errors.values())) < 4.0
     assert found.parameters["tag_18_px"].sigma < 1.2e-4  # the drawing: 0.39 mm
@@ -217,7 +217,8 @@ def test_a_layout_of_one_recording_serves_another(alidade: Command, tmp_path: Pa
 
 def test_a_camera_of_another_recording_is_refused(alidade: Command, tmp_path: Path) -> None:
     scenario = _scenario(4, 0.0)
-    method("cube").write_data(tmp_path / "s.mcap", *simulate_cube(scenario, 0), cube_config(scenario))
+    data, truth = simulate_cube(scenario, 0)
+    method("cube").write_data(tmp_path / "s.mcap", data, truth, cube_config(scenario))
     for text, says in (
         ("focal: [600, 600], centre: [640, 480], distortion: [0, 0, 0, 0, 0]", "its focal length is 600 px"),
         ("focal: [1150, 1150], centre: [640, 480], distortion: [0, 0, 0, 0]", "it has 4 coefficients of distortion"),

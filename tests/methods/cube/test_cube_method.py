@@ -31,7 +31,7 @@ from alidade.pipelines.methods.cube.simulation import (
     Magnetometer,
     ReferenceAttitude,
     TagCube,
-    simulated,
+    simulate_cube,
 )
 from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.recording.recording import open_recording
@@ -55,7 +55,7 @@ SHORT: dict[str, Any] = {"poses": 16, "static_s": 2.0, "turn_rad_s": 1.6, "camer
 
 @cache
 def _simulated(seed: int, **options: Any) -> tuple[CubeData, dict[str, float], Config]:
-    found = simulated(CubeScenario(**(SHORT | options)), seed)
+    found = simulate_cube(CubeScenario(**(SHORT | options)), seed)
     return found.data, dict(found.truth), load_config(found.config.encode())
 
 

@@ -26,7 +26,7 @@ SCENARIO = CubeScenario(poses=4, static_s=2.0, camera=CubeCamera(rate_hz=5.0))
 
 @pytest.fixture(scope="module")
 def session() -> CubeData:
-    return simulate_cube(SCENARIO, 1)[0]
+    return simulate_cube(SCENARIO, 1).data
 
 
 def _config(text: str = "") -> Config:
@@ -191,7 +191,7 @@ def test_no_static_pose(session: CubeData) -> None:
 
 def test_a_tag_that_is_not_where_the_config_says_is_named() -> None:
     scenario = CubeScenario(poses=12, static_s=2.0, camera=CubeCamera(rate_hz=5.0), magnetometer=None)
-    session, config = simulate_cube(scenario, 3)[0], load_config(cube_config(scenario).encode())
+    session, config = simulate_cube(scenario, 3).data, load_config(cube_config(scenario).encode())
     tags = dict(config.section(CubeConfig).tags)
     turned = so3.multiply(tags[18].rotation, so3.exp([0.0, 0.0, np.pi / 2]))
     tags[18] = tags[18].model_copy(update={"rotation": tuple(turned)})

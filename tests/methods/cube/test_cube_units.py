@@ -20,7 +20,7 @@ from datasets import imu_tk_xsens
 
 @pytest.fixture(scope="module")
 def data() -> CubeData:
-    return simulate_cube(CubeScenario(poses=10, static_s=1.0), 3)[0]
+    return simulate_cube(CubeScenario(poses=10, static_s=1.0), 3).data
 
 
 def _check(

@@ -14,14 +14,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.model import problem
 from alidade.pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
 from alidade.pipelines.methods.cube.recording import CubeData, local_field
-from alidade.pipelines.methods.cube.simulation import (
-    CubeCamera,
-    CubeScenario,
-    Errors,
-    cube_config,
-    simulate_cube,
-    simulated,
-)
+from alidade.pipelines.methods.cube.simulation import CubeCamera, CubeScenario, Errors, cube_config, simulate_cube
 
 RNG = np.random.default_rng(1)
 K = np.eye(3) + 0.05 * RNG.normal(size=(3, 3))
@@ -86,7 +79,7 @@ def test_nominal_vectors_are_those_of_the_local_level_frame() -> None:
 def test_static_gyro_regression_returns_no_gain() -> None:
     """The defect that the graph is there for: earth rate alone, under MEMS noise."""
     scenario = CubeScenario(poses=18, errors=Errors(gain=0.0), camera=CubeCamera(rate_hz=5.0))
-    found = simulated(scenario, 2)
+    found = simulate_cube(scenario, 2)
     data, config = found.data, load_config(found.config.encode())
     estimate = published_estimate(data, config, problem(data, config))
     values = dict(zip(estimate.names, estimate.values, strict=True))

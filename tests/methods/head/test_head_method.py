@@ -18,11 +18,10 @@ from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.head.model import problem
-from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import validate
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.simulation.scenario import Simulated, load_scenario
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.solved import calibrate
 
@@ -34,7 +33,7 @@ def scenario(**changes: object) -> HeadScenario:
     return HeadScenario.model_validate(load_scenario(HeadScenario, "head_mounts").model_dump() | settings)
 
 
-def made(**changes: object) -> tuple[HeadData, dict[str, float]]:
+def made(**changes: object) -> Simulated:
     return simulate_head(scenario(**changes), 1)
 
 
@@ -112,7 +111,7 @@ def test_gaps_have_no_windows() -> None:
     data, truth = made(vision_outages_s=[(3.0, 9.0)])
     against_vision, _ = validate(data, Config(), truth)
     assert not ((against_vision.time > 3.0) & (against_vision.time < 9.9)).any()
-    one, two = (made(vision_outages_s=[(start, 12.0)])[0] for start in (0.5, 2.0))
+    one, two = (made(vision_outages_s=[(start, 12.0)]).data for start in (0.5, 2.0))
     assert len(validate(two, Config(), truth)[0].time) > 10
     with pytest.raises(InputError, match="no two frames about 1 s apart"):
         validate(one, Config(), truth)

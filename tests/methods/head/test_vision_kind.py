@@ -26,7 +26,7 @@ KINDS = ("mocap", "pnp", "vio", "other")
 def made(rate_hz: float = 25.0, sigma: float = 8.7e-3) -> HeadData:
     """Attitudes without covariances."""
     scenario = {"duration_s": 12, "gyro_rate_hz": 200, "vision_rate_hz": rate_hz, "noise": {"vision_attitude": sigma}}
-    return replace(simulate_head(HeadScenario.model_validate(scenario), 1)[0], vision_cov=None)
+    return replace(simulate_head(HeadScenario.model_validate(scenario), 1).data, vision_cov=None)
 
 
 def scale_prior(config: str) -> float | None:

@@ -27,6 +27,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 
 SCENARIO = IndexerScenario(
@@ -41,7 +42,7 @@ SCENARIO = IndexerScenario(
 
 
 @pytest.fixture(scope="module")
-def session() -> tuple[IndexerData, dict[str, float]]:
+def session() -> Simulated:
     return simulate_indexer(SCENARIO, 1)
 
 
@@ -55,7 +56,7 @@ def _errors(data: IndexerData, truth: dict[str, float], config: Config | None = 
     return np.asarray((estimate.values - expected) / estimate.sigmas)
 
 
-def test_no_rotation(session: tuple[IndexerData, dict[str, float]]) -> None:
+def test_no_rotation(session: Simulated) -> None:
     data, _ = session
     still = replace(data, outer=0.0 * data.outer, inner=1e-3 * np.sin(data.encoder_t))
     with pytest.raises(
@@ -65,22 +66,20 @@ def test_no_rotation(session: tuple[IndexerData, dict[str, float]]) -> None:
 
 
 @pytest.mark.parametrize(("name", "axis"), [("outer", "outer_x"), ("inner", "inner_z")])
-def test_encoder_that_counts_the_other_way_is_named(
-    session: tuple[IndexerData, dict[str, float]], name: str, axis: str
-) -> None:
+def test_encoder_that_counts_the_other_way_is_named(session: Simulated, name: str, axis: str) -> None:
     data, _ = session
     with pytest.raises(InputError, match=f"the axis {axis} disagree in sign"):
         problem(replace(data, **{name: -getattr(data, name)}), _config())
 
 
-def test_gear_that_is_off_by_two_percent_is_named(session: tuple[IndexerData, dict[str, float]]) -> None:
+def test_gear_that_is_off_by_two_percent_is_named(session: Simulated) -> None:
     data, _ = session
     with pytest.raises(InputError, match=r"about the axis outer_x the gyro turns at 98.0\d* % of the encoder's rate"):
         problem(replace(data, outer=1.02 * data.outer), _config())
     problem(replace(data, outer=1.009 * data.outer), _config())
 
 
-def test_missing_latitude_is_refused_when_the_earth_shows(session: tuple[IndexerData, dict[str, float]]) -> None:
+def test_missing_latitude_is_refused_when_the_earth_shows(session: Simulated) -> None:
     data, truth = session
     blind = replace(data, latitude_deg=None)
     with pytest.raises(InputError, match=r"latitude is not known; record /fix or give latitude_deg"):
@@ -90,14 +89,14 @@ def test_missing_latitude_is_refused_when_the_earth_shows(session: tuple[Indexer
     assert np.abs(_errors(blind, truth, coarse)).max() < 1.0
 
 
-def test_unknown_parameter_names_the_nearest(session: tuple[IndexerData, dict[str, float]]) -> None:
+def test_unknown_parameter_names_the_nearest(session: Simulated) -> None:
     config = _config().model_copy(update={"priors": {"tetha_x": 0.1}})
     with pytest.raises(InputError, match=r"priors.tetha_x; the nearest known key is theta_x"):
-        problem(session[0], config)
+        problem(session.data, config)
 
 
 @pytest.mark.parametrize("stream", ["gyro", "encoder"])
-def test_gap_in_a_turn_is_told_and_the_rest_is_used(session: tuple[IndexerData, dict[str, float]], stream: str) -> None:
+def test_gap_in_a_turn_is_told_and_the_rest_is_used(session: Simulated, stream: str) -> None:
     data, truth = session
     if stream == "gyro":
         keep = (data.gyro_t < 20.0) | (data.gyro_t > 27.0)
@@ -110,7 +109,7 @@ def test_gap_in_a_turn_is_told_and_the_rest_is_used(session: tuple[IndexerData, 
     assert np.abs(_errors(damaged, truth)).max() < 4.0
 
 
-def test_turn_in_which_the_gyro_stuck_is_dropped(session: tuple[IndexerData, dict[str, float]]) -> None:
+def test_turn_in_which_the_gyro_stuck_is_dropped(session: Simulated) -> None:
     data, truth = session
     gyro = data.gyro.copy()
     gyro[(data.gyro_t > 20.0) & (data.gyro_t < 25.0)] = 0.0
@@ -120,9 +119,7 @@ def test_turn_in_which_the_gyro_stuck_is_dropped(session: tuple[IndexerData, dic
 
 
 @pytest.mark.parametrize("rows", [slice(None), slice(7, 8)])
-def test_an_orientation_that_is_not_there_throughout_is_none(
-    session: tuple[IndexerData, dict[str, float]], rows: slice, tmp_path: Path
-) -> None:
+def test_an_orientation_that_is_not_there_throughout_is_none(session: Simulated, rows: slice, tmp_path: Path) -> None:
     data, _ = session
     turning = so3.exp(np.outer(data.gyro_t, [0.0, 0.0, 0.1]))
     lacking = turning.copy()
@@ -133,8 +130,8 @@ def test_an_orientation_that_is_not_there_throughout_is_none(
         assert (found.attitude is not None) is there
 
 
-def test_fixes_that_never_came_are_none(session: tuple[IndexerData, dict[str, float]], tmp_path: Path) -> None:
-    method("indexer").write_data(tmp_path / "s.mcap", session[0])
+def test_fixes_that_never_came_are_none(session: Simulated, tmp_path: Path) -> None:
+    method("indexer").write_data(tmp_path / "s.mcap", session.data)
     whole = open_recording(tmp_path / "s.mcap")
     none = series.FixSeries(np.empty(0, np.int64), np.empty(0), np.empty(0))
     topics: dict[str, series.Topic] = {
@@ -148,8 +145,8 @@ def test_fixes_that_never_came_are_none(session: tuple[IndexerData, dict[str, fl
     assert read_indexer(recording, load_config(None)).latitude_deg is None
 
 
-def test_fixes_without_a_position_are_refused(session: tuple[IndexerData, dict[str, float]], tmp_path: Path) -> None:
-    method("indexer").write_data(tmp_path / "s.mcap", session[0])
+def test_fixes_without_a_position_are_refused(session: Simulated, tmp_path: Path) -> None:
+    method("indexer").write_data(tmp_path / "s.mcap", session.data)
     whole = open_recording(tmp_path / "s.mcap")
     topics: dict[str, series.Topic] = {
         "/imu": whole.imu("/imu"),
@@ -162,9 +159,7 @@ def test_fixes_without_a_position_are_refused(session: tuple[IndexerData, dict[s
 
 
 @pytest.mark.parametrize("wrap", [np.pi, 2.0 * np.pi])
-def test_wrapped_and_continuous_encoders_give_the_same(
-    session: tuple[IndexerData, dict[str, float]], wrap: float
-) -> None:
+def test_wrapped_and_continuous_encoders_give_the_same(session: Simulated, wrap: float) -> None:
     data, _ = session
     low = wrap - 2.0 * np.pi
     wrapped = replace(data, outer=(data.outer - low) % (2 * np.pi) + low, inner=(data.inner - low) % (2 * np.pi) + low)
@@ -200,7 +195,7 @@ def test_coarse_encoders_are_slow_errors() -> None:
     assert np.abs(_errors(data, truth, config)).max() < 3.0
 
 
-def test_runs_cut_in_the_middle_of_a_turn(session: tuple[IndexerData, dict[str, float]]) -> None:
+def test_runs_cut_in_the_middle_of_a_turn(session: Simulated) -> None:
     """A recording that starts and stops while an axis turns."""
     data, truth = session
     g = (data.gyro_t > 13.0) & (data.gyro_t < data.gyro_t[-1] - 30.0)
@@ -217,7 +212,7 @@ def test_runs_cut_in_the_middle_of_a_turn(session: tuple[IndexerData, dict[str, 
     assert np.abs(_errors(part, truth)).max() < 4.0
 
 
-def test_validation_without_an_attitude_looks_at_the_turns(session: tuple[IndexerData, dict[str, float]]) -> None:
+def test_validation_without_an_attitude_looks_at_the_turns(session: Simulated) -> None:
     data, truth = session
     (turns,) = validate(data, _config(), truth)
     assert np.abs(turns.after).max() < 1e-4 < np.abs(turns.before).max()

@@ -69,7 +69,7 @@ def test_turn_on_bias_is_reestimated_given_the_calibrated_device(tmp_path: Path)
     short = LosScenario(duration_s=20.0, gyro_rate_hz=100.0, image_rate_hz=10.0)
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     for seed, path in ((1, first), (2, second)):
-        method("los").write_data(path, *simulate_los(short, seed), los_config(short))
+        method("los").write(path, simulate_los(short, seed))
     alidade.calibrate(first).write(tmp_path / "out")
     held = alidade.validate(second, tmp_path / "out" / "calibration.yaml")
     stored, applied, expected = (each[0] for each in (held.validations, held.device, held.best))
