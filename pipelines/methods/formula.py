@@ -23,9 +23,9 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.parameters import DEAD_BAND
+from alidade.pipelines.estimation.parameters import DEAD_BAND, g_sensitivity, gyro_scale
 from alidade.pipelines.estimation.problem import Parameter
-from alidade.pipelines.methods.temperature import FIRST
+from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
 from alidade.pipelines.recording.plausibility import dead_band
 from alidade.pipelines.recording.streams import Temperature
 
@@ -41,6 +41,9 @@ _ROTATION, _VECTOR = (
 _BLOCK = 100_000
 # `Exp(angle ez)`: a number before the name of an axis.
 _AXIS = re.compile(r"(\w+) (e[xyz])\b")
+# Of a gyro's S, xx yy zz xy xz yz, and of its G by rows.
+_SCALE = tuple(name for each in gyro_scale("gyro", "gyro", 0.0) for name in each.names)
+_SENSITIVITY = g_sensitivity(0.0).names
 AXES = {"ex": np.eye(3)[0], "ey": np.eye(3)[1], "ez": np.eye(3)[2]}
 
 
@@ -260,35 +263,28 @@ def temperature_text(names: Sequence[str], known: Collection[str]) -> str:
     return f"{vector_text(names, known)} * (temperature - first_temperature)"
 
 
-def gyro_rate(
-    known: Collection[str], s: Sequence[str], g: Sequence[str], c: Sequence[str] = (), force: str = "accel"
-) -> tuple[str, tuple[str, ...]]:
+def gyro_rate(known: Collection[str], force: str = "accel") -> tuple[str, tuple[str, ...]]:
     """Expression of the rate w, from a gyro reading (I + S) w + G f + c (temperature - first_temperature) + gyro_bias.
 
     Args:
         known: parameters that are applied.
-        s, g, c: names of the numbers of S, xx yy zz xy xz yz, of those of G by rows, and of c.
         force: name of f: the accelerometer's reading, or an earlier formula's result from it.
 
     Returns:
         Expression and inputs.
     """
-    scaled, feels, drifts = (any(name in known for name in names) for names in (s, g, c))
-    felt = f" - {matrix_text([g[:3], g[3:6], g[6:]], known)} * {force}" if feels else ""
-    text = f"gyro{felt}{f' - {temperature_text(c, known)}' if drifts else ''} - gyro_bias"
+    scaled, feels, drifts = (any(name in known for name in names) for names in (_SCALE, _SENSITIVITY, GYRO_SLOPE.names))
+    rows = [_SENSITIVITY[i : i + 3] for i in (0, 3, 6)]
+    felt = f" - {matrix_text(rows, known)} * {force}" if feels else ""
+    text = f"gyro{felt}{f' - {temperature_text(GYRO_SLOPE.names, known)}' if drifts else ''} - gyro_bias"
     return (
-        f"inverse({symmetric_text(s, known)}) * ({text})" if scaled else text,
+        f"inverse({symmetric_text(_SCALE, known)}) * ({text})" if scaled else text,
         ("gyro", *(["accel"] if feels else []), *(["temperature"] if drifts else [])),
     )
 
 
 def corrected_rates(
-    t: Array,
-    gyro: Array,
-    force: Array | None,
-    temperature: Temperature | None,
-    values: Mapping[str, float],
-    names: tuple[Sequence[str], Sequence[str], Sequence[str]],
+    t: Array, gyro: Array, force: Array | None, temperature: Temperature | None, values: Mapping[str, float]
 ) -> Array:
     """Rates (N, 3), rad/s, of a gyro's samples, corrected by `gyro_rate`; errors with unmeasured causes remain.
 
@@ -298,17 +294,16 @@ def corrected_rates(
         force: (N, 3) m/s^2 by the accelerometer beside it; None: not measured.
         temperature: of the gyro; None: not measured.
         values: parameters by name; those not there are zero.
-        names: of the numbers of S, G and c, as `gyro_rate` has them.
     """
     warm = None if temperature is None else temperature.above(0.0, t)
     known = {**({} if temperature is None else {FIRST: temperature.first}), **values}
-    for causes, cause in zip(names[1:], (force, warm), strict=True):
+    for causes, cause in ((_SENSITIVITY, force), (GYRO_SLOPE.names, warm)):
         if cause is None:
             known = {name: value for name, value in known.items() if name not in causes}
     if DEAD_BAND.name in values:
         gyro = gyro + values[DEAD_BAND.name] * dead_band(t, gyro)[1]
     inputs = {"gyro": gyro, "accel": force, "temperature": warm}
-    formula, out = Formula("rate, rad/s", "w", *gyro_rate(known, *names)), np.empty_like(gyro)
+    formula, out = Formula("rate, rad/s", "w", *gyro_rate(known)), np.empty_like(gyro)
     for begin in range(0, len(out), _BLOCK):
         some = slice(begin, begin + _BLOCK)
         measured = {name: given[some] for name in formula.inputs if (given := inputs[name]) is not None}

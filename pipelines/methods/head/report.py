@@ -31,23 +31,13 @@ from alidade.pipelines.methods.formula import (
     symmetric_text,
     vector_text,
 )
-from alidade.pipelines.methods.head.parameters import (
-    CAMERA,
-    HELMET,
-    OFFSET,
-    PLATFORM_BIAS,
-    PLATFORM_SCALE,
-    SCALE,
-    SENSITIVITY,
-)
+from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, PLATFORM_BIAS, PLATFORM_SCALE, SENSITIVITY
 from alidade.pipelines.methods.head.recording import HEAD_IMU, PLATFORM_IMU, HeadData
-from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.methods.triads import G, gyro_reading
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
-_S, _PLATFORM_S = (tuple(name for each in scale for name in each.names) for scale in (SCALE, PLATFORM_SCALE))
-_DRIVERS = SENSITIVITY.names, GYRO_SLOPE.names
+_PLATFORM_S = tuple(name for each in PLATFORM_SCALE for name in each.names)
 _MOUNTS = *HELMET.names, *CAMERA.names
 
 
@@ -56,7 +46,7 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
     return [
         Formula("markers to helmet IMU", "vRh", "Exp(helmet_mount)", ()),
         Formula("platform to camera", "cRb", "Exp(camera_mount)", ()),
-        Formula("rate of the helmet, rad/s in v", "w_iv", *gyro_rate(parameters, _S, *_DRIVERS)),
+        Formula("rate of the helmet, rad/s in v", "w_iv", *gyro_rate(parameters)),
         *_platform_rate(parameters),
         Formula(
             "attitude of the helmet on the platform from a camera measurement cRh",
@@ -111,7 +101,7 @@ def _from_vision(data: HeadData, calibration: Calibration, attitudes: Attitudes)
 
 def _attitude(attitudes: Attitudes, seen: Attitudes) -> Plot:
     out = Figure("rotation vector of bRv, deg", height=360)
-    fused, vision = _vectors(attitudes.wxyz), _vectors(seen.wxyz)
+    fused, vision = (np.rad2deg(so3.log(each.wxyz)) for each in (attitudes, seen))
     for i, axis in enumerate(AXES):
         out.points(seen.time, vision[:, i], f"vision {axis}", COLORS[i], 3, alpha=0.45)
     for i, axis in enumerate(AXES):
@@ -143,7 +133,7 @@ def _against_truth(data: HeadData, calibration: Calibration, attitudes: Attitude
         return None
     truth = Attitudes(data.truth_t, data.truth_wxyz)
     without = ""
-    if _camera_mount_unknown(calibration):
+    if any(calibration.verdicts.get(name) in ("weak", "unobservable") for name in CAMERA.names):
         turn = _constant_turn(truth, attitudes)
         seen, attitudes = (Attitudes(a.time, so3.multiply(turn, a.wxyz)) for a in (seen, attitudes))
         without = " less its constant part on the platform's side, which is the camera mount that is not known"
@@ -153,11 +143,6 @@ def _against_truth(data: HeadData, calibration: Calibration, attitudes: Attitude
         out.points(time, angle, name, color, 3)
     said = ", ".join(f"{name} {float(np.sqrt((angle**2).mean())):.3g} deg RMS" for name, (_, angle) in errors.items())
     return Plot("Attitude against the truth", f"Angle between attitude and truth{without}: {said}.", out)
-
-
-def _camera_mount_unknown(calibration: Calibration) -> bool:
-    verdicts = calibration.verdicts
-    return any(verdicts.get(f"camera_mount_{axis}") in ("weak", "unobservable") for axis in AXES)
 
 
 def _constant_turn(truth: Attitudes, attitudes: Attitudes) -> Array:
@@ -183,11 +168,6 @@ def _delta(attitudes: Attitudes, others: Attitudes) -> Array:
     """Rotation vectors (n, 3), deg, from interpolated attitudes to others at the others' times."""
     at = so3.interpolate(attitudes.time, attitudes.wxyz, others.time)
     return np.rad2deg(so3.local(at, others.wxyz))
-
-
-def _vectors(wxyz: Array) -> Array:
-    """Convert quaternions to rotation vectors, deg."""
-    return np.rad2deg(so3.log(wxyz))
 
 
 # How long the gyros carry the attitude, s, and how far from that frames may lie.
@@ -414,8 +394,7 @@ def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], a
 
 def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:
     """Helmet gyro without dead band, corrected by its formula; errors with unmeasured causes remain."""
-    names = _S, *_DRIVERS
-    rates = corrected_rates(data.head_t, data.head_gyro, data.head_force, data.temperature, values, names)
+    rates = corrected_rates(data.head_t, data.head_gyro, data.head_force, data.temperature, values)
     return GyroPath(data.head_t, rates)
 
 

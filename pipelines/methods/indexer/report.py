@@ -48,7 +48,7 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
     """Formulas of mounting, rate and attitude, with those sensor errors that are among the parameters."""
     angles = axis_angles(_JOINT_NAMES, ONCE_PER_TURN.names, DELAY.names[0], parameters)
     outer, inner = [angle.name for angle in angles] or _JOINT_NAMES
-    rate, inputs = gyro_rate(parameters, ERRORS, (), GYRO_SLOPE.names)
+    rate, inputs = gyro_rate(parameters)
     tilt = "Exp(axis_nonperpendicularity ey) * " if "axis_nonperpendicularity" in parameters else ""
     return [
         Formula(

@@ -39,23 +39,19 @@ from alidade.pipelines.methods.los.initial_values import (
     los_error,
     select_pictures,
 )
-from alidade.pipelines.methods.los.parameters import ANGLES, DELAY, ONCE_PER_TURN, SCALE, SENSITIVITY, TIME_OFFSET
+from alidade.pipelines.methods.los.parameters import ANGLES, DELAY, ONCE_PER_TURN, SENSITIVITY, TIME_OFFSET
 from alidade.pipelines.methods.los.recording import JOINTS, LosData
-from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.methods.triads import G, gyro_reading
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
-
-S = tuple(name for each in SCALE for name in each.names)
-DRIVERS = SENSITIVITY.names, GYRO_SLOPE.names
 
 
 def formulas(parameters: Collection[str], _config: Config | None = None) -> list[Formula]:
     """Formulas of mounting, rate, camera and clock, with those sensor errors that are among the parameters."""
     angles = axis_angles(JOINTS, ONCE_PER_TURN.names, DELAY.names[0], parameters)
     azimuth, elevation = [angle.name for angle in angles] or JOINTS
-    rate, inputs = gyro_rate(parameters, S, *DRIVERS)
+    rate, inputs = gyro_rate(parameters)
     turns = {
         "camera_roll": "Ry(camera_roll)",
         "collimation": "Rz(collimation)",
@@ -256,7 +252,7 @@ def _without_drift(t: Array, error: Array) -> Array:
 
 def rates(data: LosData, values: Mapping[str, float]) -> Array:
     """Corrected rates (N, 3), rad/s, at the gyro's samples; errors with unmeasured causes remain."""
-    return corrected_rates(data.gyro_t, data.gyro, data.force, data.temperature, values, (S, *DRIVERS))
+    return corrected_rates(data.gyro_t, data.gyro, data.force, data.temperature, values)
 
 
 def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:

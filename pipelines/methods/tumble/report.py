@@ -22,7 +22,7 @@ from alidade.pipelines.estimation.parameters import SENSOR_NAMES
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods import Report
 from alidade.pipelines.methods.formula import Formula, gyro_rate, temperature_text, vector_text
-from alidade.pipelines.methods.temperature import ACCEL_SLOPE, FIRST, GYRO_SLOPE
+from alidade.pipelines.methods.temperature import ACCEL_SLOPE, FIRST
 from alidade.pipelines.methods.triads import (
     CORRECTIONS,
     RESULTS,
@@ -40,7 +40,6 @@ from alidade.pipelines.methods.triads import (
 from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.parameters import STRENGTHS
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData
-from alidade.pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -57,10 +56,9 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
     if "mag_k11" in parameters:
         unit = "the unit of field_strength"
         found.append(triad_formula("mag", parameters, "mag", ("mag",), "body's", unit))
-    if BIAS[0] in parameters:
-        names = tuple(name for each in SCALE for name in each.names)
+    if "gyro_bias_x" in parameters:
         force = RESULTS["accel"]
-        rate, inputs = gyro_rate(parameters, names, SENSITIVITY.names, GYRO_SLOPE.names, force)
+        rate, inputs = gyro_rate(parameters, force)
         of_force = [name for each in found if each.name == force and "accel" in inputs for name in each.inputs]
         found.append(
             Formula("rate, rad/s along the body's axes", "w_b", rate, tuple(dict.fromkeys([*inputs, *of_force])))
