@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from alidade.pipelines.estimation.parameters import DEAD_BAND, ParameterSpec, gyro_bias, scalar
+from alidade.pipelines.estimation.parameters import DEAD_BAND, scalar
 from alidade.pipelines.methods import Method, deferred
 from alidade.pipelines.methods.triads import triad_specs
 from alidade.pipelines.methods.tumble import turning
@@ -27,13 +27,13 @@ PARAMETERS = (
     scalar(
         "field_dip", "rad", 1.0, "Inclination of the magnetic field, positive down.", require=2e-2, per_recording=True
     ),
-    gyro_bias(0.05, 2e-3),
+    turning.BIAS,
     *turning.SCALE,
     turning.SENSITIVITY,
     turning.DELAY,
     turning.FILTER,
     DEAD_BAND,
-    ParameterSpec("accel_arm", "m", 0.3, "Lever arm from the point of rotation to the accelerometer, {axis}."),
+    turning.ARM,
     ACCEL_SQUARE,
     *SLOPES,
 )

@@ -51,7 +51,7 @@ def first_guess(raw: Array, strength: float | None, offset: float) -> tuple[Arra
         by_numbers = factor(np.tile(numbers, (len(x), 1)), ones[:, None])[1]()[0][:, 0]
         return np.vstack([by_numbers, np.diag(1.0 / sigma)])
 
-    starts = [_sphere_numbers(each / unit) for each in _centres(raw, centre, radius, strength)]
+    starts = [np.append(_UNIT, -each / unit) for each in _centres(raw, centre, radius, strength)]
     if (found := _inliers_ellipsoid(raw)) is not None:
         S = unit * found.S
         starts.append(np.append(S[np.triu_indices(3)], -S @ found.centre / unit))
@@ -61,10 +61,6 @@ def first_guess(raw: Array, strength: float | None, offset: float) -> tuple[Arra
     # Lengths stay where S is replaced by the positive root of its square.
     sizes, vt = np.linalg.svd(S)[1:]
     return vt.T @ np.diag(sizes) @ vt / unit, -unit * np.linalg.solve(S, likeliest[9:])
-
-
-def _sphere_numbers(centre: Array) -> Array:
-    return np.append(_UNIT, -centre)
 
 
 def _centres(raw: Array, centre: Array, radius: float, strength: float | None) -> list[Array]:

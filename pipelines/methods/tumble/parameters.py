@@ -5,22 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 
 import gtsam
 import numpy as np
 
 from alidade.factors.array import Array
 from alidade.factors.ellipsoid import entries
-from alidade.pipelines.estimation.parameters import DEAD_BAND, quantities
+from alidade.pipelines.estimation.parameters import check_parameters, quantities
 from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Factor, Parameter, Quantity
-from alidade.pipelines.methods.triads import MAG_SHAPE, triad_names, with_factor
+from alidade.pipelines.methods.triads import MAG_SHAPE, with_factor
+from alidade.pipelines.methods.tumble import PARAMETERS
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, GAIN, OFFSET
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
-from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, EARTH, FILTER, SCALE, SENSITIVITY
-from alidade.pipelines.settings import Config, check_names
+from alidade.pipelines.methods.tumble.turning import EARTH
+from alidade.pipelines.settings import Config
 
 TRIAD_KEYS = {"accel": int(gtsam.symbol("A", 0)), "mag": int(gtsam.symbol("M", 0))}
 STRENGTH_KEYS = {"accel": int(gtsam.symbol("g", 0)), "mag": int(gtsam.symbol("f", 0))}
@@ -56,7 +55,7 @@ def variables(model: Model, config: Config) -> tuple[Variable, ...]:
 
     Raises InputError when the config names no such parameter.
     """
-    _check_names(config)
+    check_parameters(PARAMETERS, config, EARTH, [MAG_SHAPE])
     found = [_triad(sensor, config) for sensor in model.sensors]
     found += [_strength(sensor, config) for sensor in model.sensors]
     if model.dip is not None:
@@ -128,19 +127,3 @@ def _variable(key: int, quantities: tuple[Quantity, ...], scales: Array, start: 
 def _scaled(scales: Array, values: gtsam.Values, key: int) -> tuple[Array, Array]:
     """Reported numbers of a dimensionless variable, and their Jacobian."""
     return scales * np.asarray(values.atVector(key), dtype=float), np.diag(scales)
-
-
-def _check_names(config: Config) -> None:
-    known = [name for sensor in TRIAD_KEYS for name in triad_names(sensor)]
-    known += [
-        *STRENGTHS.values(),
-        _DIP,
-        *BIAS,
-        *ARM,
-        *EARTH,
-        *chain.from_iterable(
-            each.names for each in (*SCALE, SENSITIVITY, DELAY, FILTER, DEAD_BAND, ACCEL_SQUARE, *SLOPES)
-        ),
-    ]
-    check_names(config.priors, known, "priors")
-    check_names(config.require, [*known, MAG_SHAPE], "require")

@@ -9,6 +9,7 @@ those of the measurements, which biases it where noise is not small; there is no
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
+from alidade.pipelines.methods.triads import numeric_jacobian
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.settings import Config
 
@@ -66,6 +68,8 @@ def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Es
 
     Raises InputError where the best quadric is no ellipsoid.
     """
+    from scipy.linalg import block_diag
+
     from alidade.pipelines.methods.tumble.model import prepare
 
     names: list[str] = []
@@ -76,17 +80,11 @@ def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Es
         if found is None:
             raise InputError(f"no ellipsoid fits the readings of {sensor.name}: turn it through more attitudes")
         names += sensor.names
-        values.append(_numbers(sensor, found.coefficients, found))
-        steps = _STEP * np.sqrt(np.diag(found.covariance)) * np.eye(9)
-        ends = [[_numbers(sensor, found.coefficients + sign * step, found) for sign in (1, -1)] for step in steps]
-        J = np.array([(a - b) / (2.0 * np.abs(step).max()) for (a, b), step in zip(ends, steps, strict=True)]).T
+        values.append(_numbers(sensor, found, found.coefficients))
+        steps = _STEP * np.sqrt(np.diag(found.covariance))
+        J = numeric_jacobian(partial(_numbers, sensor, found), found.coefficients, steps)
         blocks.append(J @ found.covariance @ J.T)
-    whole = np.concatenate(values)
-    covariance = np.zeros((len(whole), len(whole)))
-    first = 0
-    for block in blocks:
-        covariance[first : first + len(block), first : first + len(block)] = block
-        first += len(block)
+    whole, covariance = np.concatenate(values), block_diag(*blocks)
     known = [i for i, name in enumerate(names) if name in {q.name for q in problem.quantities}]
     return Estimate(
         solver="published",
@@ -98,7 +96,7 @@ def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Es
     )
 
 
-def _numbers(sensor: Sensor, coefficients: Array, found: Ellipsoid) -> Array:
+def _numbers(sensor: Sensor, found: Ellipsoid, coefficients: Array) -> Array:
     """Reported K and b of a sensor, for quadric coefficients near the best."""
     shape = _shape(coefficients, found.origin, found.unit)
     assert shape is not None

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.factors.array import Array
+from alidade.factors.ellipsoid import entries
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.use import Truth, Use
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot, thin
@@ -27,7 +28,6 @@ from alidade.pipelines.methods.triads import (
     CORRECTIONS,
     RESULTS,
     G,
-    gain_names,
     gyro_reading,
     parts_row,
     parts_with_sigmas,
@@ -119,18 +119,11 @@ def _parts(sensor: Sensor, estimate: Estimate, values: Mapping[str, float]) -> d
     """Scales, nonorthogonalities and mounting of K, for a sensor with a nominal scale; else None."""
     if not sensor.is_si or sensor.unit == "1":
         return None
-    names = triad_names(sensor.name, sensor.symmetric)[:-3]
-    rows = [estimate.names.index(name) for name in names]
-    spread = np.array([[1.0 if own == name else 0.0 for own in names] for name in _nine(sensor)])
+    rows = [estimate.names.index(name) for name in triad_names(sensor.name, sensor.symmetric)[:-3]]
+    spread = entries(sensor.symmetric)[:9, :-3]
     covariance = spread @ estimate.covariance[np.ix_(rows, rows)] @ spread.T
     found = parts_with_sigmas(triad_of(sensor.name, values)[0], covariance)
     return None if found is None else parts_row(sensor.name, *found)
-
-
-def _nine(sensor: Sensor) -> list[str]:
-    """Parameter names of the nine entries of K, by rows."""
-    known = triad_names(sensor.name, sensor.symmetric)
-    return [name for row in gain_names(sensor.name, known) for name in row]
 
 
 def _offset(sensor: Sensor, estimate: Estimate, values: Mapping[str, float]) -> dict[str, object]:

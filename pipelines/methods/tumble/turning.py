@@ -24,6 +24,7 @@ from alidade.pipelines.estimation.parameters import (
     ParameterSpec,
     acting,
     g_sensitivity,
+    gyro_bias,
     gyro_errors,
     gyro_scale,
     quantities,
@@ -38,7 +39,7 @@ from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.recording.plausibility import dead_band, hidden
 from alidade.pipelines.settings import Config
 
-BIAS = tuple(f"gyro_bias_{axis}" for axis in "xyz")
+BIAS = gyro_bias(0.05, 2e-3)
 # The usual grade of consumer gyros, one sigma; and how far from their stamps readings of a magnetometer are taken that
 # is read by itself, beside a gyro whose samples are means over an interval that may end at their stamps.
 SCALE = gyro_scale("gyro", "gyro", 1e-2)
@@ -46,12 +47,10 @@ SENSITIVITY = g_sensitivity(2e-4)
 DELAY = scalar("mag_delay", "s", 1e-2, "Magnetometer time delay (true time minus stamp).", "mag.delay")
 # A low-pass of 10 ms, beyond a mean over the sample interval.
 FILTER = scalar("gyro_filter", "s^2", 5e-5, "Low-pass of the gyro (half its response's second moment).", "gyro.filter")
-ARM = tuple(f"accel_arm_{axis}" for axis in "xyz")
+# Of the hand that turns a device.
+ARM = ParameterSpec("accel_arm", "m", 0.3, "Lever arm from the point of rotation to the accelerometer, {axis}.")
 EARTH = tuple(f"earth_rate_{axis}" for axis in "xyz")
 DELAY_KEY, FILTER_KEY, ARM_KEY, _ERRORS_KEY, _EARTH_KEY = (int(gtsam.symbol(letter, 0)) for letter in "dlrGe")
-# m; of the hand that turns a device.
-_ARM_PRIOR = 0.3
-_BIAS_PRIOR, _BIAS_REQUIRE = 0.05, 2e-3
 
 # Readings share a keyframe within this time, s, and keyframes are never farther apart than this, s.
 _SHARED, _APART = 0.1, 0.2
@@ -370,24 +369,23 @@ def turning(
         walk=walk.used,
         errors=errors,
     )
+    arm = None
+    if accel is not None and accel.swung:
+        arm = Parameter(ARM_KEY, tuple(replace(q, nuisance=True) for q in quantities(ARM, config)))
     earth = None if accel is None or data.latitude is None else _earth(data.latitude, declination)
     # A mean up to its stamp is late by half an interval, and has h^2 / 24 more of a filter than a point.
     lag = 0.5 * float(np.median(np.diff(data.gyro_t)))
     delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, lag)))
     low_pass = replace(FILTER, prior=float(np.hypot(FILTER.prior, lag**2 / 6.0)))
-    known = tuple(
-        Quantity(name, "rad/s", config.prior(name, _BIAS_PRIOR), _BIAS_PRIOR, config.require.get(name, _BIAS_REQUIRE))
-        for name in BIAS
-    )
     return Turning(
         chain=chain,
         earth=earth,
         mag=Rows(inside, np.repeat(np.arange(len(time)), np.diff(begins))),
         accel=rested or Rows(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)),
-        bias=Parameter(FIRST, known),
+        bias=Parameter(FIRST, quantities(BIAS, config)),
         delay=Parameter(DELAY_KEY, quantities(delay, config)),
         filter=Parameter(FILTER_KEY, quantities(low_pass, config)),
-        arm=_arm(config) if accel is not None and accel.swung else None,
+        arm=arm,
         earth_rate=_earth_rate(config) if earth is None else None,
         levels=(density, walk),
     )
@@ -405,11 +403,6 @@ def _earth_rate(config: Config) -> Parameter:
         for name in EARTH
     )
     return Parameter(_EARTH_KEY, tuple(known))
-
-
-def _arm(config: Config) -> Parameter:
-    known = (Quantity(name, "m", config.prior(name, _ARM_PRIOR), _ARM_PRIOR, np.inf, nuisance=True) for name in ARM)
-    return Parameter(ARM_KEY, tuple(known))
 
 
 def _inside(stamps: Array, gyro: Array) -> Index:

@@ -221,8 +221,8 @@ def test_the_gyro_bias_does_not_depend_on_the_accelerometers_offset() -> None:
     for seed in seeds:
         simulated = _simulated(TURNING.model_copy(update={"attitudes": 12, "turn_rad_s": 0.5}), seed)
         estimate = _solved(simulated)
-        some = [estimate.names.index(name) for name in BIAS]
-        error = estimate.values[some] - [simulated.truth[name] for name in BIAS]
+        some = [estimate.names.index(name) for name in BIAS.names]
+        error = estimate.values[some] - [simulated.truth[name] for name in BIAS.names]
         total += float(error @ np.linalg.solve(estimate.covariance[np.ix_(some, some)], error))
     dof = 3 * len(seeds)
     assert quantile(0.005, dof) < total < quantile(0.995, dof), f"NEES {total:.1f} for {dof}"
@@ -974,7 +974,7 @@ def test_the_formula_of_the_rate_subtracts_g_sensitivity_times_the_calibrated_fo
     K = np.array([[1.1, 0.02, 0.0], [0.0, 0.9, 0.1], [-0.05, 0.0, 1.0]])
     given = {f"accel_k{i + 1}{j + 1}": float(K[i, j]) for i in range(3) for j in range(3)}
     given |= {f"accel_b{i}": 0.1 for i in "123"}
-    given |= dict.fromkeys([*SENSITIVITY.names, *BIAS], 0.0) | {"gyro_g_xy": 1e-3, "gyro_bias_x": 0.02}
+    given |= dict.fromkeys([*SENSITIVITY.names, *BIAS.names], 0.0) | {"gyro_g_xy": 1e-3, "gyro_bias_x": 0.02}
     force, rate = np.array([[1.0, 9.0, -3.0]]), np.array([[0.1, 0.2, 0.3]])
     inputs = {"accel": (force - 0.1) @ np.linalg.inv(K).T, "gyro": rate + [1e-3 * 9.0 + 0.02, 0.0, 0.0]}
     np.testing.assert_allclose(apply(formulas(given), given, inputs)["w_b"], rate, atol=1e-12)
