@@ -25,7 +25,6 @@ from scipy.stats import chi2
 
 from alidade.factors import so3
 from alidade.factors.array import Array
-from alidade.factors.indexer import mounting_angles
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.estimation.problem import Estimate, Problem, Step, rotation_vector_coordinates
@@ -146,7 +145,7 @@ def _mount(seed: int) -> tuple[float, float, float]:
 
 def _angles(rotation_deg: tuple[float, float, float]) -> tuple[float, float, float]:
     """The indexer's mounting angles, deg, of a rotation vector."""
-    x, y, z = np.rad2deg(mounting_angles(so3.exp(np.deg2rad(rotation_deg)))).tolist()
+    x, y, z = np.rad2deg(so3.angles(so3.exp(np.deg2rad(rotation_deg)))).tolist()
     return x, y, z
 
 

@@ -37,19 +37,6 @@ _SIZES: dict[Option, int] = {"errors": 6, "temperature": 3, "encoder": len(ENCOD
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) / np.sqrt(12.0)
 
 
-def mounting(theta: ArrayLike) -> Array:
-    """Mounting rotation tRm (..., 4) of the angles theta (..., 3), rad."""
-    x, y, z = (np.asarray(theta, dtype=float)[..., i, None] for i in range(3))
-    return so3.compose(so3.exp(z * _EZ), so3.exp(y * _EY), so3.exp(x * _EX))
-
-
-def mounting_angles(tRm: ArrayLike) -> Array:
-    """Angles theta (..., 3), rad, of mounting rotations tRm (..., 4), with theta_y within +-pi/2."""
-    m = so3.matrix(tRm)
-    y = -np.arcsin(np.clip(m[..., 2, 0], -1.0, 1.0))
-    return np.stack([np.arctan2(m[..., 2, 1], m[..., 2, 2]), y, np.arctan2(m[..., 1, 0], m[..., 0, 0])], axis=-1)
-
-
 def base_from_platform(outer: ArrayLike, inner: ArrayLike, epsilon: ArrayLike = 0.0) -> Array:
     """Rotation baseRt (..., 4) of the platform at the axis angles, rad."""
     alpha, beta, tilt = (np.asarray(a, dtype=float)[..., None] for a in (outer, inner, epsilon))
@@ -318,7 +305,7 @@ class IndexerAverageFactor(Model):
         given = dict(zip(self.options, more, strict=True))
         epsilon, tilt = given.get("epsilon", np.zeros(1)), given.get("tilt", np.zeros(3))
         theta = self.theta_unit * theta
-        tRm = mounting(theta)
+        tRm = so3.from_angles(theta)
         corrected, N = self.gyro - bias, np.asarray(np.eye(3))
         if "temperature" in given:
             corrected = corrected - needed(self.temperature)[:, None] * given["temperature"]

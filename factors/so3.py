@@ -228,6 +228,19 @@ def from_matrix(r: ArrayLike) -> Array:
     return np.where(q[..., :1] < 0.0, -q, q)
 
 
+def from_angles(angles: ArrayLike) -> Array:
+    """Rotations Exp(z ez) Exp(y ey) Exp(x ex), (..., 4), of angles x, y, z (..., 3), rad."""
+    about_x, about_y, about_z = (np.asarray(angles, dtype=float)[..., i, None] * np.eye(3)[i] for i in range(3))
+    return compose(exp(about_z), exp(about_y), exp(about_x))
+
+
+def angles(q: ArrayLike) -> Array:
+    """Angles x, y, z (..., 3), rad, of rotations as `from_angles` takes them, with y within +-pi/2."""
+    m = matrix(q)
+    y = -np.arcsin(np.clip(m[..., 2, 0], -1.0, 1.0))
+    return np.stack([np.arctan2(m[..., 2, 1], m[..., 2, 2]), y, np.arctan2(m[..., 1, 0], m[..., 0, 0])], axis=-1)
+
+
 @_in_cache
 def right_jacobian(phi: ArrayLike) -> Array:
     """Right Jacobian J (..., 3, 3): Exp(phi + d) = Exp(phi) * Exp(J d) to first order.

@@ -51,9 +51,7 @@ class EulerMotion(ScenarioPart):
 
         In the passive matrices of the publications bRa = Rx(roll) Ry(pitch) Rz(yaw).
         """
-        angles = [angle(self.yaw, t), angle(self.pitch, t), angle(self.roll, t)]
-        turns = [so3.exp(a[:, None] * axis) for a, axis in zip(angles, np.eye(3)[::-1], strict=True)]
-        return so3.compose(*turns)
+        return so3.from_angles(np.stack([angle(each, t) for each in (self.roll, self.pitch, self.yaw)], axis=1))
 
 
 def angle(swings: Sequence[Swing], t: Array) -> Array:
@@ -102,11 +100,6 @@ class Warming(ScenarioPart):
     def at(self, t: Array) -> Array:
         """Temperatures (n,) at times (n,), s, degrees Celsius."""
         return np.asarray(self.start_c - self.rise_k * np.expm1(-t / self.time_constant_s))
-
-    def measured(self, duration: float) -> Temperature:
-        """Temperatures as messages state them, from the start until the end, s."""
-        t = np.arange(np.floor(duration * self.rate_hz) + 1.0) / self.rate_hz
-        return Temperature(t, self.at(t))
 
 
 def true_values(specs: Sequence[ParameterSpec], scenario: Any, rng: np.random.Generator) -> dict[str, float]:
@@ -181,8 +174,11 @@ def read_by(rate: Array, sensor: str, values: Mapping[str, float], force: Array 
 
 
 def measured(warming: Warming | None, duration: float) -> Temperature | None:
-    """Temperatures as messages state them; None without a topic."""
-    return None if warming is None else warming.measured(duration)
+    """Temperatures as messages state them, from the start until the end, s; None without a topic."""
+    if warming is None:
+        return None
+    t = np.arange(np.floor(duration * warming.rate_hz) + 1.0) / warming.rate_hz
+    return Temperature(t, warming.at(t))
 
 
 def drift(warming: Warming | None, sensor: str, values: Mapping[str, float], t: Array) -> Array:

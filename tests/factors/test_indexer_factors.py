@@ -19,8 +19,6 @@ from alidade.factors.indexer import (
     base_from_platform,
     gyro_edges,
     gyro_means,
-    mounting,
-    mounting_angles,
 )
 from alidade.factors.testing import assert_jacobians
 from tests.support.numerics import assert_rows_are_independent
@@ -105,9 +103,9 @@ def test_angles_make_the_mounting_of_the_publication_and_come_back() -> None:
     theta = RNG.uniform(-1.2, 1.2, size=(50, 3))
     passive = [so3.matrix(so3.inverse(so3.exp(theta[:, i : i + 1] * e))) for i, e in enumerate(np.eye(3))]
     np.testing.assert_allclose(
-        so3.matrix(so3.inverse(mounting(theta))), passive[0] @ passive[1] @ passive[2], atol=1e-12
+        so3.matrix(so3.inverse(so3.from_angles(theta))), passive[0] @ passive[1] @ passive[2], atol=1e-12
     )
-    np.testing.assert_allclose(mounting_angles(mounting(theta)), theta, atol=1e-12)
+    np.testing.assert_allclose(so3.angles(so3.from_angles(theta)), theta, atol=1e-12)
 
 
 def test_gyro_mean_is_the_integral_between_sample_edges() -> None:
@@ -189,7 +187,7 @@ def test_residual_vanishes_at_the_truth() -> None:
     w = so3.rotate(so3.exp(tilt), fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
     xx, yy, zz, xy, xz, yz = errors[0]
     gain = np.eye(3) + np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    gyro = so3.rotate(so3.inverse(mounting(theta)), w) @ gain + bias + TEMPERATURE[:, None] * slope
+    gyro = so3.rotate(so3.inverse(so3.from_angles(theta)), w) @ gain + bias + TEMPERATURE[:, None] * slope
     model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0, OPTIONS, temperature=TEMPERATURE)
     np.testing.assert_allclose(model(theta, bias, errors, slope, encoder, epsilon, tilt)[0], 0.0, atol=1e-13)
     assert np.abs(model(theta + 1e-3, bias, errors, slope, encoder, epsilon, tilt)[0]).max() > 1e-5

@@ -168,3 +168,8 @@ def test_shortest_rotation_takes_one_vector_to_the_other(angle: float) -> None:
     np.testing.assert_allclose(so3.rotate(found, a), b, atol=2e-7 if angle > 3.0 else 1e-12)
     np.testing.assert_allclose(np.linalg.norm(so3.log(found), axis=1), angle, atol=2e-7 if angle > 3.0 else 1e-12)
     np.testing.assert_array_equal(so3.shortest(a[0], b[0]), found[0])
+
+
+def test_angles_of_any_rotation_make_it_again() -> None:
+    q = so3.normalize(np.random.default_rng(1).standard_normal((200, 4)))
+    np.testing.assert_allclose(so3.local(so3.from_angles(so3.angles(q)), q), 0.0, atol=1e-8)

@@ -15,7 +15,7 @@ import pytest
 import alidade
 from alidade.factors import so3
 from alidade.factors.array import Array
-from alidade.factors.indexer import base_from_platform, mounting
+from alidade.factors.indexer import base_from_platform
 from alidade.factors.los import LosDirectionFactor
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.diagnose import diagnose
@@ -141,7 +141,7 @@ def test_indexer_formulas_scale_the_gyro_and_tilt_the_axes_where_these_are_free(
     values = {name: float(x) for name, x in zip(free, 0.1 * rng.normal(size=len(free)), strict=True)}
     theta, bias, scale = (np.array([values[f"{n}_{a}"] for a in "xyz"]) for n in ("theta", "gyro_bias", "gyro_scale"))
     rate = rng.normal(size=3)
-    measured = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), rate) + bias
+    measured = (1.0 + scale) * so3.rotate(so3.inverse(so3.from_angles(theta)), rate) + bias
     found = apply(
         method("indexer").report.formulas(free, Config()), values, {"gyro": measured, "outer": 0.3, "inner": 0.7}
     )

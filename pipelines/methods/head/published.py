@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from alidade.factors import so3
 from alidade.factors.array import Array, interpolated
@@ -73,7 +72,7 @@ def euler_kalman_filter(
     inside = (data.vision_t >= data.head_t[0]) & (data.vision_t <= data.head_t[-1])
     if not inside.any():
         raise InputError("vision and helmet gyro do not overlap in time: the published filter has nothing to do")
-    t, measured = data.vision_t[inside], euler_angles(data.vision_wxyz[inside])
+    t, measured = data.vision_t[inside], so3.angles(data.vision_wxyz[inside])[:, ::-1]  # yaw, pitch, roll
     x = np.concatenate([measured[0], np.zeros(3)])
     P = np.diag(np.repeat([vision_sigma**2, _BIAS_SIGMA**2], 3))
     R = vision_sigma**2 * np.eye(3)
@@ -94,7 +93,7 @@ def euler_kalman_filter(
     history = np.array(states)
     return HeadFilterResult(
         t=t,
-        wxyz=attitude(history[:, :3]),
+        wxyz=so3.from_angles(history[:, 2::-1]),
         bias=_smooth(history[:, 3:], _SMOOTHED, _SMOOTHING_SIGMA),
         bias_sigma=np.array(sigmas)[:, 3:],
         innovation=np.array(innovations),
@@ -141,22 +140,6 @@ def _smooth(bias: Array, window: int, threshold: float) -> Array:
     padded = np.concatenate([np.repeat(bias[:1], window - 1, axis=0), bias])
     recent = np.lib.stride_tricks.sliding_window_view(padded, window, axis=0)
     return np.asarray(np.where(recent.std(axis=-1) > threshold, recent.mean(axis=-1), bias))
-
-
-def attitude(angles: ArrayLike) -> Array:
-    """Attitudes bRv (..., 4) from yaw, pitch, roll (..., 3), rad."""
-    yaw, pitch, roll = (np.asarray(angles, dtype=float)[..., i, None] for i in range(3))
-    ex, ey, ez = np.eye(3)
-    return so3.compose(so3.exp(yaw * ez), so3.exp(pitch * ey), so3.exp(roll * ex))
-
-
-def euler_angles(bRv: ArrayLike) -> Array:
-    """Yaw, pitch, roll (..., 3), rad, of attitudes (..., 4), with pitch within +-pi/2."""
-    m = so3.matrix(bRv)
-    yaw = np.arctan2(m[..., 1, 0], m[..., 0, 0])
-    pitch = -np.arcsin(np.clip(m[..., 2, 0], -1.0, 1.0))
-    roll = np.arctan2(m[..., 2, 1], m[..., 2, 2])
-    return np.stack([yaw, pitch, roll], axis=-1)
 
 
 def euler_rates(angles: Array, w_iv: Array, w_ib: Array) -> tuple[Array, Array, Array]:

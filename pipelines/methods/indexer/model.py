@@ -21,14 +21,7 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.array import Array, Index
 from alidade.factors.earth import EARTH_RATE
-from alidade.factors.indexer import (
-    ENCODER_ERRORS,
-    IndexerAverageFactor,
-    Option,
-    base_from_platform,
-    mounting,
-    mounting_angles,
-)
+from alidade.factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option, base_from_platform
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.noise import Level, Noise
@@ -380,7 +373,7 @@ def guess(groups: tuple[Group, ...]) -> tuple[Array, Array]:
     # A trace of the identity decides what one axis alone leaves open.
     trace = 1e-6 * np.linalg.norm(((gyro - b) * weight[:, None]).T @ w)
     tRm = so3.align(np.vstack([w, np.eye(3)]), np.vstack([gyro - b, np.eye(3)]), np.append(weight, np.full(3, trace)))
-    return mounting_angles(tRm), b
+    return so3.angles(tRm), b
 
 
 # Of the trajectory, Hz.
@@ -405,5 +398,5 @@ def carrier(data: IndexerData, motion: AxisMotion, rows: Index, theta: Array, ep
             (np.interp(at, motion.t, read) for read in motion.angles.T), encoder[:4].reshape(2, 2), strict=True
         )
     )
-    mRb = so3.multiply(so3.inverse(mounting(theta)), so3.inverse(base_from_platform(outer, inner, epsilon)))
+    mRb = so3.multiply(so3.inverse(so3.from_angles(theta)), so3.inverse(base_from_platform(outer, inner, epsilon)))
     return so3.multiply(data.attitude[rows], mRb)

@@ -140,10 +140,8 @@ def cost(theta: ArrayLike, measured: Sequence[HalfDifference]) -> float:
 
 def _across(theta: ArrayLike, measured: Sequence[HalfDifference]) -> list[Array]:
     """Components (2,) of each half difference across the rotation axis in t, rad/s."""
-    x, y, z = np.asarray(theta, dtype=float)
-    ex, ey, ez = np.eye(3)
-    C_m_t = so3.compose(so3.exp(z * ez), so3.exp(y * ey), so3.exp(x * ex))
-    in_t = [so3.rotate(C_m_t, half.rate) for half in measured]
+    tRm = so3.from_angles(theta)
+    in_t = [so3.rotate(tRm, half.rate) for half in measured]
     return [rate[1:] if half.axis == "outer" else rate[:2] for rate, half in zip(in_t, measured, strict=True)]
 
 

@@ -14,7 +14,7 @@ from alidade.factors import so3
 from alidade.factors.array import Array, Index
 from alidade.factors.earth import EARTH_RATE
 from alidade.factors.gyro import symmetric
-from alidade.factors.indexer import IndexerAverageFactor, mounting
+from alidade.factors.indexer import IndexerAverageFactor
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
 from alidade.pipelines.display.figure import AXES, COLORS, Figure, Plot
@@ -106,7 +106,7 @@ def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | Non
     ):
         labels, across = [], []
         for half in found:
-            in_t = so3.rotate(mounting(theta), half.rate) / np.linalg.norm(half.rate) * _ARCSEC
+            in_t = so3.rotate(so3.from_angles(theta), half.rate) / np.linalg.norm(half.rate) * _ARCSEC
             for axis in (1, 2) if half.axis == "outer" else (0, 1):
                 labels.append(f"{half.position} {AXES[axis]}t")
                 across.append(float(in_t[axis]))
@@ -216,7 +216,7 @@ def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array,
         values: parameters by name; those not named are zero.
     """
     tRm, bias, gain = (
-        mounting(several(values, THETA)),
+        so3.from_angles(several(values, THETA)),
         several(values, BIAS),
         np.eye(3) + symmetric(several(values, ERRORS)),
     )

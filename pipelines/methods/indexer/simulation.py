@@ -239,8 +239,7 @@ def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t:
         outer_axis = so3.exp(w * (np.cos(a) * ey + np.sin(a) * ez))
         inner_axis = so3.exp(w * (np.cos(b) * ex + np.sin(b) * ey))
     tilt = so3.exp(scenario.axis_nonperpendicularity_arcsec * ARCSEC * ey)
-    x, y, z = np.deg2rad(scenario.mounting_deg)
-    tRm = so3.compose(so3.exp(z * ez), so3.exp(y * ey), so3.exp(x * ex))
+    tRm = so3.from_angles(np.deg2rad(scenario.mounting_deg))
     baseRt = so3.compose(outer_axis, so3.exp(outer * ex), tilt, inner_axis, so3.exp(inner * ez))
     return so3.compose(np.array(scenario.base_attitude), baseRt, tRm)
 

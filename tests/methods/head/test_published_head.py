@@ -33,12 +33,6 @@ def bias(truth: dict[str, float]) -> np.ndarray:
     return np.array([truth[f"gyro_bias_{axis}"] for axis in "xyz"])
 
 
-def test_euler_angles_round_trip() -> None:
-    rng = np.random.default_rng(1)
-    bRv = so3.normalize(rng.standard_normal((200, 4)))
-    assert error_deg(published.attitude(published.euler_angles(bRv)), bRv).max() < 1e-6
-
-
 def test_euler_rates_move_the_attitude_at_the_rate_they_were_made_from() -> None:
     rng = np.random.default_rng(2)
     for _ in range(50):
@@ -46,9 +40,9 @@ def test_euler_rates_move_the_attitude_at_the_rate_they_were_made_from() -> None
         w_iv, w_ib = rng.standard_normal((2, 3))
         rates, _, _ = published.euler_rates(angles, w_iv, w_ib)
         h = 1e-5
-        before, after = published.attitude(angles - h * rates), published.attitude(angles + h * rates)
+        before, after = (so3.from_angles((angles + step * rates)[::-1]) for step in (-h, h))
         w_bv = so3.log(so3.multiply(so3.inverse(before), after)) / (2 * h)
-        expected = w_iv - so3.rotate(so3.inverse(published.attitude(angles)), w_ib)
+        expected = w_iv - so3.rotate(so3.inverse(so3.from_angles(angles[::-1])), w_ib)
         np.testing.assert_allclose(w_bv, expected, atol=1e-7)
 
 

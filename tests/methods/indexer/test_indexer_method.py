@@ -10,7 +10,6 @@ import pytest
 
 from alidade.factors import so3
 from alidade.factors.chi_square import quantile
-from alidade.factors.indexer import mounting
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import rms
 from alidade.pipelines.estimation.parameters import prior_z_score
@@ -272,7 +271,7 @@ def test_real_turns_by_hand_against_imucal(shared_data: Path) -> None:
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
     scale, theta, bias = (np.array([values[f"{n}_{a}"] for a in "xyz"]) for n in ("gyro_scale", "theta", "gyro_bias"))
     np.testing.assert_allclose(COUNTS * (1.0 + scale), np.diag(published["K_g"]), rtol=2e-3)
-    mRt = so3.matrix(so3.inverse(mounting(theta)))
+    mRt = so3.matrix(so3.inverse(so3.from_angles(theta)))
     np.testing.assert_allclose(np.rad2deg(mRt), -np.rad2deg(published["R_g"]), atol=0.25)
     np.testing.assert_allclose(np.rad2deg(bias) * COUNTS, published["b_g"], atol=0.1)
 
