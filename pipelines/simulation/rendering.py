@@ -9,12 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from alidade.factors import so3
 from alidade.factors.array import Array, Mask
+from alidade.pipelines.recording.series import CameraInfo
+from alidade.pipelines.simulation.scenario import NotNegative, Positive, ScenarioPart
 from alidade.pipelines.vision.camera import Camera
 
 Picture = NDArray[np.uint8]
@@ -25,6 +29,29 @@ _PARTS = ((1, 20.0), (2, 80.0), (4, np.inf))
 _BLACK, _WHITE = 20.0, 220.0
 # About so many at a time, which stay in the cache with all that is made of them on the way.
 _PIXELS = 8192
+
+
+class PinholeCamera(ScenarioPart):
+    """Settings of a camera and its pictures: pinhole, plumb_bob distortion, not quite centred."""
+
+    width: Annotated[int, Field(gt=0)] = 640
+    height: Annotated[int, Field(gt=0)] = 480
+    focal_px: Positive
+    distortion: list[float]  # k1 k2 p1 p2 k3
+    blur_px: NotNegative = 0.7  # sigma
+    grey_noise: NotNegative = 2.0  # sigma, grey levels of 255
+
+    @property
+    def camera(self) -> Camera:
+        """The camera. Raises InputError where none can have that distortion."""
+        f, x, y = self.focal_px, 0.5 * (self.width - 1.0) + 3.4, 0.5 * (self.height - 1.0) - 2.7
+        K = np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
+        return Camera(self.width, self.height, K, "plumb_bob", np.array(self.distortion))
+
+    def info(self, t_ns: int) -> CameraInfo:
+        """Description of the camera at a stamp, Unix ns."""
+        camera = self.camera
+        return CameraInfo.of(t_ns, (self.width, self.height), camera.distortion_model, camera.coefficients, camera.K)
 
 
 @cache

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from alidade.factors import so3
@@ -25,7 +24,7 @@ from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import Board, SensorSheets, Tag
-from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
+from alidade.pipelines.simulation.rendering import PinholeCamera, Renderer, encode, expose, tag_quad
 from alidade.pipelines.simulation.scenario import EPOCH_NS, NotNegative, Positive, ScenarioPart, Simulated
 from alidade.pipelines.simulation.sensors import (
     EulerMotion,
@@ -43,15 +42,12 @@ from alidade.pipelines.simulation.sensors import (
     smooth_map,
     true_values,
 )
-from alidade.pipelines.vision.camera import Camera
 
 Fraction = Annotated[float, Field(ge=0.0, lt=1.0)]
 Vector = tuple[float, float, float]
 
 # The head's sway goes round in no common period, Hz.
 _SWAY_HZ = (0.31, 0.23, 0.17)
-# Off the middle of the picture, px, as principal points are.
-_OFF_CENTRE = (3.4, -2.7)
 
 
 def _board(*tags: tuple[float, float, float, float]) -> Board:
@@ -67,60 +63,17 @@ def _board(*tags: tuple[float, float, float, float]) -> Board:
     return Board(tags=out)
 
 
-class HeadPictures(ScenarioPart):
+class HeadPictures(PinholeCamera):
     """Settings of camera, pictures and tag board: a pinhole camera with plumb_bob distortion."""
 
-    width: Annotated[int, Field(gt=0)] = 640
-    height: Annotated[int, Field(gt=0)] = 480
     focal_px: Positive = 620.0
     distortion: list[float] = [-0.22, 0.09, 8e-4, -5e-4, 0.0]  # k1 k2 p1 p2 k3
-    blur_px: NotNegative = 0.7  # sigma
-    grey_noise: NotNegative = 2.0  # sigma, grey levels of 255
     format: Literal["png", "jpeg"] = "jpeg"
     board: Board = _board(
         (-0.032, -0.032, 12, -12), (0.032, -0.032, 12, 12), (-0.032, 0.032, 0, 0), (0.032, 0.032, 0, 0)
     )
     position_m: Vector = (0.0, 0.0, 0.34)  # of the board's origin in the camera's frame, on average
     sway_m: Vector = (0.015, 0.01, 0.02)  # amplitude about that
-
-
-def draw(
-    settings: HeadPictures, t: Array, t_ns: NDArray[np.int64], cRh: Array, rng: np.random.Generator
-) -> tuple[series.CameraInfo, series.ImageSeries]:
-    """Return the camera's description and its pictures, rendered one by one.
-
-    Args:
-        settings: camera and board.
-        t: (K,) when the pictures are taken, s.
-        t_ns: (K,) their stamps, Unix ns.
-        cRh: (K, 4) the board's attitude at those times.
-        rng: of the sensor's noise.
-
-    Raises:
-        InputError: no camera can have that distortion.
-    """
-    centre = np.array([settings.width - 1.0, settings.height - 1.0]) / 2.0 + _OFF_CENTRE
-    K = np.array([[settings.focal_px, 0.0, centre[0]], [0.0, settings.focal_px, centre[1]], [0.0, 0.0, 1.0]])
-    camera = Camera(settings.width, settings.height, K, "plumb_bob", np.array(settings.distortion))
-    size = camera.width, camera.height
-    info = series.CameraInfo.of(int(t_ns[0]), size, camera.distortion_model, camera.coefficients, K)
-    position = np.array(settings.position_m) + np.array(settings.sway_m) * np.sin(2.0 * np.pi * t[:, None] * _SWAY_HZ)
-    files = _exposures(settings, camera, cRh, position, rng)
-    return info, series.ImageSeries(t_ns, files, settings.format, "camera")
-
-
-def _exposures(
-    settings: HeadPictures, camera: Camera, cRh: Array, position: Array, rng: np.random.Generator
-) -> Iterator[bytes]:
-    """Yield the pictures' files."""
-    renderer = Renderer(camera)
-    for attitude, origin in zip(cRh, position, strict=True):
-        quads = [
-            tag_quad(i, tag.size, so3.multiply(attitude, tag.rotation), origin + so3.rotate(attitude, tag.position))
-            for i, tag in settings.board.tags.items()
-        ]
-        picture = expose(renderer.radiance(quads), settings.blur_px, settings.grey_noise, rng)
-        yield encode(picture, settings.format, 92)
 
 
 class HeadNoise(ScenarioPart):
@@ -230,11 +183,24 @@ def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraI
     """
     if scenario.outlier_fraction > 0.0:
         raise InputError("outlier_fraction: pictures are simulated without outliers; leave out --images")
-    rng_of_sensors = np.random.default_rng([seed, 1])
-    effects = true_values(NUISANCE, scenario, rng_of_sensors)
+    effects = true_values(NUISANCE, scenario, np.random.default_rng([seed, 1]))
     t, at, cRh = _sights(scenario, effects)
-    rng = np.random.default_rng(seed)
-    return draw(scenario.pictures, at, nanoseconds(t, EPOCH_NS), cRh, rng)
+    settings, t_ns = scenario.pictures, nanoseconds(t, EPOCH_NS)
+    position = np.array(settings.position_m) + np.array(settings.sway_m) * np.sin(2.0 * np.pi * at[:, None] * _SWAY_HZ)
+    files = _exposures(settings, cRh, position, np.random.default_rng(seed))
+    return settings.info(int(t_ns[0])), series.ImageSeries(t_ns, files, settings.format, "camera")
+
+
+def _exposures(settings: HeadPictures, cRh: Array, position: Array, rng: np.random.Generator) -> Iterator[bytes]:
+    """Yield the pictures' files."""
+    renderer = Renderer(settings.camera)
+    for attitude, origin in zip(cRh, position, strict=True):
+        quads = [
+            tag_quad(i, tag.size, so3.multiply(attitude, tag.rotation), origin + so3.rotate(attitude, tag.position))
+            for i, tag in settings.board.tags.items()
+        ]
+        picture = expose(renderer.radiance(quads), settings.blur_px, settings.grey_noise, rng)
+        yield encode(picture, settings.format, 92)
 
 
 def head_config(scenario: HeadScenario, images: bool = False) -> str:

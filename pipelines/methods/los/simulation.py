@@ -13,7 +13,7 @@ to what its gyro reads, errors included.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Annotated, Literal, Self
 
@@ -31,6 +31,7 @@ from alidade.pipelines.methods.los.recording import JOINTS, LosData
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import SensorSheets
+from alidade.pipelines.simulation.rendering import PinholeCamera, Quad, Renderer, encode, expose, tag_quad
 from alidade.pipelines.simulation.scenario import EPOCH_NS, NotNegative, Positive, ScenarioPart, Share, Simulated
 from alidade.pipelines.simulation.sensors import (
     EulerMotion,
@@ -85,17 +86,13 @@ class Loss(ScenarioPart):
     elevation_step_deg: float = 0.0
 
 
-class LosCamera(ScenarioPart):
+class LosCamera(PinholeCamera):
     """Settings of pictures of the target: pinhole camera with plumb_bob distortion, scene, image quality."""
 
-    width: Annotated[int, Field(gt=0)] = 640
-    height: Annotated[int, Field(gt=0)] = 480
     focal_px: Positive = 2000.0
     distortion: list[float] = [-0.2, 0.1, 5e-4, 3e-4, 0.0]
     target: Literal["tag", "texture"] = "tag"
     target_size: Positive = 0.1  # edge of the tag's black square per distance, or a quarter of the texture's width
-    blur_px: NotNegative = 0.7
-    grey_noise: NotNegative = 2.0
 
 
 class LosScenario(ScenarioPart):
@@ -312,28 +309,17 @@ def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraIn
     stamps, cRt = targets(scenario, motion, rng)
     if scenario.losses:
         raise InputError("losses: pictures are simulated of a single target; leave out --images")
-    camera = scenario.camera
-    centre = 0.5 * camera.width - 0.5 + 3.4, 0.5 * camera.height - 0.5 - 2.7
-    K = np.array([[camera.focal_px, 0.0, centre[0]], [0.0, camera.focal_px, centre[1]], [0.0, 0.0, 1.0]])
     t_ns = nanoseconds(stamps, EPOCH_NS)
-    size = camera.width, camera.height
-    info = series.CameraInfo.of(int(t_ns[0]), size, "plumb_bob", np.array(camera.distortion), K)
-    # The lens magnifies by more than CameraInfo knows.
-    magnified = 1.0 + motion.effects["los_scale"]
-    lens = K * np.array([magnified, magnified, 1.0])
-    return info, series.ImageSeries(t_ns, _exposures(camera, lens, cRt, rng), "jpeg", "camera")
+    files = _exposures(scenario.camera, 1.0 + motion.effects["los_scale"], cRt, rng)
+    return scenario.camera.info(int(t_ns[0])), series.ImageSeries(t_ns, files, "jpeg", "camera")
 
 
-def _exposures(settings: LosCamera, K: Array, cRt: Array, rng: np.random.Generator) -> Iterator[bytes]:
-    """Pictures of a target at unit distance, as JPEG files."""
-    from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-    from alidade.pipelines.vision.camera import Camera
-
-    camera = Camera(settings.width, settings.height, K, "plumb_bob", np.array(settings.distortion))
-    renderer = Renderer(camera)
+def _exposures(settings: LosCamera, magnified: float, cRt: Array, rng: np.random.Generator) -> Iterator[bytes]:
+    """Pictures of a target at unit distance, as JPEG files, by a lens that magnifies by more than CameraInfo knows."""
+    camera = settings.camera
+    renderer = Renderer(replace(camera, K=camera.K * np.array([magnified, magnified, 1.0])))
     oRc = so3.from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
-    # The target's face: x right, y up, z towards the camera.
-    tRq = so3.from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
+    tRq = oRc  # the target's face: x right, y up, z towards the camera
     texture = _texture(rng) if settings.target == "texture" else None
     for attitude in so3.multiply(oRc, cRt):
         position, oRq = so3.rotate(attitude, [0.0, 1.0, 0.0]), so3.multiply(attitude, tRq)
