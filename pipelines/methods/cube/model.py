@@ -12,7 +12,7 @@ accel_k31 and accel_k32 are zero unless given a prior.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -67,7 +67,6 @@ from alidade.pipelines.methods.cube.static_poses import (
     cube_reference,
     from_vectors,
     static_poses,
-    turn,
 )
 from alidade.pipelines.methods.cube.tags import layout_prior
 from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
@@ -87,6 +86,16 @@ _NO_FIELD = (
 _POSITION_PRIOR_SIGMA, _ATTITUDE_PRIOR_SIGMA = 10.0, np.pi
 
 
+def _key_of_pose(letter: str) -> Callable[[int], int]:
+    return lambda k: int(gtsam.symbol(letter, k))
+
+
+# Variables of pose k: attitude nRb (Rot3); the cube's position in the camera frame, (3,) m; reference attitude nRB
+# (Rot3), that of pose 0 for a stationary reference; the gyro offset's deviation from its mean, (3,), nominal units; the
+# sum of deviations up to this pose, weighted by duration.
+pose_key, place_key, reference_key, deviation_key, sum_key = map(_key_of_pose, "xpRde")
+
+
 def problem(data: CubeData, config: Config) -> Problem:
     """Build the graph of a cube recording.
 
@@ -95,6 +104,7 @@ def problem(data: CubeData, config: Config) -> Problem:
             the cube is seen well though there is a camera.
     """
     model = prepare(data, config)
+    premises = {_NO_FIELD: model.poses.mag is not None and model.field is None, DEAD_BAND: model.dead_band > 0.0}
     graph = Problem(
         method="cube",
         parameters=model.parameters.all,
@@ -103,7 +113,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         attitudes=partial(_trajectory, model),
         advice=advice,
         dropped=model.dropped,
-        premises=_premises(model),
+        premises=tuple(premise for premise, holds in premises.items() if holds),
         noises=tuple(noises(data, config).values()),
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=ChainLayout(states="xdepR" if model.reference.moves else "xdep"),
@@ -121,15 +131,6 @@ def _by_sheets(known: Problem, plain: Problem) -> Problem:
         replace(p, quantities=tuple(replace(q, sheet=sheets[q.name]) for q in p.quantities)) for p in known.parameters
     )
     return replace(known, parameters=parameters, premises=plain.premises)
-
-
-def _premises(model: Model) -> tuple[str, ...]:
-    """Sentences about missing information in the recording."""
-    lacking = {
-        _NO_FIELD: model.poses.mag is not None and model.field is None,
-        DEAD_BAND: model.dead_band > 0.0,
-    }
-    return tuple(sentence for sentence, lacks in lacking.items() if lacks)
 
 
 def _steps(model: Model, _: int) -> Iterator[Step]:
@@ -255,10 +256,11 @@ class Model:
 
     def samples(self, k: int) -> Turning:
         """Readings of gyro and accelerometer over the turn that ends in pose k."""
-        rows = turn(self.data, self.poses.span[k - 1, 1], self.poses.span[k, 0])
+        t, start, stop = self.data.imu_t, self.poses.span[k - 1, 1], self.poses.span[k, 0]
+        rows = slice(np.searchsorted(t, start), np.searchsorted(t, stop, side="right"))
         raw = self.config.section(CubeConfig).raw
         gyro, accel = nominal(self.data.gyro[rows], raw.gyro), nominal(self.data.accel[rows], raw.accel)
-        t, warming = self.data.imu_t[rows], self.data.temperature
+        t, warming = t[rows], self.data.temperature
         return Turning(t, gyro, accel, self.beyond[rows], None if warming is None else warming.above(warming.first, t))
 
     @property
@@ -383,21 +385,6 @@ def noises(data: CubeData, config: Config) -> dict[str, Level]:
 _FOCAL_STEP, _CENTRE_STEP = 1e-4, 0.1
 
 
-def pose_key(k: int) -> int:
-    """Key of the attitude nRb (Rot3) in pose k."""
-    return int(gtsam.symbol("x", k))
-
-
-def place_key(k: int) -> int:
-    """Key of the cube's position in the camera frame in pose k, (3,) m."""
-    return int(gtsam.symbol("p", k))
-
-
-def reference_key(k: int) -> int:
-    """Key of the reference attitude nRB (Rot3) in pose k; that of pose 0 for a stationary reference."""
-    return int(gtsam.symbol("R", k))
-
-
 def sensor_factors(model: Model, k: int) -> list[Factor]:
     """Factors of accelerometer, gyro and magnetometer at rest in pose k."""
     poses, row = model.poses, slice(k, k + 1)
@@ -506,16 +493,6 @@ def turn_factor(model: Model, k: int) -> Factor:
 
 # A gyro bias that does not walk still does so by this much, rad/s, for the sake of the arithmetic.
 _STEADY = 1e-8
-
-
-def deviation_key(k: int) -> int:
-    """Key of the offset's deviation from its mean in pose k, (3,), nominal units."""
-    return int(gtsam.symbol("d", k))
-
-
-def sum_key(k: int) -> int:
-    """Key of the sum of deviations up to pose k, weighted by duration, (3,), nominal units."""
-    return int(gtsam.symbol("e", k))
 
 
 @dataclass(frozen=True)

@@ -240,12 +240,15 @@ def cube_parameters(
         triads[name] = _triad_parameter(TRIAD_KEYS[name], plain, getattr(config.section(CubeConfig).raw, name))
         priors[name] = prior_sigmas(Parameter(0, tuple(plain)))
     rotations: list[Parameter] = []
+    places: list[Parameter] = []
     said = None
     if camera:
         rotations.append(Parameter(MOUNT_KEY, nuisance(MOUNT, not reference), rotation_vector_coordinates))
         for tag in tags:
+            # The first tag defines the body frame.
             own = nuisance(_given(of_tag(TAG, tag), config), tag == tags[0])
             rotations.append(Parameter(tag_key(tag), own, rotation_vector_coordinates))
+            places.append(Parameter(tag_place_key(tag), quantities(of_tag(PLACE, tag), config, tag == tags[0])))
         tilt = [q if reference else replace(q, prior_sigma=0.0) for q in quantities(TILT, config)]
         said = Parameter(SAID_KEY, (*tilt, *nuisance(HEADING, not reference)))
     field_parameter = field_prior = None
@@ -257,7 +260,7 @@ def cube_parameters(
         triads=triads,
         priors=priors,
         rotations=tuple(rotations),
-        places=tuple(_place(tag, tag == tags[0], config) for tag in tags) if camera else (),
+        places=tuple(places),
         said=said,
         field=field_parameter,
         field_prior=field_prior,
@@ -290,11 +293,6 @@ def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Factor
 def _given(spec: ParameterSpec, config: Config) -> ParameterSpec:
     """Give a spec its data-sheet prior without marking it as a sensor error."""
     return replace(spec, prior=stated(config, spec), data_sheet="")
-
-
-def _place(tag: int, fixed: bool, config: Config) -> Parameter:
-    """Parameter of a tag's position correction; that of the tag that defines the body frame is fixed."""
-    return Parameter(tag_place_key(tag), quantities(of_tag(PLACE, tag), config, fixed))
 
 
 def _slopes(config: Config) -> dict[str, Parameter]:

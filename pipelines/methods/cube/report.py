@@ -301,7 +301,8 @@ def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
     estimate = calibration.estimate
     values = calibration.problem.numbers(estimate)
     poses = static_poses(data, config)
-    found: list[Plot | Table | None] = [*cube_tables(calibration)]
+    tables = _noise_table(calibration), _static_poses(calibration), _disturbed_table(calibration)
+    found: list[Plot | Table | None] = [table for table in tables if table.rows]
     found += [_before_and_after(*rows) for rows in _errors(data, config, poses, calibration, values)]
     for name, strength in _strengths(data, values).items():
         found.append(_sphere(name, strength, data, config, poses, values))
@@ -533,16 +534,6 @@ def coverage(calibration: Calibration) -> Plot | None:
 
 
 _NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg(60.0)), "mag": ("nT/√Hz", 1e9)}
-
-
-def cube_tables(calibration: Calibration) -> list[Table]:
-    """Tables of the findings beside the parameters; empty ones are left out."""
-    tables = (
-        _noise_table(calibration),
-        _static_poses(calibration),
-        _disturbed_table(calibration),
-    )
-    return [table for table in tables if table.rows]
 
 
 def rows_of(calibration: Calibration, name: str) -> Sequence[Mapping[str, Any]]:

@@ -125,11 +125,6 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
     return StaticPoses(span, gyro, accel, duration, unrest, mag, mag_duration, celsius, tags, dropped)
 
 
-def turn(data: CubeData, start: float, stop: float) -> slice:
-    """Slice of the device's samples from one stamp to another, both included."""
-    return slice(int(np.searchsorted(data.imu_t, start)), int(np.searchsorted(data.imu_t, stop, side="right")))
-
-
 def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
     """Means (P, d) over the spans, NaN over empty ones, and averaging time (P,), s."""
     first, last = np.searchsorted(t, span[:, 0]), np.searchsorted(t, span[:, 1], side="right")
