@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import write_file
 from alidade.pipelines.methods.cube.simulation import FACES, SIDES
@@ -55,16 +56,16 @@ def print_cube(out: Path, edge: float, first_id: int = 16) -> None:
     write_file(out.with_suffix(".yaml"), "\n".join(["cube:", "  tag_family: 36h11", "  tags:", *tags, ""]))
 
 
-def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
+def _numbers(values: Sequence[float] | Array) -> str:
     return f"[{', '.join(f'{value:.9g}' for value in values)}]"
 
 
-def _side(axis: NDArray[np.float64]) -> str:
+def _side(axis: Array) -> str:
     """Side of the cube nearest to the direction of a vector."""
     return max(SIDES, key=lambda side: float(np.dot(SIDES[side], axis)))
 
 
-def _face(edge: float, tag: int, bRt: NDArray[np.float64]) -> str:
+def _face(edge: float, tag: int, bRt: Array) -> str:
     """Drawing commands of one page, the print of one face."""
     from alidade.pipelines.simulation.rendering import tag_bits
 

@@ -14,10 +14,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem, Residuals
@@ -140,7 +139,7 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
     )
 
 
-def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArray[np.intp], Array]:
+def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[Index, Array]:
     """Indices of the poses with visible cube, and nRb = nRB BRC cRb there, with all mounts as stated.
 
     Raises:

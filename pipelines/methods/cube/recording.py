@@ -67,7 +67,7 @@ class LayoutCovariance(Section):
         return self
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
+    def matrix(self) -> Array:
         """Covariance matrix (6 n, 6 n); of a layout with camera (6 n + 3, 6 n + 3)."""
         out = np.zeros((len(self.rows), len(self.rows)))
         for i, row in enumerate(self.rows):

@@ -14,11 +14,10 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.factors.earth import earth_rate, gravity, magnetic_field
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import stated
@@ -501,7 +500,7 @@ class Motion:
     wobble: Array
     detour: Array
 
-    def _phase(self, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    def _phase(self, t: Array) -> tuple[Index, Array, Array]:
         """Index of the last static pose at times t, s, share (0 to 1) of the following turn, and its duration, s."""
         k = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
         following = np.minimum(k + 1, len(self.start) - 1)

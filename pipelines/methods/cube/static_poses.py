@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.errors import InputError
@@ -225,7 +225,7 @@ def _away(corners: Array) -> Array:
     return np.asarray(np.abs(corners - np.median(corners, axis=0)).max(axis=(1, 2)))
 
 
-def _in_common(seen: Sightings, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+def _in_common(seen: Sightings, rows: Index) -> Index:
     """Select detections of one set of tags, in the pictures that show all of these, with the most rows."""
     frames, ids = seen.frame[rows], seen.ids[rows]
     shown = {frame: frozenset(ids[frames == frame].tolist()) for frame in frames.tolist()}
@@ -267,7 +267,7 @@ def _seen_in(
     return SeenTags(tags.ids[keep], tags.corners[keep], tags.covariance[keep], t, pose)
 
 
-def _mean_corners(seen: Sightings, sigma: float, config: Config, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+def _mean_corners(seen: Sightings, sigma: float, config: Config, rows: Index) -> tuple[Array, Array]:
     """Mean (4, 2) px of one tag's corners over its pictures, and the mean's covariance (4, 2, 2) px^2."""
     corners = seen.corners[rows]
     if config.noise.corner_px is None and seen.covariance is not None:

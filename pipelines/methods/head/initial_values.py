@@ -6,10 +6,9 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.factors.attitude import SKEW_COLUMN
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.camera_clock import Clock, Miss, first_span, guess_clock, turns_near
@@ -128,7 +127,7 @@ def guess_picture_clock(
         pairs = _pairs(elapsed[:count], _CLOCK_PAIRS)
         return None if len(pairs[0]) < _FEWEST_FRAMES else partial(near, *pairs)
 
-    def near(i: NDArray[np.intp], j: NDArray[np.intp], x: Array) -> Miss:
+    def near(i: Index, j: Index, x: Array) -> Miss:
         def taken(x: Array) -> tuple[Array, Array]:
             clock = Clock(begun, *x[_CLOCK])
             return clock.taken(elapsed[i]), clock.taken(elapsed[j])
@@ -155,7 +154,7 @@ def guess_picture_clock(
     return guess_clock(begun, float(elapsed[-1]), x, prior, sigma, missing)[0]
 
 
-def _pairs(time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pairs(time: Array, most: int) -> tuple[Index, Index]:
     """Indices of picture pairs about `_GUESS_SPAN` s apart, at most about `most` pairs."""
     stride = max(1, round(_GUESS_SPAN / max(float(np.median(np.diff(time))), 1e-3))) if len(time) > 1 else 1
     i = np.flatnonzero(time[stride:] - time[:-stride] < 2.0 * _GUESS_SPAN)

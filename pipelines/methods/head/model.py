@@ -12,10 +12,9 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index, Mask
 from alidade.factors.attitude import FADE, OFFSET_COLUMN, SKEW_COLUMN, VisionAttitudeFactor
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
@@ -71,7 +70,7 @@ class _Model:
 
     chain: GyroChain  # bRv at the keyframes
     carriers: tuple[GyroPath, GyroPath | None]  # of the helmet and the platform, without the noise at rest
-    pictures: NDArray[np.intp]  # (K + 1,) those of keyframe k are from pictures[k] to pictures[k + 1]
+    pictures: Index  # (K + 1,) those of keyframe k are from pictures[k] to pictures[k + 1]
     stamps: Array  # (frames,)
     taken: Array  # (frames,) s, about when
     clock: Clock  # of the pictures
@@ -330,7 +329,7 @@ def _all_around(attitudes: Array) -> bool:
     return bool((angles > FADE).mean() > _FEW_OUTLIERS)
 
 
-def _inside(data: HeadData, taken: Array) -> NDArray[np.bool_]:
+def _inside(data: HeadData, taken: Array) -> Mask:
     """Mask of frames within the gyros' records. Raises InputError if these are too few."""
     inside = (taken >= data.head_t[0]) & (taken <= data.head_t[-1])
     if data.platform_t is not None:
@@ -343,7 +342,7 @@ def _inside(data: HeadData, taken: Array) -> NDArray[np.bool_]:
     return np.asarray(inside)
 
 
-def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], config: Config) -> Array:
+def _sqrt_information(covariance: Array | None, inside: Mask, config: Config) -> Array:
     """Square-root information (n, 3, 3) of vision attitudes, 1/rad: by config, else messages, else default."""
     if covariance is None or config.noise.vision_attitude is not None:
         sigma = first_given(config.noise.vision_attitude, DEFAULT_NOISE.vision_attitude)
@@ -393,7 +392,7 @@ def _begin(model: _Model, step: Step) -> None:
             step.factors.append(prior_of(vector))
 
 
-def _pictures(model: _Model, keyframes: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pictures(model: _Model, keyframes: Sequence[int]) -> tuple[Index, Index]:
     """Indices of the pictures of some keyframes, and the keyframe of each picture."""
     rows = [np.arange(*model.pictures[k : k + 2]) for k in keyframes]
     return np.concatenate(rows), np.repeat(np.array(keyframes, dtype=np.intp), [len(r) for r in rows])

@@ -9,10 +9,9 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index, Mask
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
@@ -153,7 +152,7 @@ def _constant_turn(truth: Attitudes, attitudes: Attitudes) -> Array:
     return np.linalg.eigh(turns.T @ turns)[1][:, -1]
 
 
-def _inside(attitudes: Attitudes, time: Array) -> NDArray[np.bool_]:
+def _inside(attitudes: Attitudes, time: Array) -> Mask:
     return (time >= attitudes.time[0]) & (time <= attitudes.time[-1])
 
 
@@ -228,7 +227,7 @@ def validate(data: HeadData, config: Config, values: Mapping[str, float]) -> tup
     return tuple(out)
 
 
-def _windows(data: HeadData, ways: Sequence[_Applied]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _windows(data: HeadData, ways: Sequence[_Applied]) -> tuple[Index, Index]:
     """Indices of start and stop vision frames of 1-s windows within the gyros' records."""
     t = data.vision_t
     start = np.arange(len(t))
@@ -244,7 +243,7 @@ def _windows(data: HeadData, ways: Sequence[_Applied]) -> tuple[NDArray[np.intp]
     return start[use], stop[use]
 
 
-def _carried_on(data: HeadData, way: _Applied, start: NDArray[np.intp], stop: NDArray[np.intp]) -> Array:
+def _carried_on(data: HeadData, way: _Applied, start: Index, stop: Index) -> Array:
     """Attitudes bRv (n, 4) at the `stop` frames, propagated by the gyros from vision at the `start` frames."""
     t0, t1 = way.time[start], way.time[stop]
     bRv = so3.compose(so3.inverse(way.cRb), data.vision_wxyz[start], so3.inverse(way.vRh))
@@ -263,7 +262,7 @@ def _validation(against: str, time: Array, errors: Sequence[Array], note: str = 
     return Validation(name, "rad", time[good], before, after, "; ".join(filter(None, notes)))
 
 
-def _vision_noise(data: HeadData, config: Config, start: NDArray[np.intp], stop: NDArray[np.intp]) -> str:
+def _vision_noise(data: HeadData, config: Config, start: Index, stop: Index) -> str:
     """Phrase: part of the error that the noise of the two vision frames causes."""
     if config.noise.vision_attitude is not None:
         variance = 6.0 * config.noise.vision_attitude**2

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index, Mask
 from alidade.factors.gimbal import GimbalPath
 from alidade.factors.los import LosDirectionFactor
 from alidade.factors.preintegration import GyroPath, Increments
@@ -61,9 +60,7 @@ def seen(cRm: Array, measured: Array) -> Array:
     return so3.multiply(so3.inverse(cRt), cRm)
 
 
-def initial_attitudes(
-    chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measured: Array, gyro: GyroPath
-) -> Array:
+def initial_attitudes(chains: Sequence[Index], time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
     """Initial attitudes tRm (n, 4): gyro propagation from a target's first picture, aligned with each picture."""
     out = np.empty((len(time), 4))
     toward = so3.rotate(so3.inverse(cRm), los_direction(measured))
@@ -91,7 +88,7 @@ def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath, tar
 
 
 def guess(
-    chains: Sequence[NDArray[np.intp]],
+    chains: Sequence[Index],
     time: Array,
     gimbal: Array,
     measured: Array,
@@ -127,7 +124,7 @@ def guess(
 
 
 def guess_picture_clock(
-    chains: Sequence[NDArray[np.intp]],
+    chains: Sequence[Index],
     time: Array,
     begun: float,
     gimbal: GimbalPath,
@@ -217,7 +214,7 @@ def _miss(
     return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), [0.0, 1.0, 0.0])) - after[:, :2]
 
 
-def _pairs(chains: Sequence[NDArray[np.intp]], time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pairs(chains: Sequence[Index], time: Array, most: int) -> tuple[Index, Index]:
     """Indices of picture pairs of one target, one second apart, at most about `most` pairs."""
     first, second = [], []
     for chain in chains:
@@ -241,9 +238,7 @@ _ROUNDING = 1e-9
 _FOLLOWERS = 5
 
 
-def select_pictures(
-    data: LosData, sigma: Array, margin: float
-) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
+def select_pictures(data: LosData, sigma: Array, margin: float) -> tuple[Index, Mask, dict[str, int]]:
     """Select the usable pictures; return indices, mask of each target's first one, and exclusion counts.
 
     `margin`, s, is left out on either side of a gap in which the gimbal may have turned to another target.
@@ -283,14 +278,14 @@ def select_pictures(
     return keep, starts[keep], {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
 
 
-def _in_gap(t: Array, at: Array) -> NDArray[np.bool_]:
+def _in_gap(t: Array, at: Array) -> Mask:
     """Mask of times that lie in a gap between two samples."""
     step = np.diff(t)
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(step) - 1)
     return np.asarray(step[i] > _GAP * np.median(step))
 
 
-def _first_of_target(data: LosData, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _first_of_target(data: LosData, rows: Index) -> Mask:
     """Mask of pictures that start a chain, after a gap with a possible change of target or a gyro gap."""
     starts = np.ones(len(rows), dtype=bool)
     if len(rows) < 2:

@@ -14,10 +14,9 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index, Mask
 from alidade.factors.chi_square import gate
 from alidade.factors.gimbal import WINDOWS, GimbalPath, LocalMotion
 from alidade.factors.los import LosContext, LosDirectionFactor
@@ -272,8 +271,8 @@ class _Used:
     """
 
     time: Array
-    starts: NDArray[np.bool_]
-    chains: list[NDArray[np.intp]]
+    starts: Mask
+    chains: list[Index]
     measured: Array
     covariance: Array
     angles: Array
@@ -415,7 +414,7 @@ def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
     ]
 
 
-def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str) -> Factor:
+def _picture_factor(model: _Model, k: Index, count: int, family: str) -> Factor:
     p, some = model.parameters, as_slice(k)
     rows_model = LosDirectionFactor(
         model.chain.time[some],

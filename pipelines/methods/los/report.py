@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array, interpolated
+from alidade.factors.array import Array, Index, Mask, interpolated
 from alidade.factors.gimbal import WINDOWS, GimbalPath, command
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.diagnostics.cross_validation import Validation
@@ -205,7 +204,7 @@ def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tupl
     return tuple(found)
 
 
-def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float]) -> Array:
+def _replayed(data: LosData, chain: Index, values: Mapping[str, float]) -> Array:
     """LOS errors phx, phz (n, 2), rad, of one target if compensated commands had driven the gimbal."""
     t = data.image_t[chain]
     inside = (data.gyro_t > t[0]) & (data.gyro_t < t[-1])
@@ -233,7 +232,7 @@ def _camera_attitude(gimbal: Array, px: float) -> Array:
     return so3.multiply(passive(0, gimbal[:, 1] + px), passive(2, gimbal[:, 0]))
 
 
-def _near_neighbours(error: Array) -> NDArray[np.bool_]:
+def _near_neighbours(error: Array) -> Mask:
     """Mask of LOS errors (n, 2) near the median of their neighbours."""
     if len(error) < _NEIGHBOURS:
         return np.ones(len(error), dtype=bool)

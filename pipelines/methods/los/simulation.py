@@ -18,11 +18,10 @@ from math import cos, sin
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from alidade.factors import so3
-from alidade.factors.array import Array, interpolated
+from alidade.factors.array import Array, Mask, interpolated
 from alidade.factors.earth import earth_rate, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import Simulator
@@ -168,7 +167,7 @@ class LosMotion:
         """Azimuth and elevation (n, 2), rad, at times (n,), s."""
         return interpolated(t, self.edges, self.gimbal)
 
-    def covers(self, t: Array) -> NDArray[np.bool_]:
+    def covers(self, t: Array) -> Mask:
         """Mask of the times (n,) within the simulated motion."""
         return np.asarray((t >= self.edges[0]) & (t <= self.edges[-1]))
 

@@ -16,10 +16,9 @@ from itertools import pairwise, product
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Index
 from alidade.factors.chi_square import gate
 from alidade.factors.ellipsoid import DipFactor, StrengthFactor, entries, excess, sagitta
 from alidade.factors.loss import TruncatedLoss
@@ -395,7 +394,7 @@ def _check_turned(sensor: Sensor, config: Config) -> None:
         )
 
 
-def _beginnings(raw: Array, sigma: float) -> NDArray[np.intp]:
+def _beginnings(raw: Array, sigma: float) -> Index:
     """Index of the first sample of each mean; neighbours are merged while their scatter allows.
 
     Of points of a sphere of radius 1, with a scatter V, the mean lies V / 2 inside.

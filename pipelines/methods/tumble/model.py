@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from alidade.factors.array import Array, interpolated
+from alidade.factors.array import Array, Index, interpolated
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
 from alidade.pipelines.diagnostics.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
@@ -624,7 +623,7 @@ def _together(
     return [accel, turned], dip, moments, premises
 
 
-def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:
+def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[Index, Array, Array, Array]:
     """Accelerometer rows with simultaneous magnetometer data; times, readings and sample counts of the latter."""
     if rests is not None:
         first, last = np.searchsorted(t, rests[:, 0]), np.searchsorted(t, rests[:, 1], side="right")
