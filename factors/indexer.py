@@ -191,12 +191,9 @@ class AxisPath:
         out[:, 1, :2] = by_outer * np.stack([np.cos(middle), -np.sin(middle)], axis=1)
         out[:, 2, 2] = turned[:, 0]
         for share in _GAUSS:
-            out += 0.5 * duration[:, None, None] * self._base_rate_in_platform(begin + share * turned)
+            angles = begin + share * turned
+            out += 0.5 * duration[:, None, None] * _in_platform(self._base_rate_turned(angles[:, 0]), angles[:, 1])
         return out
-
-    def _base_rate_in_platform(self, angles: Array) -> Array:
-        """Inertial rate of the base in t, as its three parts, (n, part, 3), rad/s."""
-        return _in_platform(self._base_rate_turned(angles[:, 0]), angles[:, 1])
 
     def _base_rate_turned(self, outer: Array) -> Array:
         """Inertial rate of the base in the frame behind the outer axis, (n, 3), rad/s."""

@@ -143,15 +143,14 @@ def results(formulas: Sequence[Formula], values: Mapping[str, float], measured: 
     space = {name: Value.constant(array) for name, array in (with_vectors(values) | AXES).items()}
     space |= {name: Value(input_kind(name), np.asarray(given, dtype=float)) for name, given in measured.items()}
     found: dict[str, Value] = {}
+
+    def of_name(name: str) -> Value:
+        return space.get(name) or Value.constant(np.array(0.0))
+
     for formula in formulas:
         if all(name in measured for name in formula.inputs):
-            space[formula.name] = found[formula.name] = evaluate(formula.tree, space)
+            space[formula.name] = found[formula.name] = walk(formula.tree, of_name, lambda x: x, operate)
     return found
-
-
-def evaluate(tree: ast.expr, names: Mapping[str, Value]) -> Value:
-    """Evaluate a parsed expression; names without a value are 0. Raises ValueError for unsupported syntax."""
-    return walk(tree, lambda name: names.get(name) or Value.constant(np.array(0.0)), lambda x: x, operate)
 
 
 def walk(

@@ -441,13 +441,13 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
         return None
     if np.median(np.diff(found)) < _PAUSE:
         return None
-    alone = data.gyro is None and np.diff(found).sum() > _MOSTLY * (t[-1] - t[0])
-    return found if len(found) >= FEWEST or (alone and _scatter_within(t, data.accel, found) < TURNED) else None
-
-
-def _scatter_within(t: Array, accel: Array, rests: Array) -> float:
-    """Median over rests of an accelerometer's scatter over gravity, which reveals slow rotations."""
-    return float(np.median([relative_scatter(accel[first:last]) for first, last in np.searchsorted(t, rests)]))
+    if len(found) >= FEWEST:
+        return found
+    if data.gyro is not None or np.diff(found).sum() <= _MOSTLY * (t[-1] - t[0]):
+        return None
+    # The scatter over gravity within rests reveals slow rotations.
+    scatter = [relative_scatter(data.accel[first:last]) for first, last in np.searchsorted(t, found)]
+    return found if np.median(scatter) < TURNED else None
 
 
 def _accelerometer(data: TumbleData, config: Config, rests: Array | None, swung: bool) -> Sensor:

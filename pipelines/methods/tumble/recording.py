@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import accel_square
 from alidade.pipelines.methods import temperature
@@ -79,7 +78,8 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         imu = recording.imu(name)
         if is_there("accel", imu.accel, imu.accel_cov):
             accel = reader.samples(name, imu, "accel", may_be_held=True)
-            _check_gravity(name, accel.series.accel)
+            if lacks_gravity(np.linalg.norm(accel.series.accel, axis=1)):
+                raise InputError(f"topic {name}: {GRAVITY_REMOVED}")
             accel_density = reader.density(name, "accel", accel)
             spans[name] = accel.t
         if mag is not None and (gyro := _gyro(reader, name, imu)) is not None:
@@ -110,12 +110,6 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         gyro_density=gyro_density,
         temperature=warming,
     )
-
-
-def _check_gravity(topic: str, accel: Array) -> None:
-    """Raise InputError if an accelerometer's readings lack gravity, the reference of its calibration."""
-    if lacks_gravity(np.linalg.norm(accel, axis=1)):
-        raise InputError(f"topic {topic}: {GRAVITY_REMOVED}")
 
 
 def _gyro(reader: StreamReader, topic: str, imu: series.ImuSeries) -> Samples[series.ImuSeries] | None:

@@ -51,8 +51,13 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
         formula = triad_formula("accel", parameters, "accel", ("accel",), "body's")
         if any(name in parameters for name in ACCEL_SQUARE.names):
             found.append(replace(formula, description=f"{formula.description}, its square term in it", name="f_read"))
-            formula = _less_square(formula, parameters)
-        found.append(_less_drift(formula, parameters))
+            square = vector_text(ACCEL_SQUARE.names, parameters)
+            formula = replace(formula, expression=f"f_read - {square} * f_read**2", inputs=("accel",))
+        if any(name in parameters for name in ACCEL_SLOPE.names):
+            drift = temperature_text(ACCEL_SLOPE.names, parameters)
+            inputs = *formula.inputs, "temperature"
+            formula = replace(formula, expression=f"{formula.expression} - {drift}", inputs=inputs)
+        found.append(formula)
     if "mag_k11" in parameters:
         unit = "the unit of field_strength"
         found.append(triad_formula("mag", parameters, "mag", ("mag",), "body's", unit))
@@ -64,23 +69,6 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
             Formula("rate, rad/s along the body's axes", "w_b", rate, tuple(dict.fromkeys([*inputs, *of_force])))
         )
     return found
-
-
-def _less_square(formula: Formula, parameters: Collection[str]) -> Formula:
-    """Formula of the accelerometer's reading f_read, m/s^2, minus its square term, axis by axis."""
-    square = vector_text(ACCEL_SQUARE.names, parameters)
-    return replace(formula, expression=f"f_read - {square} * f_read**2", inputs=("accel",))
-
-
-def _less_drift(formula: Formula, parameters: Collection[str]) -> Formula:
-    """Subtract the temperature drift of b from the accelerometer's formula, where the slopes are parameters."""
-    if not any(name in parameters for name in ACCEL_SLOPE.names):
-        return formula
-    return replace(
-        formula,
-        expression=f"{formula.expression} - {temperature_text(ACCEL_SLOPE.names, parameters)}",
-        inputs=(*formula.inputs, "temperature"),
-    )
 
 
 # Unit of a strength -> the one that people read, and what to multiply by.

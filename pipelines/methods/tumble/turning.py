@@ -372,7 +372,10 @@ def turning(
     arm = None
     if accel is not None and accel.swung:
         arm = Parameter(ARM_KEY, tuple(replace(q, nuisance=True) for q in quantities(ARM, config)))
-    earth = None if accel is None or data.latitude is None else _earth(data.latitude, declination)
+    earth = None
+    if accel is not None and data.latitude is not None:
+        # In the level frame n, with y along the horizontal field.
+        earth = so3.rotate(so3.exp(np.array([0.0, 0.0, declination])), earth_rate(data.latitude))
     # A mean up to its stamp is late by half an interval, and has h^2 / 24 more of a filter than a point.
     lag = 0.5 * float(np.median(np.diff(data.gyro_t)))
     delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, lag)))
@@ -389,11 +392,6 @@ def turning(
         earth_rate=_earth_rate(config) if earth is None else None,
         levels=(density, walk),
     )
-
-
-def _earth(latitude: float, declination: float) -> Array:
-    """Earth rate (3,), rad/s, in the level frame n with y along the horizontal field."""
-    return np.asarray(so3.rotate(so3.exp(np.array([0.0, 0.0, declination])), earth_rate(latitude)))
 
 
 def _earth_rate(config: Config) -> Parameter:
