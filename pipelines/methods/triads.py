@@ -38,13 +38,21 @@ _DESCRIPTIONS = {
     "gyro": ("rate along the {body} axes, {unit}", "rad/s"),
     "mag": ("field along the {body} axes, {unit}", "T"),
 }
+_IMU_INPUTS = {"gyro": "gyro", "accel": "accel"}
 # Topics of the sensors, and the results that correct them.
 CORRECTIONS = (
-    Correction(topic=IMU, inputs={"gyro": "gyro", "accel": "accel"}, results={"gyro": "w_b", "accel": "f_b"}),
+    Correction(topic=IMU, inputs=_IMU_INPUTS, results={"gyro": "w_b", "accel": "f_b"}),
     Correction(topic=MAG, inputs={"field": "mag"}, results={"field": "m_b"}, frame_of=IMU),
 )
 # Of K's entries, for the derivatives of its parts.
 _STEP = 1e-6
+
+
+def rotated_imu(body: str, rate: str, rotation: str) -> tuple[Correction]:
+    """Correction of an IMU mounted on a body, by the formula of its rate and the rotation of its axes to the body."""
+    force = Formula(f"specific force along the {body}'s axes, m/s^2", "force", f"{rotation} * accel", ("accel",))
+    results = {"gyro": rate, "accel": "force"}
+    return (Correction(topic=IMU, inputs=_IMU_INPUTS, results=results, formulas=(force,), frame=body),)
 
 
 def triad_specs(

@@ -19,7 +19,7 @@ from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.use import Applied, Line, Truth, Use
 from alidade.pipelines.display.figure import AXES, COLORS, Figure, Plot
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.methods import Correction, Report
+from alidade.pipelines.methods import Report
 from alidade.pipelines.methods.formula import Formula, axis_angles, gyro_rate, passive
 from alidade.pipelines.methods.indexer.model import carrier
 from alidade.pipelines.methods.indexer.parameters import (
@@ -36,8 +36,7 @@ from alidade.pipelines.methods.indexer.published import half_differences
 from alidade.pipelines.methods.indexer.recording import IndexerConfig, IndexerData
 from alidade.pipelines.methods.indexer.windows import AxisMotion, Group, axis_motion, groups_of
 from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
-from alidade.pipelines.methods.triads import gyro_reading
-from alidade.pipelines.recording.topics import IMU
+from alidade.pipelines.methods.triads import gyro_reading, rotated_imu
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -308,17 +307,7 @@ REPORT = Report(
     uses=uses,
     cards=CARDS,
     formulas=formulas,
-    corrections=(
-        Correction(
-            topic=IMU,
-            inputs={"gyro": "gyro", "accel": "accel"},
-            results={"gyro": "w_it", "accel": "force"},
-            formulas=(
-                Formula("specific force along the platform's axes, m/s^2", "force", "inverse(mRt) * accel", ("accel",)),
-            ),
-            frame="platform",
-        ),
-    ),
+    corrections=rotated_imu("platform", "w_it", "inverse(mRt)"),
     figures=indexer_plots,
     validate=validate,
 )

@@ -21,7 +21,7 @@ from alidade.pipelines.estimation.camera_clock import Clock
 from alidade.pipelines.estimation.parameters import fixed_without_force
 from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.methods import Correction, Report
+from alidade.pipelines.methods import Report
 from alidade.pipelines.methods.formula import (
     Formula,
     apply,
@@ -40,7 +40,7 @@ from alidade.pipelines.methods.los.initial_values import (
 )
 from alidade.pipelines.methods.los.parameters import ANGLES, DELAY, ONCE_PER_TURN, SENSITIVITY, TIME_OFFSET
 from alidade.pipelines.methods.los.recording import JOINTS, LosData
-from alidade.pipelines.methods.triads import G, gyro_reading
+from alidade.pipelines.methods.triads import G, gyro_reading, rotated_imu
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -387,15 +387,7 @@ REPORT = Report(
     uses=uses,
     cards=CARDS,
     formulas=formulas,
-    corrections=(
-        Correction(
-            topic=IMU,
-            inputs={"gyro": "gyro", "accel": "accel"},
-            results={"gyro": "w_b", "accel": "force"},
-            formulas=(Formula("specific force along the carrier's axes, m/s^2", "force", "M * accel", ("accel",)),),
-            frame="carrier",
-        ),
-    ),
+    corrections=rotated_imu("carrier", "w_b", "M"),
     findings=findings,
     figures=los_plots,
     validate=validate,
