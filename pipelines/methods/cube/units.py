@@ -113,11 +113,9 @@ def _ball(values: Array) -> tuple[float, float]:
     """Radius and per-axis offset of readings of a vector of constant length in many directions."""
     norms = np.linalg.norm(values, axis=1)
     middle = float(np.median(norms))
-    if float(np.median(np.abs(norms - middle))) < _ROUND * middle:
-        low, high = np.quantile(values, [0.02, 0.98], axis=0)
-        if float(np.median(high - low)) > 0.5 * middle:
-            return middle, 0.0
     low, high = np.quantile(values, [0.02, 0.98], axis=0)
+    if np.median(np.abs(norms - middle)) < _ROUND * middle and np.median(high - low) > 0.5 * middle:
+        return middle, 0.0
     offset = float(np.median(0.5 * (low + high)))
     about = np.linalg.norm(values - 0.5 * (low + high), axis=1)
     radius = float(np.median(about))

@@ -35,7 +35,7 @@ from alidade.pipelines.methods.formula import clock_constants
 from alidade.pipelines.methods.head.initial_values import guess, guess_camera, guess_picture_clock
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, VISION_MAP, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
-from alidade.pipelines.methods.head.report import at_gyro_rate
+from alidade.pipelines.methods.head.report import at_gyro_rate, between
 from alidade.pipelines.methods.noise import at_least_at_rest, estimated, mean_at_rest, sampled, stated, typical
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.plausibility import DEAD_BAND as HAS_DEAD_BAND
@@ -271,7 +271,7 @@ def _prepare(
     chain = GyroChain.over(
         time,
         np.arange(len(time)) == 0,
-        _between(gyro, platform, taken, so3.compose(so3.inverse(cRb), measured, so3.inverse(vRh)), time),
+        between(gyro, platform, taken, so3.compose(so3.inverse(cRb), measured, so3.inverse(vRh)), time),
         gyro,
         density=density,
         other_density=platform_density,
@@ -310,17 +310,6 @@ def _carrier(gyro: GyroPath, force: Array | None) -> GyroPath:
     """
     rate = mean_at_rest(gyro.t, gyro.read, force)
     return gyro if rate is gyro.read else gyro.with_rate(rate)
-
-
-def _between(gyro: GyroPath, platform: GyroPath | None, taken: Array, bRv: Array, at: Array) -> Array:
-    """Attitudes (n, 4) at times between pictures, interpolated by the gyros, correct over gaps of several turns."""
-
-    def held(times: Array) -> tuple[Array, Array]:
-        return so3.identity(len(times)) if platform is None else platform.attitude(times), gyro.attitude(times)
-
-    (base, own), (base_at, own_at) = held(taken), held(at)
-    frame = so3.interpolate(taken, so3.compose(base, bRv, so3.inverse(own)), at)
-    return so3.compose(so3.inverse(base_at), frame, own_at)
 
 
 def _all_around(attitudes: Array) -> bool:

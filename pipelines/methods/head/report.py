@@ -381,14 +381,20 @@ def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], a
         at: (n,) s; before the first and after the last attitude they are carried from that one alone.
     """
     time, first = np.unique(attitudes.time, return_index=True)
-    helmet, platform = helmet_gyro(data, values), _platform_gyro(data, values)
-    both = np.concatenate([time, at])
-    P = helmet.attitude(both)
-    Q = so3.identity(len(both)) if platform is None else platform.attitude(both)
-    C = so3.compose(Q[: len(time)], attitudes.wxyz[first], so3.inverse(P[: len(time)]))
+    return between(helmet_gyro(data, values), _platform_gyro(data, values), time, attitudes.wxyz[first], at)
+
+
+def between(helmet: GyroPath, platform: GyroPath | None, time: Array, bRv: Array, at: Array) -> Array:
+    """Attitudes (n, 4) at times, propagated by the gyros from known ones (k, 4), correct over gaps of several turns."""
+
+    def by_gyros(t: Array) -> tuple[Array, Array]:
+        return so3.identity(len(t)) if platform is None else platform.attitude(t), helmet.attitude(t)
+
+    (base, own), (base_at, own_at) = by_gyros(time), by_gyros(at)
+    frame = so3.compose(base, bRv, so3.inverse(own))
     if len(time) > 1:
-        C = so3.interpolate(time, C, np.clip(at, time[0], time[-1]))
-    return so3.compose(so3.inverse(Q[len(time) :]), np.broadcast_to(C, (len(at), 4)), P[len(time) :])
+        frame = so3.interpolate(time, frame, np.clip(at, time[0], time[-1]))
+    return so3.compose(so3.inverse(base_at), frame, own_at)
 
 
 def helmet_gyro(data: HeadData, values: Mapping[str, float]) -> GyroPath:

@@ -16,9 +16,8 @@ from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.estimation.problem import Attitudes
 from alidade.pipelines.methods import method
-from alidade.pipelines.methods.head.model import _between
 from alidade.pipelines.methods.head.recording import HeadData
-from alidade.pipelines.methods.head.report import carried
+from alidade.pipelines.methods.head.report import between, carried
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.simulation.scenario import load_scenario
 
@@ -114,6 +113,6 @@ def test_first_attitudes_in_a_gap_of_more_than_a_turn() -> None:
     gyro = GyroPath(t, np.tile(rate, (len(t), 1)))
     truth = so3.exp(np.linspace(0.5, 3.5, 25)[:, None] * rate)
     seen = so3.multiply(so3.exp(np.array([0.3, 0.2, 0.1])), truth[[0, 4, 20, 24]])
-    found = _between(gyro, None, np.linspace(0.5, 3.5, 25)[[0, 4, 20, 24]], seen, np.linspace(0.5, 3.5, 25))
+    found = between(gyro, None, np.linspace(0.5, 3.5, 25)[[0, 4, 20, 24]], seen, np.linspace(0.5, 3.5, 25))
     expected = so3.multiply(so3.exp(np.array([0.3, 0.2, 0.1])), truth)
     assert np.linalg.norm(so3.log(so3.multiply(so3.inverse(expected), found)), axis=1).max() < 1e-6
