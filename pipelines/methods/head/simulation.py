@@ -259,10 +259,8 @@ def _walking_bias(scenario: HeadScenario, n: int, rng: np.random.Generator) -> A
 def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array, Array, Array]:
     """Stamps and true times of vision, s, and attitudes cRh (K, 4) without noise."""
     t = sample_times(scenario.duration_s, scenario.vision_rate_hz, scenario.vision_phase)
-    seen = np.ones(len(t), dtype=bool)
     for start, end in scenario.vision_outages_s:
-        seen &= (t < start) | (t >= end)
-    t = t[seen]
+        t = t[(t < start) | (t >= end)]
     cRb, vRh = so3.exp(np.deg2rad([scenario.camera_mount_deg, scenario.helmet_mount_deg]))
     at = exposures(t, scenario.time_offset_s, effects["clock_skew"])
     filtered = so3.exp(effects["vision_filter"] * _acceleration(scenario, at))

@@ -201,11 +201,10 @@ def _program(scenario: IndexerScenario) -> tuple[list[_Drive], float]:
 
 def _recorded(t: Array, drives: list[_Drive], scenario: IndexerScenario) -> Array:
     """Remove the stamps within moves that the scenario does not record."""
-    keep = np.ones(len(t), dtype=bool)
     for move in drives:
         if move.is_move and not scenario.record_moves:
-            keep &= (t < move.start) | (t > move.start + move.duration)
-    return t[keep]
+            t = t[(t < move.start) | (t > move.start + move.duration)]
+    return t
 
 
 def _commanded(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Array:

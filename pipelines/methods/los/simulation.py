@@ -388,10 +388,8 @@ def _command(wx: float, wy: float, wz: float, azimuth: float, elevation: float) 
 def targets(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) -> tuple[Array, Array]:
     """Stamps (K,), s, of pictures that show a target, and target attitudes cRt (K, 4): y towards it, z up."""
     stamps = sample_times(scenario.duration_s, scenario.image_rate_hz, scenario.image_phase)
-    seen = np.ones(len(stamps), dtype=bool)
     for start, end in scenario.gaps:
-        seen &= (stamps < start) | (stamps >= end)
-    stamps = stamps[seen]
+        stamps = stamps[(stamps < start) | (stamps >= end)]
     effects = motion.effects
     t = exposures(stamps, effects["time_offset"], effects["clock_skew"])
     # What would be taken beyond the recording's ends is left out.
