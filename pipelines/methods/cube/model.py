@@ -263,22 +263,6 @@ class Model:
         t, warming = t[rows], self.data.temperature
         return Turning(t, gyro, accel, self.beyond[rows], None if warming is None else warming.above(warming.first, t))
 
-    @property
-    def rest_error(self) -> float:
-        """Sigma of a mean rate at rest beyond white noise, rad/s per axis.
-
-        That of the earth rate left out, and of an offset within the dead band, uniform and the same in all poses.
-        """
-        return float(np.hypot(self.unknown_rate, self.dead_band * np.sqrt(len(self.poses) / 3.0)))
-
-    def turn_error(self, samples: Turning) -> float:
-        """Sigma of a mean rate over a turn beyond white noise, rad/s per axis.
-
-        That of the earth rate left out, and of rates within the gyro's dead band, uniform in it.
-        """
-        within = float((samples.beyond == 0.0).mean(axis=0).max())
-        return float(np.hypot(self.unknown_rate, self.dead_band * within / np.sqrt(3.0)))
-
     def temperature_rise(self, sensor: str, k: int) -> Array | None:
         """Mean temperature (1,), K, in pose k above the first one; None if the sensor's slope is no parameter."""
         warming, celsius = self.data.temperature, self.poses.celsius
@@ -396,7 +380,9 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
     slopes = {name: [] if temperature_rises[name] is None else [key] for name, key in SLOPE_KEYS.items()}
     accel_sigma = accel_density / np.sqrt(duration)
     accel = AccelFactor(time, poses.accel[row], accel_sigma, model.gravity, curved, temperature_rises["accel"])
-    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.rest_error**2)
+    # Beside white noise: the earth rate left out, and an offset in the dead band, uniform and the same in all poses.
+    offset = np.hypot(model.unknown_rate, model.dead_band * np.sqrt(len(poses) / 3.0))
+    gyro_sigma = np.sqrt(gyro_density**2 / duration + offset**2)
     gravity = model.gravity if feels else None
     gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, gravity, temperature_rises["gyro"])
     terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
@@ -471,7 +457,10 @@ def turn_factor(model: Model, k: int) -> Factor:
     samples, feels = model.samples(k), model.parameters.sensitivity is not None
     t = samples.t
     duration = float(t[-1] - t[0])
-    sigma = np.sqrt([model.density[0] ** 2 * duration + (model.turn_error(samples) * duration) ** 2])
+    # Beside white noise: the earth rate left out, and rates within the gyro's dead band, uniform in it.
+    within = (samples.beyond == 0.0).mean(axis=0).max()
+    rate_error = np.hypot(model.unknown_rate, model.dead_band * within / np.sqrt(3.0))
+    sigma = np.sqrt([model.density[0] ** 2 * duration + (rate_error * duration) ** 2])
     accel = [samples.accel] if feels else None
     slopes = model.parameters.slopes
     # What an accelerometer drifts by alone is nothing beside a gyro that does not.

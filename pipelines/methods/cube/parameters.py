@@ -256,6 +256,7 @@ def cube_parameters(
         field_parameter, field_prior = _field(config, field)
         mag = triads["mag"]
         triads["mag"] = replace(mag, quantities=with_factor("mag", mag.quantities, config, _GAIN[1]))
+    slopes = {name: parameter(SLOPE_KEYS[name], (each,), config) for name, each in TEMPERATURE.items()}
     return Parameters(
         triads=triads,
         priors=priors,
@@ -267,7 +268,7 @@ def cube_parameters(
         sensitivity=parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
         curvature=parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
         lens=parameter(LENS_KEY, (FOCAL, CENTRE), config) if camera else None,
-        slopes=_slopes(config) if thermometer else {},
+        slopes={name: each for name, each in slopes.items() if thermometer and each is not None},
         dead_band=parameter(DEAD_BAND_KEY, (DEAD_BAND,), config) if dead_band else None,
     )
 
@@ -293,12 +294,6 @@ def _field(config: Config, model: Array) -> tuple[Parameter, tuple[Array, Factor
 def _given(spec: ParameterSpec, config: Config) -> ParameterSpec:
     """Give a spec its data-sheet prior without marking it as a sensor error."""
     return replace(spec, prior=stated(config, spec), data_sheet="")
-
-
-def _slopes(config: Config) -> dict[str, Parameter]:
-    """Slopes over temperature that are not all fixed, by sensor."""
-    found = {name: parameter(SLOPE_KEYS[name], (each,), config) for name, each in TEMPERATURE.items()}
-    return {name: parameter for name, parameter in found.items() if parameter is not None}
 
 
 def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConversion | None) -> Parameter:

@@ -225,11 +225,6 @@ def stated_density(name: str, data: CubeData, config: Config, *families: str) ->
     return stated(name, config, message, families)
 
 
-def noise_densities(data: CubeData, config: Config) -> tuple[float, ...]:
-    """Stated noise densities of gyro, accelerometer and magnetometer, nominal SI per sqrt(Hz)."""
-    return tuple(stated_density(name, data, config).stated for name in DENSITIES)
-
-
 # rad^2; no reference is as good.
 _LEAST_VARIANCE = 1e-11
 

@@ -33,9 +33,9 @@ from alidade.pipelines.methods.cube.recording import (
     CubeData,
     RawConversion,
     local_field,
-    noise_densities,
     nominal,
     recorded,
+    stated_density,
 )
 from alidade.pipelines.methods.cube.static_poses import StaticPoses, static_poses
 from alidade.pipelines.methods.formula import Formula, apply, matrix_text, temperature_text, vector_text
@@ -239,14 +239,13 @@ def _noise(
     vectors = calibrated(name, nominal(samples, getattr(config.section(CubeConfig).raw, name)), config, values)
     rate = 1.0 / float(np.median(np.diff(t)))
     density = white_noise(t, vectors, poses.span, rate)
-    stated = dict(zip(("gyro", "accel", "mag"), noise_densities(data, config), strict=True))[name]
     row: dict[str, object] = {
         "sensor": name,
         "topic": config.topic(MAG if name == "mag" else IMU),
         "rate_hz": float(f"{rate:.6g}"),
         "unit": _UNITS[name],
         "density": density.tolist(),
-        "stated": stated,
+        "stated": stated_density(f"{name}_density", data, config).stated,
     }
     taken = noises(data, config)["gyro_bias_walk"].used if name == "gyro" else 0.0
     # One that adds up to more over the recording than the mean of one rest is good to would have shown.

@@ -25,8 +25,8 @@ from alidade.pipelines.methods.cube.recording import (
     CubeData,
     Sightings,
     computed_once,
-    noise_densities,
     nominal,
+    stated_density,
 )
 from alidade.pipelines.recording.checks import count
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -319,7 +319,9 @@ def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
 def static_intervals(data: CubeData, config: Config) -> Array:
     """Start and end, (P, 2) s, of the device's static intervals. Raises InputError if there is none."""
     root_rate = float(np.median(np.diff(data.imu_t))) ** -0.5
-    gyro_sigma, accel_sigma, _ = (density * root_rate for density in noise_densities(data, config))
+    gyro_sigma, accel_sigma = (
+        stated_density(name, data, config).stated * root_rate for name in ("gyro_density", "accel_density")
+    )
     raw = config.section(CubeConfig).raw
     gyro = Stream(nominal(data.gyro, raw.gyro), gyro_sigma, GYRO_TREMOR)
     return find_static_intervals(data.imu_t, Stream(nominal(data.accel, raw.accel), accel_sigma, ACCEL_TREMOR), gyro)

@@ -140,7 +140,9 @@ def simulate_head(scenario: HeadScenario, seed: int, images: bool = False) -> Si
     effects = true_values(NUISANCE, scenario, rng_of_sensors)
     head_t, head_rate = _gyro(scenario, scenario.gyro_rate_hz, scenario.gyro_phase, helmet=True)
     force = _specific_force(scenario, head_t)
-    bias = _walking_bias(scenario, len(head_t), rng)
+    bias = np.deg2rad(scenario.gyro_turn_on_bias_deg_s) * rng.standard_normal(3)
+    walk = noise.gyro_bias_walk / np.sqrt(scenario.gyro_rate_hz) * rng.standard_normal((len(head_t), 3))
+    bias = np.asarray(bias + np.cumsum(walk, axis=0))
     head_gyro = read_by(head_rate, "gyro", effects, force) + bias
     head_gyro += drift(scenario.temperature, "gyro", effects, head_t)
     head_gyro = head_gyro + _white(noise.gyro_density, scenario.gyro_rate_hz, len(head_t), rng)
@@ -248,12 +250,6 @@ def _specific_force(scenario: HeadScenario, t: Array) -> Array:
 
 def _white(density: float, rate_hz: float, n: int, rng: np.random.Generator) -> Array:
     return density * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
-
-
-def _walking_bias(scenario: HeadScenario, n: int, rng: np.random.Generator) -> Array:
-    start = np.deg2rad(scenario.gyro_turn_on_bias_deg_s) * rng.standard_normal(3)
-    steps = scenario.noise.gyro_bias_walk / np.sqrt(scenario.gyro_rate_hz) * rng.standard_normal((n, 3))
-    return np.asarray(start + np.cumsum(steps, axis=0))
 
 
 def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array, Array, Array]:

@@ -11,7 +11,7 @@ from itertools import cycle
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Array, Index
+from alidade.factors.array import Array
 from alidade.factors.earth import EARTH_RATE
 from alidade.factors.gyro import symmetric
 from alidade.factors.indexer import IndexerAverageFactor
@@ -34,7 +34,7 @@ from alidade.pipelines.methods.indexer.parameters import (
 )
 from alidade.pipelines.methods.indexer.published import half_differences
 from alidade.pipelines.methods.indexer.recording import IndexerConfig, IndexerData
-from alidade.pipelines.methods.indexer.windows import AxisMotion, Group, axis_motion, groups_of
+from alidade.pipelines.methods.indexer.windows import Group, axis_motion, groups_of
 from alidade.pipelines.methods.temperature import FIRST, GYRO_SLOPE
 from alidade.pipelines.methods.triads import gyro_reading, rotated_imu
 from alidade.pipelines.reports.result import Calibration
@@ -195,16 +195,14 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
     if data.attitude is not None:
         rows = np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))
         bRn = so3.inverse(np.array(config.section(IndexerConfig).base_attitude))
-        errors = [so3.log(so3.multiply(bRn, _carrier(data, motion, rows, some))) for some in ({}, values)]
+        errors = []
+        for some in ({}, values):
+            theta, epsilon, encoder = (several(some, names) for names in (THETA, EPSILON, ENCODER))
+            nRb = carrier(data, motion, rows, theta, float(epsilon[0]), encoder)
+            errors.append(so3.log(so3.multiply(bRn, nRb)))
         claim = "the publication claims 0.005 deg over an hour"
         found.insert(0, Validation("attitude put out", "rad", data.gyro_t[rows], errors[0], errors[1], claim))
     return found
-
-
-def _carrier(data: IndexerData, motion: AxisMotion, rows: Index, values: Mapping[str, float]) -> Array:
-    """Carrier's attitude at gyro samples, by calibrated parameters."""
-    epsilon = float(several(values, EPSILON)[0])
-    return carrier(data, motion, rows, several(values, THETA), epsilon, several(values, ENCODER))
 
 
 def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array, Array]:

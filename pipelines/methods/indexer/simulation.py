@@ -156,7 +156,9 @@ def simulate_indexer(scenario: IndexerScenario, seed: int, _images: bool = False
         noise.gyro_density or None,
         temperature=measured(scenario.temperature, duration),
     )
-    return Simulated(data, {**_truth(scenario, bias), **effects}, indexer_config(scenario))
+    truth = by_axis(theta=np.deg2rad(scenario.mounting_deg), gyro_bias=bias.mean(axis=0))
+    truth["axis_nonperpendicularity"] = float(scenario.axis_nonperpendicularity_arcsec * ARCSEC)
+    return Simulated(data, {**truth, **effects}, indexer_config(scenario))
 
 
 def indexer_config(scenario: IndexerScenario) -> str:
@@ -255,11 +257,6 @@ def _encoders(scenario: IndexerScenario, commanded: Array, rng: np.random.Genera
     step = 2.0 * np.pi / 2**scenario.encoder_bits
     read = step * np.round(read / step)
     return (read + np.pi) % (2.0 * np.pi) - np.pi if scenario.encoder_wrapped else read
-
-
-def _truth(scenario: IndexerScenario, bias: Array) -> dict[str, float]:
-    truth = by_axis(theta=np.deg2rad(scenario.mounting_deg), gyro_bias=bias.mean(axis=0))
-    return truth | {"axis_nonperpendicularity": float(scenario.axis_nonperpendicularity_arcsec * ARCSEC)}
 
 
 SIMULATOR = Simulator(scenario=IndexerScenario, simulate=simulate_indexer)

@@ -320,10 +320,14 @@ def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array
 
 def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
     """Attitudes nRb (wxyz) of the turned device at keyframes; n is level, with y along the horizontal field."""
-    chain, rows = graph.turning.chain, list(keyframes)
+    turned, chain, rows = graph.turning, graph.turning.chain, list(keyframes)
     aRb = so3.from_gtsam([values.atRot3(chain.state(k)) for k in rows])
     time = chain.time[rows]
-    return Attitudes(time, so3.multiply(so3.inverse(graph.turning.aRn(time, values)), aRb))
+    earth = turned.earth
+    if turned.earth_rate is not None:
+        earth = values.atVector(turned.earth_rate.key)
+    assert earth is not None
+    return Attitudes(time, so3.multiply(so3.exp(-turned.elapsed(time)[:, None] * earth), aRb))
 
 
 def advice(weights: Mapping[str, float]) -> Motion:

@@ -353,7 +353,7 @@ def _chained(
         if model is not None and _contradicts(sine, model[0]):
             sine = -sine
             if not _is_mounted_straight(found.turned):
-                gyro = gyro.mirrored
+                gyro = replace(gyro, K=-gyro.K, b=-gyro.b)  # in the opposite field
                 found = _of_guess(mag, gyro)
                 premises.append(_LEFT_HANDED)
             elif _is_mounted_straight(rotation):

@@ -126,11 +126,6 @@ class FieldGuess:
         u, _, vt = np.linalg.svd(self.K)
         return np.asarray(u @ vt)
 
-    @property
-    def mirrored(self) -> FieldGuess:
-        """Mirrored solution: opposite field, for a magnetometer with left-handed axes."""
-        return replace(self, K=-self.K, b=-self.b)
-
 
 @dataclass(frozen=True, eq=False)
 class Turning:
@@ -176,14 +171,6 @@ class Turning:
     def elapsed(self, time: Array) -> Array:
         """Convert times (n,) to s since the first keyframe, where the frames a (inertial) and n (level) coincide."""
         return np.asarray(time - self.chain.time[0])
-
-    def aRn(self, time: Array, values: gtsam.Values) -> Array:
-        """Earth rotations aRn (n, 4) since the first keyframe, by the known or estimated earth rate."""
-        earth = self.earth
-        if earth is None:
-            assert self.earth_rate is not None
-            earth = values.atVector(self.earth_rate.key)
-        return so3.exp(self.elapsed(time)[:, None] * earth)
 
 
 def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
