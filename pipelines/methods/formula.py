@@ -197,8 +197,10 @@ def operate(op: str, *parts: Value) -> Value:
     kind, arrays = result_kind(op, [part.kind for part in parts]), [part.array for part in parts]
     if op == "inverse" and kind == "rotation":
         return Value(kind, so3.inverse(*arrays))
-    if op == "mul" and parts[0].kind in ("matrix", "rotation"):
-        return Value(kind, _applied(parts[0], parts[1]))
+    if op == "mul" and parts[0].kind == "matrix":
+        return Value(kind, np.asarray(arrays[1] @ arrays[0].T))
+    if op == "mul" and parts[0].kind == "rotation":
+        return Value(kind, (so3.rotate if parts[1].kind == "vector" else so3.multiply)(*arrays))
     if len(parts) == 2 and kind == "vector":
         arrays = [part.array[..., None] if part.kind == "scalar" else part.array for part in parts]
     return Value(kind, np.asarray(_COMPUTED[op](*arrays)))
@@ -211,12 +213,6 @@ def result_kind(op: str, kinds: Sequence[Kind]) -> Kind:
     if op == "mul" and kinds[0] in ("matrix", "rotation"):
         return kinds[1]
     return "vector" if "vector" in kinds else kinds[0]
-
-
-def _applied(left: Value, right: Value) -> Array:
-    if left.kind == "matrix":
-        return np.asarray(right.array @ left.array.T)
-    return (so3.rotate if right.kind == "vector" else so3.multiply)(left.array, right.array)
 
 
 def passive(axis: int, angle: Any) -> Array:

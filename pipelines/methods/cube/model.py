@@ -330,14 +330,10 @@ def _attitudes(
             found.append(from_vectors(poses.accel[k], mag, field))
         else:
             turned = path.increments(poses.span[k - 1 : k, 1], poses.span[k : k + 1, 0]).wxyz[0]
-            found.append(_levelled(so3.multiply(found[-1], turned), poses.accel[k]))
+            nRb = so3.multiply(found[-1], turned)
+            up = so3.rotate(nRb, poses.accel[k] / np.linalg.norm(poses.accel[k]))
+            found.append(so3.multiply(so3.shortest(up, [0.0, 0.0, 1.0]), nRb))
     return np.array(found)
-
-
-def _levelled(nRb: Array, accel: Array) -> Array:
-    """Rotate nRb by the smallest angle that makes the specific force point up."""
-    up = so3.rotate(nRb, accel / np.linalg.norm(accel))
-    return so3.multiply(so3.shortest(up, [0.0, 0.0, 1.0]), nRb)
 
 
 @computed_once

@@ -16,6 +16,7 @@ from alidade.factors.array import Array, interpolated
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import ChiSquare, Estimate, History, Problem, Residuals
 from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.methods.noise import typical
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 NAMES = ("delta_px", "delta_gx", "delta_gy", "delta_z")
@@ -74,10 +75,7 @@ def recursive_least_squares(
 
 def published_estimate(data: LosData, config: Config, problem: Problem) -> Estimate:
     """Run the published filter as a solver of the problem, for four mounting angles without a gyro bias."""
-    sigma = config.noise.los_error
-    if sigma is None and data.error_cov is not None:
-        sigma = float(np.sqrt(np.median(data.error_cov[:, [0, 1], [0, 1]])))
-    sigma = first_given(sigma, DEFAULT_NOISE.los_error)
+    sigma = first_given(config.noise.los_error, typical(data.error_cov, 0, 1), DEFAULT_NOISE.los_error)
     result = recursive_least_squares(data, sigma)
     keep = [i for i, name in enumerate(NAMES) if name in {q.name for q in problem.quantities}]
     covariance = result.covariance[:, keep][:, :, keep]

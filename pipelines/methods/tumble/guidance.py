@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.display.drawing import along, covered, resting
@@ -20,6 +19,7 @@ from alidade.pipelines.settings import Config
 
 # Part of all directions that a vector has to have come near, and the widest gap that is none, rad.
 _ENOUGH, _GAP = 0.9, np.deg2rad(45.0)
+_UP = (0.0, 0.0, 1.0)
 _WHAT = {"mag": "directions of the field", "accel": "sides up"}
 _TURN = {"mag": "turn the device so that the field goes along", "accel": "rest it with this side up:"}
 
@@ -31,17 +31,13 @@ def checklist(data: TumbleData, config: Config) -> Sequence[ChecklistItem]:
         share, (gap, where) = share_near(sensor.directions), widest_gap(sensor.directions)
         wanted = f"{_TURN[sensor.name]} {described(where)}" if share < _ENOUGH or gap > _GAP else ""
         have = f"{100.0 * share:.0f} % within 30 deg, {len(sensor.raw)} readings"
-        motion = Motion(wanted, _picture(sensor.name, where)) if wanted else None
+        motion = None
+        if wanted:
+            toward = along(where, "field") if sensor.name == "mag" else resting(so3.shortest(where, _UP), lit=where)
+            motion = Motion(wanted, toward)
         chart = covered(sensor.directions, _WHAT[sensor.name])
         found.append(ChecklistItem(_WHAT[sensor.name], have, wanted, min(share / _ENOUGH, 1.0), motion, chart))
     return found
-
-
-def _picture(sensor: str, where: Array) -> str:
-    """Drawing of the device with a body direction (3,) along the field, or upwards."""
-    if sensor == "mag":
-        return along(where, "field")
-    return resting(so3.shortest(where, [0.0, 0.0, 1.0]), lit=where)
 
 
 # Longer than an accelerometer needs to be seen at rest, s.

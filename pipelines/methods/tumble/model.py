@@ -253,7 +253,10 @@ def prepare(data: TumbleData, config: Config) -> Model:
         done = _AT_REST if gyro is None else _SWUNG
         premises.append(f"The accelerometer has fewer than {FEWEST} rests: {done}.")
     dip = moments = None
-    modelled = None if field is None else _modelled(config, field)
+    modelled = None
+    if field is not None:
+        size = float(np.linalg.norm(field))
+        modelled = float(np.arcsin(-field[2] / size)), sheet(config, FIELD) / size  # dip and its sigma, rad
     if gyro is not None:
         sensors, dip, gyro, more = _chained(sensors, gyro, modelled)
         premises += more
@@ -285,12 +288,6 @@ def _maybe_a_unit(sensor: Sensor) -> str:
         f"{SENSOR_NAMES[sensor.name].capitalize()}: a norm of {size:.3g} is none in {SI[sensor.name]}, so it is read "
         f"as counts; if it is in {unit}, state `units: {{{kind}: {unit}}}` beside its `columns`, or convert it."
     )
-
-
-def _modelled(config: Config, field: Array) -> tuple[float, float]:
-    """Dip of the modelled field (3,) and its sigma, rad."""
-    strength = float(np.linalg.norm(field))
-    return float(np.arcsin(-field[2] / strength)), sheet(config, FIELD) / strength
 
 
 def _is_upright(data: TumbleData, rests: Array | None) -> bool:

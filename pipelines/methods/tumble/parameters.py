@@ -84,7 +84,8 @@ def _triad(sensor: Sensor, config: Config) -> Variable:
     accuracy = _REQUIRE_GAIN * (1.0 if sensor.unit == "1" else sensor.gain)
     require = np.repeat([accuracy, _REQUIRE_BIAS[sensor.name] * wide], [gains, 3])
     listed = []
-    units = [_gain_unit(sensor)] * gains + [sensor.unit] * 3
+    raw = {"accel": "m/s^2", "mag": "T"}[sensor.name] if sensor.is_si else "count"
+    units = ["1" if sensor.unit == raw else f"{sensor.unit}/{raw}"] * gains + [sensor.unit] * 3
     for i, (name, unit) in enumerate(zip(sensor.names, units, strict=True)):
         scale = float(sensor.scales[i])
         prior = config.prior(name, scale * float(sigma[i]))
@@ -93,13 +94,6 @@ def _triad(sensor: Sensor, config: Config) -> Variable:
     if sensor.name == "mag":
         listed = list(with_factor("mag", listed, config, _REQUIRE_GAIN))
     return _variable(TRIAD_KEYS[sensor.name], tuple(listed), sensor.scales, sensor.start)
-
-
-def _gain_unit(sensor: Sensor) -> str:
-    raw = {"accel": "m/s^2", "mag": "T"}[sensor.name] if sensor.is_si else "count"
-    if sensor.unit == raw:
-        return "1"
-    return f"{sensor.unit}/{raw}"
 
 
 def _strength(sensor: Sensor, config: Config) -> Variable:
