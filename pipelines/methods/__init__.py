@@ -261,8 +261,8 @@ class Report:
         fixed_rotations: config -> inputs of formulas that the config states, such as rotations of a drawing, by name.
         findings: data, config, estimate -> the method's own tables.
         figures: data, calibration -> the method's own figures and tables.
-        validate: data, config, parameter values -> errors before and after compensation. Raises InputError when there
-            are none.
+        validate: data, config, calibrated parameters by name, SI, those not there zero -> errors before and after
+            compensation. Raises InputError when there are none.
         uses: estimate, config, noise used by name (SI) -> uses of a result, with the error that it leaves.
         corrections: topics whose sensors the formulas correct.
         cards: of the report's results: title -> groups of numbers, each with its title, the unit (deg, deg/s, deg/h,

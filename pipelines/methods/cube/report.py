@@ -432,13 +432,7 @@ def validate(data: CubeData, config: Config, values: Mapping[str, float]) -> lis
 
     Without calibration the sensors are nominal: as recorded, or converted as the config's `raw` says.
 
-    Args:
-        data: the session.
-        config: of the session.
-        values: calibrated parameters by name, those of calibration.yaml.
-
-    Raises:
-        InputError: there is no static pose, or the place on the earth is unknown.
+    Raises InputError when there is no static pose, or the place on the earth is unknown.
     """
     if data.latitude is None:
         raise InputError("the place on the earth is unknown: record /reference/fix, or give latitude_deg in the config")

@@ -202,13 +202,7 @@ def _picture_times(data: HeadData, values: Mapping[str, float]) -> Array:
 def validate(data: HeadData, config: Config, values: Mapping[str, float]) -> tuple[Validation, ...]:
     """Errors of attitudes propagated by the gyros, against vision and, where it is known, against the truth.
 
-    Args:
-        data: the session.
-        config: of the session.
-        values: calibrated parameters by name, those of calibration.yaml.
-
-    Raises:
-        InputError: no two vision frames about a second apart within the gyros' record.
+    Raises InputError when no two vision frames are about a second apart within the gyros' record.
     """
     ways = [_Applied.of(data, each) for each in ({}, values)]
     start, stop = _windows(data, ways)

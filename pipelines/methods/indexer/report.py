@@ -179,13 +179,7 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
     The carrier's attitude is nRb = nRm mRt tRb(outer, inner), without calibration mRt = identity and perpendicular
     axes; the carrier is the indexer's base and stands still at the config's `indexer.base_attitude`.
 
-    Args:
-        data: the session, with the attitude nRm that the INS puts out, or without.
-        config: of the session.
-        values: calibrated parameters by name; those not named are zero.
-
-    Raises:
-        InputError: the axes hardly turn.
+    Raises InputError when the axes hardly turn.
     """
     motion = axis_motion(data)
     turning = [g for g in groups_of(data, config, motion) if g.position is not None]

@@ -175,13 +175,7 @@ _NEIGHBOURS, _OUTLYING = 9, 8.0
 def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tuple[Validation, ...]:
     """LOS error since each target's first picture, before and after compensation; again without steady drift.
 
-    Args:
-        data: the session.
-        config: of the session.
-        values: calibrated parameters by name, SI; those not there are zero.
-
-    Raises:
-        InputError: too few pictures within the records of gyro and gimbal.
+    Raises InputError when too few pictures are within the records of gyro and gimbal.
     """
     sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
     rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), 0.0)
