@@ -255,7 +255,7 @@ def _begin(graph: _Graph, step: Step) -> None:
         step.initial.insert(variable.parameter.key, variable.start)
         step.factors.append(variable.prior)
     turned = graph.turning
-    step.factors.append(prior_of(turned.bias))
+    step.factors.append(prior_of(turned.parameters[0]))
     for parameter in turned.parameters[1:]:
         step.initial.insert(parameter.key, np.zeros(len(parameter.quantities)))
         step.factors.append(prior_of(parameter))

@@ -136,7 +136,7 @@ class Turning:
         earth: (3,) rate of n in a, rad/s; None: unknown, as without a place, or without an accelerometer that says
             where up is: a parameter.
         mag, accel: rows of the sensors' readings that are used, and the keyframe of each, in time order.
-        bias, delay, filter: parameters; the last two may be fixed.
+        parameters: of the chain, in reporting order, the bias first.
         arm: that of an accelerometer which is used while it moves: m, in b, to it from the point about which the
             device is turned; None at rest.
         earth_rate: parameter, rad/s, in the axes of n at the first keyframe; None where it is known.
@@ -147,21 +147,10 @@ class Turning:
     earth: Array | None
     mag: Rows
     accel: Rows
-    bias: Parameter
-    delay: Parameter
-    filter: Parameter
+    parameters: tuple[Parameter, ...]
     arm: Parameter | None
     earth_rate: Parameter | None
     levels: tuple[Level, ...]
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Parameters of the chain, in reporting order."""
-        return tuple(
-            each
-            for each in (self.bias, self.chain.errors, self.delay, self.filter, self.arm, self.earth_rate)
-            if each is not None
-        )
 
     @property
     def errors(self) -> int:
@@ -359,35 +348,39 @@ def turning(
     arm = None
     if accel is not None and accel.swung:
         arm = Parameter(ARM_KEY, tuple(replace(q, nuisance=True) for q in quantities(ARM, config)))
-    earth = None
+    earth = rate_of_earth = None
     if accel is not None and data.latitude is not None:
         # In the level frame n, with y along the horizontal field.
         earth = so3.rotate(so3.exp(np.array([0.0, 0.0, declination])), earth_rate(data.latitude))
+    else:
+        # Of unknown direction: each component is as large as the whole, one sigma.
+        known = (
+            Quantity(name, "rad/s", config.prior(name, EARTH_RATE), EARTH_RATE, np.inf, group="assumption")
+            for name in EARTH
+        )
+        rate_of_earth = Parameter(_EARTH_KEY, tuple(known))
     # A mean up to its stamp is late by half an interval, and has h^2 / 24 more of a filter than a point.
     lag = 0.5 * float(np.median(np.diff(data.gyro_t)))
     delay = replace(DELAY, prior=float(np.hypot(DELAY.prior, lag)))
     low_pass = replace(FILTER, prior=float(np.hypot(FILTER.prior, lag**2 / 6.0)))
+    parameters = (
+        Parameter(FIRST, quantities(BIAS, config)),
+        errors,
+        Parameter(DELAY_KEY, quantities(delay, config)),
+        Parameter(FILTER_KEY, quantities(low_pass, config)),
+        arm,
+        rate_of_earth,
+    )
     return Turning(
         chain=chain,
         earth=earth,
         mag=Rows(inside, np.repeat(np.arange(len(time)), np.diff(begins))),
         accel=rested or Rows(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)),
-        bias=Parameter(FIRST, quantities(BIAS, config)),
-        delay=Parameter(DELAY_KEY, quantities(delay, config)),
-        filter=Parameter(FILTER_KEY, quantities(low_pass, config)),
+        parameters=tuple(each for each in parameters if each is not None),
         arm=arm,
-        earth_rate=_earth_rate(config) if earth is None else None,
+        earth_rate=rate_of_earth,
         levels=(density, walk),
     )
-
-
-def _earth_rate(config: Config) -> Parameter:
-    """Parameter of the earth's rate in n, for unknown direction: components with the rate's size as prior sigma."""
-    known = (
-        Quantity(name, "rad/s", config.prior(name, EARTH_RATE), EARTH_RATE, np.inf, group="assumption")
-        for name in EARTH
-    )
-    return Parameter(_EARTH_KEY, tuple(known))
 
 
 def _inside(stamps: Array, gyro: Array) -> Index:
