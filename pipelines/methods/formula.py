@@ -159,7 +159,6 @@ def walk(
     """Build what an expression stands for from its leaves. Raises ValueError for unsupported syntax.
 
     Args:
-        tree: parsed.
         of_name, of_value: leaves: a name, a number or a matrix.
         operation: of a name that `operate` knows, and of its parts.
     """

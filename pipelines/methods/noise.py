@@ -50,7 +50,6 @@ def stated(
 
     Args:
         spec: its key, or the declaration of a noise that only one method has.
-        config: in force.
         message: typical figure of the messages; None: they state none.
         families, rows: as Noise has them.
     """

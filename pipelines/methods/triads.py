@@ -61,7 +61,6 @@ def triad_specs(
     """Declare the parameters of a triad: diagonal and off-diagonal entries of K, and offset b.
 
     Args:
-        name: of the sensor.
         unit: of b.
         gain, bias: prior sigma and accuracy wanted, of entries of K and of b.
         per_recording: whether b belongs to a recording.
@@ -85,9 +84,7 @@ def with_factor(sensor: str, quantities: Sequence[Quantity], config: Config, req
     Where the config requires the shape, those that it does not name are judged by it.
 
     Args:
-        sensor: its name.
         quantities: K and b, and the strength.
-        config: what is required.
         require: accuracy of K, which they are declared with.
     """
     shape = CommonFactor(sensor, require).shape
@@ -143,10 +140,7 @@ def triad_formula(
     """Formula that applies K and b to a sensor's reading.
 
     Args:
-        name: of the sensor.
-        parameters: that there are.
         reading: the sensor's reading as an expression.
-        inputs: of that expression.
         body: whose axes the result is along.
         unit: of the result, where it is not the SI one.
     """

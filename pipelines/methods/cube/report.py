@@ -482,9 +482,7 @@ def calibrated(
     """Calibrated readings (n, 3) of a sensor along the cube's axes, SI.
 
     Args:
-        name: of the sensor.
         vectors: its readings, in nominal units as `accel`.
-        config: of the recording.
         values: parameters by name; those that are not among them are 0.
         celsius: (n,) temperatures, degrees Celsius; None: slopes over temperature are not applied.
         accel: (n, 3) readings of the accelerometer; None: a gyro's g-sensitivity is not applied.

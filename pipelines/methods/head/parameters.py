@@ -109,7 +109,6 @@ class HeadParameters:
         Motion capture has no scale of its angles, unless the config says something of it.
 
         Args:
-            config: priors, data sheets, accuracies wanted.
             platform: whether there is a platform gyro.
             drivers: SENSITIVITY, GYRO_SLOPE and DEAD_BAND, in this order, where the helmet's IMU has their causes.
             stamp_sigma: s, how well the stamps are known.

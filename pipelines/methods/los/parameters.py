@@ -112,7 +112,6 @@ class LosParameters:
         """Build the parameters with the priors of the config.
 
         Args:
-            config: priors, data sheets, accuracies wanted.
             drivers: SENSITIVITY, GYRO_SLOPE and DEAD_BAND, in this order, where the gyro's IMU has their causes.
             stamp_sigma: s, how well the stamps are known.
         """

@@ -47,7 +47,6 @@ def recursive_least_squares(
     """Run the published recursive least squares over a session.
 
     Args:
-        data: the session.
         los_sigma: noise of one LOS error, rad; it scales the covariance alone.
         initial_sigma: of each angle before any measurement, rad.
         exact: H2,1 with the term that the publication leaves out.

@@ -487,7 +487,6 @@ def _sensor(
         name: accel or mag.
         stream: stamps of all samples, raw numbers, and the density that their messages state.
         rests: over which means are used; None: all samples are.
-        config: in force.
         known: strength, its sigma, and its unit.
         swung: whether it moves beside a gyro. In SI its K and b begin as nominal then: the ellipsoid nearest to
             readings with several m/s^2 of motion may have its centre thousands of m/s^2 away.

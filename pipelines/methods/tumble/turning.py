@@ -303,7 +303,6 @@ def turning(
 
     Args:
         data: with a gyro.
-        config: in force.
         guess: of mounting and bias.
         mag, accel: what the sensors measured.
         declination: of the field, rad east.
