@@ -65,17 +65,8 @@ class FieldFactor(Model):
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Blocks of the variables: attitude, bias, filter, triad, strength, dip, delay, gyro errors, earth rate."""
-        return (
-            ROT3,
-            3,
-            1,
-            12,
-            1,
-            1,
-            1,
-            *([self.errors] if self.errors else []),
-            *([] if self.earth is not None else [3]),
-        )
+        earth = [] if self.earth is not None else [3]
+        return ROT3, 3, 1, 12, 1, 1, 1, *([self.errors] if self.errors else []), *earth
 
     def __call__(
         self,

@@ -272,15 +272,8 @@ def _field(graph: _Graph, keyframes: range) -> list[Factor]:
     if not len(seen.row):
         return []
     factor = FieldFactor(*_measured(turned, sensor, seen), chain.gyro, turned.errors, turned.earth)
-    keys = (
-        FILTER_KEY,
-        TRIAD_KEYS["mag"],
-        STRENGTH_KEYS["mag"],
-        DIP_KEY,
-        DELAY_KEY,
-        *chain.error_keys,
-        *_earth_key(turned),
-    )
+    own = FILTER_KEY, TRIAD_KEYS["mag"], STRENGTH_KEYS["mag"], DIP_KEY, DELAY_KEY
+    keys = *own, *chain.error_keys, *_earth_key(turned)
     states = [chain.state(int(k)) for k in seen.keyframe]
     return [Factor.of(SENSOR_NAMES["mag"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
 
@@ -309,13 +302,8 @@ def _earth_key(turned: Turning) -> list[int]:
 def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array, Array, Array, Array]:
     """Stamps, s, keyframe times, s, normalised readings and sigmas, and s since the first keyframe."""
     time = sensor.time[seen.row]
-    return (
-        time,
-        turned.chain.time[seen.keyframe],
-        sensor.scaled[seen.row],
-        sensor.sigma[seen.row],
-        turned.elapsed(time),
-    )
+    anchor = turned.chain.time[seen.keyframe]
+    return time, anchor, sensor.scaled[seen.row], sensor.sigma[seen.row], turned.elapsed(time)
 
 
 def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
