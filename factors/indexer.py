@@ -140,10 +140,8 @@ class AxisPath:
         # By how much each axis is elsewhere than read, (k, axis, 5).
         change = np.zeros((len(t), 2, len(ENCODER_ERRORS)))
         for axis in range(2):
-            change[:, axis, 2 * axis], change[:, axis, 2 * axis + 1] = (
-                -np.sin(angles[:, axis]),
-                -np.cos(angles[:, axis]),
-            )
+            change[:, axis, 2 * axis] = -np.sin(angles[:, axis])
+            change[:, axis, 2 * axis + 1] = -np.cos(angles[:, axis])
         change[:, :, 4] = -speed
         begin, end = angles[:-1], angles[1:]
         middle, duration = 0.5 * (begin + end), np.diff(t)

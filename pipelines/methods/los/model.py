@@ -333,9 +333,7 @@ def _sqrt_information(covariance: Array) -> Array:
     rolls = np.isfinite(covariance[:, 2, 2])
     for size, mine in ((3, rolls), (2, ~rolls)):
         root = np.linalg.cholesky(np.linalg.inv(covariance[mine][:, :size, :size]))
-        block = np.zeros((int(mine.sum()), 3, 3))
-        block[:, :size, :size] = np.swapaxes(root, 1, 2)
-        out[mine] = block
+        out[mine, :size, :size] = np.swapaxes(root, 1, 2)
     return out
 
 
