@@ -173,11 +173,11 @@ def states_first(engine: Linearization, values: Values) -> Values:
     States aligned with single measurements repeat their noise. A parameter that multiplies a state would explain that
     noise: of ten minutes of a gimbal the scale of LOS errors took a step of 12 prior sigmas.
     """
-    here = Point.of(engine, values)
     with suppress(IndeterminateStateError, np.linalg.LinAlgError):
-        last = np.zeros((len(here.factorization.root) - 1, 1))
-        states, nodes = here.factorization.given(last)
-        move = Tangent(states[..., 0], nodes[..., 0], last[here.factorization.c :, 0])
+        factorization = engine.at(values)[0].eliminate()
+        last = np.zeros((len(factorization.root) - 1, 1))
+        states, nodes = factorization.given(last)
+        move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
         return min(values, engine.layout.retract(values, move), key=engine.cost)
     return values
 
@@ -211,13 +211,13 @@ def _is_minimum(enough: float, damping: float, predicted: float, decrease: float
 def _reached(engine: Linearization, here: Point, step: Tangent, damping: float, most: int) -> tuple[Point, int]:
     """Return the end of a step, corrected at most `most` times where the cost rises, and the number of corrections."""
     there = Point.of(engine, engine.layout.retract(here.values, step))
-    if there.cost < here.cost or most == 0:
+    if there.cost < here.cost or most == 0 or deadline.passed():
         return there, 0
     firm, counted = max(INITIAL_DAMPING, _FIRMER * damping), engine.counting(engine.inliers(here.values))
     back = Point.of(counted, there.values)
     for count in range(1, most + 1):
         correction, _ = _step(back.system, firm)
-        if correction is None:
+        if correction is None or deadline.passed():
             return there, count
         further = Point.of(counted, engine.layout.retract(back.values, correction))
         if not further.cost < back.cost:

@@ -66,6 +66,8 @@ def solve_robust(
     tolerance = _ROUGH_TOLERANCE * max(count, 1)
     rough = replace(config, max_iterations=most, cost_tolerance=tolerance)
     found = minimize(plain, states_first(plain, values), rough)
+    if not found.converged and deadline.passed():
+        return found
     iterations = found.iterations
     truncated = engine.under(loss)
     start = min(values, found.values, key=truncated.cost) if np.isfinite(found.cost) else values
