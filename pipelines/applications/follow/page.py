@@ -68,9 +68,14 @@ _HEADERS = {
 class LivePage:
     """Context manager that serves the live page.
 
-    It is served at the address `host` of this machine, the loopback one for this machine alone, others by a token
-    (`is_open`); port 0 is any that is free. `say` is told where the next device finds the page once a token has been
-    used. Raises InputError when starlette or uvicorn is not installed, or there is no such address or no port free.
+    Raises InputError when starlette or uvicorn is not installed, or there is no such address or no port free there.
+
+    Args:
+        say: called with where the next device finds the page once a token has been used.
+        host: address of this machine to be reached by; the loopback one is for this machine alone, any other
+            `is_open` to others, by a token.
+        port: 0: any that is free.
+        name: of the recording.
     """
 
     def __init__(self, say: Callable[[str], None], host: str = HOST, port: int = PORT, name: str = "") -> None:
