@@ -61,7 +61,11 @@ class Trial:
 
 
 def read_trial(path: Path) -> Trial:
-    """Read a trial's Matlab file. Raises InputError: it is not there or is not a BROAD trial."""
+    """Read a trial's Matlab file.
+
+    Raises:
+        InputError: the file is not there or is not a BROAD trial.
+    """
     from scipy.io import loadmat
 
     try:

@@ -66,7 +66,11 @@ GYRO_SHEET = Sheet(
 
 
 def to_session(folder: Path) -> CubeData:
-    """Convert the recording to a session, in counts. Raises InputError: no files, or none that belong together."""
+    """Convert the recording to a session, in counts.
+
+    Raises:
+        InputError: the files are not there or do not belong together.
+    """
     accel, gyro = (_table(folder / f"xsens_{name}.mat.gz") for name in ("acc", "gyro"))
     if accel.shape != gyro.shape or not np.array_equal(accel[:, 0], gyro[:, 0]):
         raise InputError(f"{folder}: accelerometer and gyro do not have the same stamps")

@@ -46,7 +46,11 @@ require: {theta_x: 2.0e-2, theta_y: 2.0e-2, theta_z: 2.0e-2, gyro_bias_x: 1.0e-3
 
 
 def read_parts(path: Path) -> dict[str, Array]:
-    """Read the gyro counts (n, 3) of each annotated part. Raises InputError: no file, or not the annotated session."""
+    """Read the gyro counts (n, 3) of each annotated part.
+
+    Raises:
+        InputError: the file is not there or is not the annotated session.
+    """
     parts: dict[str, list[list[float]]] = {}
     try:
         with path.open() as table:

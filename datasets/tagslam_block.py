@@ -54,7 +54,11 @@ class Comparison:
 
 
 def read_block(folder: Path) -> Block:
-    """Read the block recording. Raises InputError: the files are not there or have other contents."""
+    """Read the block recording.
+
+    Raises:
+        InputError: the files are not there or have other contents.
+    """
     try:
         content = json.loads((folder / "layout.json").read_text())
         with gzip.open(folder / "detections.csv.gz", "rt") as stream:

@@ -140,9 +140,15 @@ def as_date(text: str) -> datetime.datetime:
 
 
 def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:
-    """Parse the one document of a YAML file in UTF-8, which errors call `where`; `as_text` leaves all scalars text.
+    """Parse the one document of a YAML file.
 
-    Raises InputError: no UTF-8, no YAML, values that are not what their tags say, aliases that multiply.
+    Args:
+        data: its content, UTF-8.
+        where: it stands, for what is said about it.
+        as_text: leave all scalars text.
+
+    Raises:
+        InputError: no UTF-8, no YAML, values that are not what their tags say, aliases that multiply.
     """
     from ruamel.yaml.error import MarkedYAMLError
 

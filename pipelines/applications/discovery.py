@@ -39,10 +39,12 @@ _DELAY = 0.002
 
 @dataclass(frozen=True)
 class Suggestion:
-    """The topics that a method could read in a recording, of those that it lacks, with sentences about why.
+    """The topics that a method could read in a recording.
 
     Attributes:
-        topics: key in the config -> where it could come from.
+        method: its name.
+        topics: key in the config -> where it could come from; the keys that are lacking alone.
+        reasons: sentences about why.
         missing: what would still be lacking.
         has_to_be_asked_for: whether it serves only where the method is named.
     """

@@ -62,9 +62,13 @@ _NO_VARIABLE = 0
 
 @dataclass(frozen=True, eq=False)
 class Alone:
-    """Calibration of one recording by itself, as result.json has it, kept for the joint calibration.
+    """Calibration of one recording by itself, kept for the joint calibration.
 
-    `day` is its date, days since 1970; its data wait in a file.
+    Attributes:
+        calibration: what result.json says of it by itself, without the data behind it.
+        day: its date, days since 1970.
+        sqrt_info: information about its numbers.
+        data: the file in which its data wait.
     """
 
     calibration: Calibration

@@ -229,8 +229,12 @@ def _pieces(t: Array, values: Array, rests: Array) -> tuple[list[Array], float, 
 def even_pieces(t: Array, values: Array) -> tuple[list[Array], float, int]:
     """Return pieces (n, k) of evenly spaced samples, their interval, s, and the number of samples filled in.
 
-    Jittering stamps (N,), s, increasing, count as evenly spaced; those beside a hole distinguish lost samples from late
-    stamps. Short holes in the values (N, k) are filled by straight lines, long ones split the record.
+    Jittering stamps count as evenly spaced; the stamps beside a hole distinguish lost samples from late stamps. Short
+    holes are filled by straight lines, long ones split the record.
+
+    Args:
+        t: (N,) s, increasing.
+        values: (N, k).
     """
     interval = float(np.median(np.diff(t)))
     lost = _lost(t, interval)

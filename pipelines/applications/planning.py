@@ -94,9 +94,12 @@ Made = dict[tuple[str, int], Prediction]
 
 @dataclass(frozen=True)
 class Step:
-    """Proposed change of the motion, in words, with the prediction for it and those before it.
+    """Proposed change of the motion, with its prediction.
 
-    `gain` is the information that it adds about what falls short, nats, beyond what more time alone would.
+    Attributes:
+        change: in words.
+        gain: information it adds about what falls short, nats, beyond what more time alone would.
+        prediction: with this change and those before it.
     """
 
     change: str

@@ -158,7 +158,8 @@ class Session:
     def beginning_from(self, prior: Path) -> Session:
         """Return the session with an earlier calibration of the device, result.json or calibration.yaml, as prior.
 
-        Raises InputError when it cannot be used, is another method's, or was made of this recording.
+        Raises:
+            InputError: it cannot be used, is another method's, or was made of this recording.
         """
         gaussian_prior = device_prior(load_known(prior), self.method, self.config, self.sha256(), self.epoch_ns)
         return replace(self, config=self.config.with_prior(gaussian_prior))

@@ -26,7 +26,8 @@ DAY_S = 86_400.0
 def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, float]:
     """Return the random-walk rates of the device's parameters, SI per root day; 0: constant, or to be estimated.
 
-    Raises InputError where the config's `share` names no parameter.
+    Raises:
+        InputError: the config's `share` names no parameter.
     """
     for pattern in config.share:
         if not any(fnmatchcase(name, pattern) for name in names):

@@ -82,11 +82,13 @@ _MOST_DEG_S = 7000.0
 
 @dataclass(frozen=True)
 class Columns:
-    """Proposed meaning of a table's columns, with sentences about what was concluded, and what is in doubt or assumed.
+    """Proposed meaning of a table's columns.
 
     Attributes:
         columns: topic -> its columns, as under `columns:`.
         topics: key -> its source, where a gyro and an accelerometer are in two tables.
+        reasons: sentences about what was concluded.
+        doubts: sentences about what could not be, or is assumed.
     """
 
     columns: dict[str, TableTopic]

@@ -51,7 +51,9 @@ class AllanCurve:
 def allan_curve(pieces: Sequence[Array], interval_s: float) -> AllanCurve:
     """Compute the overlapping Allan deviation at averaging times in octaves.
 
-    Pieces are samples of a rate, each evenly spaced by interval_s; the differences of all are averaged.
+    Args:
+        pieces: samples of a rate, each piece evenly spaced by interval_s; the differences of all are averaged.
+        interval_s: s.
     """
     longest = max(len(piece) for piece in pieces)
     factors = 2 ** np.arange(max(1, int(np.log2(max(2.0, _LONGEST * longest))) + 1))
@@ -79,7 +81,9 @@ def allan_variance(tau: Array, squares: Array) -> Array:
 def confidence(curve: AllanCurve, squares: Array) -> tuple[Array, Array, Array]:
     """Equivalent degrees of freedom and 95 % interval (low, high) of each Allan deviation, (n,) each.
 
-    The degrees of freedom depend on the noise, `squares` Q^2, N^2, B^2, K^2.
+    Args:
+        curve: the estimate.
+        squares: Q^2, N^2, B^2, K^2 of the noise, which the degrees of freedom depend on.
     """
     dof = np.array([_degrees_of_freedom(curve, tau, squares) for tau in curve.tau])
     bounds = np.sqrt([interval(_CONFIDENCE, each) for each in dof])

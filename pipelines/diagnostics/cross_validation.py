@@ -49,9 +49,14 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrialFit:
-    """Fit of a recording after a change: the solution, chi-square of the measurements used, and degrees of freedom.
+    """Fit of a recording after a change: the solution, and the loss of the rejected measurements.
 
-    `lost` is the loss of the rejected measurements, each at the gate; their rows count in `dof`.
+    Attributes:
+        quantities: of the problem.
+        estimate: the solution.
+        chi_square: of the measurements used.
+        lost: of the rejected measurements, each at the gate.
+        dof: degrees of freedom, the rejected rows among them.
     """
 
     quantities: tuple[Quantity, ...]

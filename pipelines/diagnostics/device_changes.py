@@ -46,7 +46,14 @@ _ROUNDING = 1e-10
 
 @dataclass(frozen=True)
 class Change:
-    """Step of a parameter, SI, between the recording with the index `after` and the next one."""
+    """Step of a parameter between a recording and the next one, SI.
+
+    Attributes:
+        name: of the number.
+        after: index of the last recording before it.
+        size: of the step.
+        sigma: of that.
+    """
 
     name: str
     after: int
@@ -290,7 +297,12 @@ Verdict = Literal["holds", "changed", "unknown", "same"]
 
 @dataclass(frozen=True)
 class CalibrationCheck:
-    """Result of a test whether an earlier calibration holds on a new recording: changes of the parameters, by name."""
+    """Result of a test whether an earlier calibration holds on a new recording.
+
+    Attributes:
+        changes: of the parameters between the two.
+        quantities: the parameters, by name.
+    """
 
     changes: Changes
     quantities: Mapping[str, Quantity]
@@ -322,7 +334,8 @@ def check_calibration(
 
     Args:
         known: of the device, from the earlier calibration; no number is exactly known.
-        sqrt_info, quantities: information of the recording, and what is estimated in its graph.
+        sqrt_info: information of the recording.
+        quantities: of the recording's graph.
         inflations: by what the recording's sigmas are larger because noise is coloured.
     """
     by_name = {q.name: q for q in quantities}

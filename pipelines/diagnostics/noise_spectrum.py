@@ -109,9 +109,12 @@ class _Bins:
 
 
 def fit_noise(pieces: Sequence[Array], interval_s: float, lines: Sequence[tuple[float, float]] = ()) -> NoiseFit:
-    """Fit noise coefficients to pieces of a record at rest: samples of a rate, each piece evenly spaced by interval_s.
+    """Fit noise coefficients to pieces of a record at rest.
 
-    `lines` are bands, Hz, that are left out because a sinusoid is in them.
+    Args:
+        pieces: samples of a rate, each piece evenly spaced by interval_s.
+        interval_s: s.
+        lines: bands, Hz, that are left out because a sinusoid is in them.
     """
     bins = _binned(pieces, interval_s, lines)
     top = float(bins.hz[-1])
@@ -382,7 +385,9 @@ class Line:
 def find_lines(pieces: Sequence[Array], interval_s: float) -> tuple[Line, ...]:
     """Find the strongest sinusoids in pieces of a record at rest, by amplitude; none if the record is too short.
 
-    The samples of each piece are evenly spaced by interval_s.
+    Args:
+        pieces: samples, each piece evenly spaced by interval_s.
+        interval_s: s.
     """
     longest = max(len(piece) for piece in pieces)
     size = min(_LONGEST, 1 << int(np.log2(max(1, longest // _WINDOWS))))

@@ -83,8 +83,13 @@ def verdicts(
     """Verdict of each parameter with a required accuracy, or of the sensor's shape where that is required instead.
 
     Of a solution that rejected more than a quarter of a family, as its findings have it, nothing is `observable`: what
-    is left are the measurements that agree with it. The covariance (n, n) and values (n,), SI, are in the order of the
-    quantities.
+    is left are the measurements that agree with it.
+
+    Args:
+        quantities: n of them.
+        covariance: (n, n) in their order.
+        findings: on the solution.
+        values: (n,) in their order.
     """
     sigmas = np.sqrt(np.diag(covariance)).tolist()
     found = {q.name: verdict(q, sigma) for q, sigma in zip(quantities, sigmas, strict=True) if q.judged}
@@ -96,7 +101,10 @@ def verdicts(
 
 
 def doubted(found: Verdict, findings: Sequence[Finding]) -> Verdict:
-    """Downgrade a verdict by the findings: no solution, or a solution that rejects many measurements."""
+    """Downgrade a verdict by the findings: no solution, or a solution that rejects many measurements.
+
+    Where there is no solution nothing is determined.
+    """
     if found != "fixed" and has_no_solution(findings):
         return "unobservable"
     return "weak" if found == "observable" and rejects_many(findings) else found
@@ -128,7 +136,11 @@ def derived(
 ) -> list[DerivedNumber]:
     """Compute scale and shape of sensors with a scale inseparable from the measured strength.
 
-    The covariance (n, n), finite, and the values (n,), SI, are in the order of the quantities.
+    Args:
+        quantities: n of them.
+        covariance: (n, n), finite, in their order.
+        values: (n,), SI.
+        findings: on the solution.
     """
     both = (each(one, quantities) for one in scalings(quantities, covariance, values) for each in (_scale, _shape))
     return [number._replace(verdict=number.verdict and doubted(number.verdict, findings)) for number in both]
@@ -284,7 +296,12 @@ def time_to_accuracy(
     """Time to the required accuracy of each estimated parameter, from the history of a filter.
 
     Information is the inverse of the variance less that of the prior; what a walking parameter loses counts as none
-    gained. The names are of the history's columns.
+    gained.
+
+    Args:
+        history: sigmas as they were at each time.
+        names: of the history's columns.
+        quantities: of which the result is wanted.
     """
     estimated = {q.name: q for q in quantities if q.prior_sigma != 0.0 and q.judged}
     found = {}

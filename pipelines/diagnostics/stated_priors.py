@@ -64,7 +64,9 @@ def with_conflicts(estimate: Estimate, quantities: Sequence[Quantity], conflicts
 def freed_config(config: Config, quantities: Sequence[Quantity]) -> Config | None:
     """Return the config with all fixed and tightly stated parameters free; None if none is fixed.
 
-    What is not among the quantities of its graph is fixed.
+    Args:
+        config: in force.
+        quantities: of its graph; what is not among them is fixed.
     """
     known = {q.name: q for q in quantities}
     tight = [name for name in config.priors if name in known and known[name].tight]

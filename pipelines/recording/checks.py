@@ -81,12 +81,12 @@ def clean(
     the same stamp; stamps out of order are sorted. What was done is counted in `dropped`.
 
     Args:
-        topic: its name.
+        topic: for what is said.
         t_ns: (N,) stamps in the order of the file.
         epoch_ns: zero of the times.
         values: (N, ...) what was measured.
         dropped: reason -> samples, added to.
-        least: samples needed; with 1 the rate is not looked at.
+        least: samples needed; of a topic that one message of will do the rate is not looked at.
         slowest_s: the longest usual step that such a sensor may have, s.
 
     Raises:
@@ -142,7 +142,9 @@ def check_time_unit(name: str, t_ns: NDArray[np.int64], slowest_s: float) -> Non
 def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
     """Return the factor (1e-3, 1e3, ...) that makes the median step of stamps, ns, plausible; None if none is needed.
 
-    Stamps (N,) may be in any order; slowest_s is the longest usual step of such a sensor, s.
+    Args:
+        t_ns: (N,), in order or not.
+        slowest_s: the longest usual step of such a sensor, s.
     """
     if len(t_ns) < _FEWEST_STEPS:
         return None

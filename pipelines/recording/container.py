@@ -168,9 +168,11 @@ class Container(ABC):
         return total({self.channels[number].topic: n} for number, n in lost)
 
     def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
-        """Return a sentence about each kind of loss, with its time in a session of duration_s from start_ns, Unix ns.
+        """Return a sentence about each kind of loss, with its time in a session that starts at start_ns, Unix ns.
 
-        Without start_ns the times are left out.
+        Args:
+            start_ns: None leaves out when the losses are.
+            duration_s: length of the session.
         """
         missing = self.missing
         messages = f"; messages lost: {', '.join(f'{n} of {topic}' for topic, n in missing.items())}" if missing else ""
@@ -248,7 +250,9 @@ class Container(ABC):
 class MultiPartContainer(Container):
     """Several files as one recording: parts of a bag that was split, or files recorded side by side.
 
-    `path` is the folder or the first part; parts are read in the order of their first messages.
+    Args:
+        path: folder, or first part.
+        parts: containers, in any order; they are read in the order of their first messages.
     """
 
     def __init__(self, path: Path, parts: Sequence[Container]) -> None:  # counts and losses are those of the parts

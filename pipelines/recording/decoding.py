@@ -91,9 +91,12 @@ class _Plan(NamedTuple):
 
 
 class ColumnTable:
-    """Columns of at most `count` messages of a type in NUMERIC_TYPES, filled block by block.
+    """Columns of a topic, filled block by block. A column whose values never change takes no memory.
 
-    Of a sensor_msgs/JointState the positions of `joints` are read. A column whose values never change takes no memory.
+    Args:
+        kind: message type, one of NUMERIC_TYPES.
+        count: largest number of messages.
+        joints: of a sensor_msgs/JointState those whose positions are read.
 
     Attributes:
         fields: column -> path of the field in a message.

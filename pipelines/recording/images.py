@@ -144,9 +144,14 @@ def is_video(start: bytes) -> bool:
 
 
 class VideoFile:
-    """Iterable of the `count` pictures of an MP4 or AVI file as files in the Netpbm form, decoded on each iteration.
+    """Iterable of the pictures of an MP4 or AVI file as files in the Netpbm form, decoded anew on each iteration.
 
-    Raises InputError: it is no such file; when iterating, it cannot be decoded or has more or fewer pictures.
+    Args:
+        path: of the file.
+        count: pictures there have to be.
+
+    Raises:
+        InputError: it is no such file; when iterating, it cannot be decoded or has more or fewer pictures.
     """
 
     def __init__(self, path: Path, count: int) -> None:

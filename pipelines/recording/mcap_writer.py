@@ -78,7 +78,10 @@ def write_session(
 class McapOutput:
     """Writer of an MCAP file: header, attachments, definitions, chunks with their message indexes, summary.
 
-    `time_ns` is that of the attachments, name -> content, Unix ns.
+    Args:
+        stream: of the file.
+        attachments: name -> content.
+        time_ns: of the attachments, Unix ns.
     """
 
     def __init__(self, stream: BinaryIO, attachments: Mapping[str, bytes], time_ns: int = 0) -> None:

@@ -76,7 +76,10 @@ class Temperature:
 class StreamReader:
     """Reads the sensors of a recording and counts the samples that cannot be used.
 
-    `topics` are decoded in one pass, each with the joints that are needed; those that are not there are ignored.
+    Args:
+        recording: it.
+        topics: names of topics that are decoded in one pass, each with the joints that are needed; those that are not
+            there are ignored.
 
     Attributes:
         dropped: reason -> samples that are not used, or used with a reservation, of the topics read by now.
@@ -110,7 +113,7 @@ class StreamReader:
         """Return the samples of a series whose `quantities` (names of attributes) are finite and without faults.
 
         Args:
-            topic: its name.
+            topic: for messages.
             found: the series.
             quantities: (N, k) each; faults are looked for in those of inertial sensors and magnetometers.
             least: samples needed.
@@ -169,9 +172,12 @@ class StreamReader:
         return self.samples(topic, self.recording.magnetic(topic), "field", may_be_held=True)
 
     def density(self, topic: str, kind: str, samples: Samples[AnySeries]) -> float | None:
-        """Noise density, per sqrt(Hz), that covariances of two samples or more state; None if they state none.
+        """Noise density, per sqrt(Hz), that the covariances of samples state; None if they state none.
 
-        `kind` is gyro, accel or mag.
+        Args:
+            topic: for what is counted.
+            kind: gyro, accel or mag.
+            samples: N >= 2.
         """
         attribute, least = _NOISE[kind]
         return plausibility.density(topic, kind, samples.t, getattr(samples.series, attribute), least, self.dropped)

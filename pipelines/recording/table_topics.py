@@ -148,8 +148,13 @@ class TableTopic(BaseModel):
     ) -> tuple[series.Topic, Stamps | None, list[str]]:
         """Return a topic's series in SI units from the rows of a table, its log times (Unix ns) or None, and notes.
 
-        Rows without a number in any of its columns are left out. `logged` are a table of messages' log times, Unix ns.
-        Raises InputError.
+        Rows without a number in any of its columns are left out. Raises InputError.
+
+        Args:
+            topic: its name.
+            form: the table.
+            columns: texts of its columns, `names` at least.
+            logged: of a table of messages the log times, Unix ns.
         """
         path, given, notes = form.path, self._given, list[str]()
         columns = {name: columns[name] for name in self.names}

@@ -148,7 +148,12 @@ def of_rate(count: int, rate_hz: float) -> Stamps:
 def check_steps(path: Path, name: str, t_ns: Stamps, unit: str, slowest_s: float) -> None:
     """Raise InputError where steps between stamps are plausible for a sensor only in another unit of time.
 
-    Stamps, ns, were read in `unit`; slowest_s is the longest usual step that the sensor of topic `name` may have, s.
+    Args:
+        path: of the table.
+        name: of the topic.
+        t_ns: stamps, by a unit.
+        unit: the one that was taken.
+        slowest_s: the longest usual step that the sensor may have, s.
     """
     likely = likely_time_unit(t_ns, slowest_s)
     if likely is None:

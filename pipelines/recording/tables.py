@@ -101,7 +101,12 @@ class TableForm(TableHead):
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
-    """Read file `data`: a trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a table that the config describes."""
+    """Read a text file: a trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a table that the config describes.
+
+    Args:
+        path: as it was named.
+        data: the file to read.
+    """
     form = table_form(path, data)
     if not form.width:
         # A file that grows may still have one.
@@ -206,10 +211,15 @@ def read_columns(form: TableForm, names: Sequence[str], most: int | None = None)
     """Return the named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
-    are no rows; a last row that is cut short is left out, and so are others up to 1 % of all. Rows after `most` are not
-    looked at.
+    are no rows; a last row that is cut short is left out, and so are others up to 1 % of all.
 
-    Raises InputError: a column is missing, or more rows are too short; the first of them is named.
+    Args:
+        form: of the table.
+        names: of the columns.
+        most: number of rows at most that are looked at; None for all.
+
+    Raises:
+        InputError: a column is missing, or more rows are too short; the first of them is named.
     """
     wanted = [form.index(name) for name in names]
     blocks: list[list[NDArray[np.str_]]] = [[] for _ in wanted]

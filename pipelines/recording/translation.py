@@ -59,7 +59,12 @@ def is_foxglove(name: str) -> bool:
 
 
 class Translation:
-    """Translates messages, by their schema or definition in ROS, into CDR of a ROS 2 type. Raises MessageError."""
+    """Translates messages into CDR of a ROS 2 type. Raises MessageError.
+
+    Args:
+        recorded: what the messages are defined by: a schema, or a definition in ROS.
+        definition: of the ROS 2 type.
+    """
 
     def __init__(self, recorded: Schema | Definition, definition: Definition) -> None:
         self._definition = definition

@@ -61,11 +61,12 @@ def board_attitudes(
 
     Args:
         images: stamps (ns) and encoded pictures (PNG, JPEG, ...), in time order.
-        camera, board, sigma_px: as in `estimate_pose`.
+        camera: the camera; pictures of another size raise InputError.
+        board: the tags and where they are on the board.
+        sigma_px: as in `estimate_pose`.
 
     Raises:
-        InputError: pictures of another size, none, none that decodes, no tag of the board ever seen, or no attitude
-            that can be used.
+        InputError: no pictures, none that decodes, no tag of the board ever seen, or no attitude that can be used.
     """
     rows: list[tuple[int, Array, Array]] = []
     dropped: Counter[str] = Counter()

@@ -180,7 +180,10 @@ class Camera:
         return np.asarray(J[:, 6 : 6 + len(self.intrinsics)].reshape(*points.shape[:-1], 2, -1))
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """Unit directions (..., 3) in the optical frame of pixels (..., 2), to 1e-9 px; NaN without an inverse."""
+        """Unit directions (..., 3) in the optical frame of pixels (..., 2).
+
+        Exact to 1e-9 px; NaN where the distortion model has no inverse.
+        """
         flat = (np.asarray(pixels, dtype=float) - self.centre) / self.focal
         if self.distortion_model == "equidistant":
             return self._undistort_angle(flat)

@@ -31,8 +31,11 @@ _Case = tuple[str, str, Camera, Sequence[int]]
 def camera_fault(camera: Camera, body: TagBody, seen: Sequence[Detections], sigma_px: float) -> str | None:
     """Find the camera fault that explains why tags do not fit their layout, with a remedy; None if none does.
 
-    Of `seen`, the tags of static poses, those with one tag alone are left out. Errors up to twice the sigma_px of a
-    corner are none of the camera's.
+    Args:
+        camera: as recorded.
+        body: the layout.
+        seen: tags of static poses; those with one tag alone are left out.
+        sigma_px: of a corner; errors up to twice that are none of the camera's.
     """
     several = [each for each in seen if len(each.ids) > 1]
     if len(several) < _FEWEST:

@@ -82,7 +82,8 @@ def detect(picture: Picture, family: str = "36h11", camera: Camera | None = None
 
     With a camera the edges are straight in space; without, they are taken as straight in the picture.
 
-    Raises InputError: the family is not 36h11, or the camera's picture has another size.
+    Raises:
+        InputError: the family is not 36h11, or the camera's picture has another size.
     """
     if family != "36h11":
         raise InputError(f"tag_family {family!r}: only 36h11 is supported")

@@ -67,10 +67,12 @@ def los_errors(images: Iterable[tuple[int, bytes]], camera: Camera) -> LosErrors
     A tag in the first picture is the target (the one nearest the middle), its centre the target's point. Else the whole
     first picture is, and its middle (the optical axis) the point.
 
-    Images are stamps (ns) and encoded pictures, in time order.
+    Args:
+        images: stamps (ns) and encoded pictures, in time order.
+        camera: the camera; pictures of another size raise InputError.
 
-    Raises InputError: no picture decodes, one is not of the camera's size, or the first one shows neither a tag nor
-    enough texture.
+    Raises:
+        InputError: no picture decodes, or the first one shows neither a tag nor enough texture.
     """
     target: _Tag | _Texture | None = None
     R = so3.identity()

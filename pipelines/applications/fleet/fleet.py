@@ -95,9 +95,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The results of a fleet's run: of the recordings that are finished, by name, in their order.
+    """The results of a fleet's run.
 
-    There are `recordings` in all; `kept` had been finished by an earlier run. Interrupted: by Ctrl-C before the end.
+    Attributes:
+        results: by recording, in their order; of those that are finished.
+        recordings: how many there are.
+        kept: how many had been finished by an earlier run.
+        interrupted: Ctrl-C came before the end.
     """
 
     results: Mapping[str, UnitResult]

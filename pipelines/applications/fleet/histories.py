@@ -23,9 +23,15 @@ from alidade.pipelines.solvers.joint import grown, join
 
 @dataclass(frozen=True)
 class History:
-    """The calibrations of a unit over its recordings, two at least, in the order of their dates, Unix s.
+    """The calibrations of a unit over its recordings.
 
-    `changes` are of the device between them, `found` the steps for which the unit needs attention.
+    Attributes:
+        unit: its name.
+        method: of its recordings.
+        recordings: their names, in the order of their dates; two at least.
+        dates: of these, Unix s.
+        changes: steps of the device between them.
+        found: those that the unit is to be looked after for.
     """
 
     unit: str

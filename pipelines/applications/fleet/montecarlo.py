@@ -47,9 +47,16 @@ SOLVERS = ("published", "batch", "incremental")
 
 @dataclass(frozen=True)
 class Study:
-    """Simulated and solved runs of one scenario: seed -> solver -> numbers, of the seeds that are finished.
+    """Simulated and solved runs of one scenario.
 
-    Of `seeds` in all, `kept` had been finished by an earlier run. Interrupted: by Ctrl-C before the end.
+    Attributes:
+        method: simulated and solved.
+        scenario: its name.
+        solvers: in the order of the tables.
+        results: seed -> solver -> numbers, in the order of the seeds; of those that are finished.
+        seeds: how many were asked for.
+        kept: how many had been finished by an earlier run.
+        interrupted: Ctrl-C came before the end.
     """
 
     method: str

@@ -33,7 +33,10 @@ _FIELDS = {"{unit}": r"(?P<unit>.+?)", "{date}": r"(?P<date>\d{4}-?\d\d-?\d\d(?:
 class Recording:
     """Recording of a fleet: a file or a bag folder, on this machine or a remote one.
 
-    `tag` is an object store's own mark of the content (ETag), as it lists it; None where there is none.
+    Attributes:
+        file: where it is.
+        tag: an object store's own mark of the content (ETag), as it lists it; None where there is none.
+        is_bag: whether it is a bag folder.
     """
 
     file: OpenFile

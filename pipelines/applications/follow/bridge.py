@@ -55,7 +55,10 @@ class _Topic(NamedTuple):
 class Bridge(Stream):
     """Source of the messages of a Foxglove WebSocket bridge. Raises InputError when websockets is not installed.
 
-    They are kept in the folder, if any; `say` is called when the bridge answers and when it does not.
+    Args:
+        url: ws://host:port or wss://.
+        folder: where they are kept; None: nowhere.
+        say: called when the bridge answers and when it does not.
     """
 
     def __init__(self, url: str, folder: Path | None, say: Callable[[str], None]) -> None:

@@ -176,7 +176,11 @@ class View:
 
 
 class Watch:
-    """Watches whether the parameters of a run stay constant: `change` is as of the last look, None without one."""
+    """Watches whether the parameters that a run calibrates stay constant.
+
+    Attributes:
+        change: as of the last look; None: none was found.
+    """
 
     def __init__(self) -> None:
         self._seen: tuple[IncrementalSolver, int] | None = None  # the run, and its moments at the last look

@@ -80,7 +80,12 @@ class _Admitted:
 
 
 class Gate:
-    """Limit on connections of either kind to a server, in all and from one address; safe in any thread."""
+    """Limit on the number of connections of a server; safe in any thread.
+
+    Args:
+        most: connections of either kind.
+        per_address: of these, from one address.
+    """
 
     def __init__(self, most: int = MAX_CONNECTIONS, per_address: int = MAX_PER_ADDRESS) -> None:
         self._most, self._per_address = most, per_address

@@ -66,10 +66,13 @@ _STATUS = {
 
 
 class LiveServer:
-    """Context manager that serves a calibration on the loopback interface, on a port; 0 is any that is free.
+    """Context manager that serves a calibration on the loopback interface.
 
-    `origins` are other sites whose pages may read it, beside Foxglove's: `https://example.org`. Raises InputError when
-    websockets is not installed or the port is taken.
+    Raises InputError when websockets is not installed or the port is taken.
+
+    Args:
+        port: 0: any that is free.
+        origins: pages of other sites that may read it, beside Foxglove's: `https://example.org`.
     """
 
     def __init__(self, port: int = PORT, origins: Sequence[str] = ()) -> None:

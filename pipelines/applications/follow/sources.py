@@ -30,7 +30,12 @@ _PART = re.compile(r"live_(\d+)\.mcap")
 
 
 class Source(AbstractContextManager["Source"]):
-    """Recording that may still be written: a file, or a folder of its parts, which may not exist yet."""
+    """Recording that may still be written: a file, or a folder of its parts, which may not exist yet.
+
+    Attributes:
+        path: of the file or the folder.
+        name: what it is called in sentences.
+    """
 
     def __init__(self, path: Path, name: str | None = None) -> None:
         self.path, self.name = path, name or str(path)
@@ -69,8 +74,12 @@ class Source(AbstractContextManager["Source"]):
 class Stream(Source):
     """Source of messages that arrive as a stream, stored in a folder: a file for each run, so that later runs go on.
 
-    Without a folder it is a temporary one; `say` is called with what goes wrong. Raises InputError when the folder
-    cannot be made.
+    Args:
+        name: what it is called.
+        folder: where to; None: a temporary one.
+        say: called with what goes wrong.
+
+    Raises InputError when the folder cannot be made.
     """
 
     def __init__(self, name: str, folder: Path | None, say: Callable[[str], None]) -> None:
@@ -141,9 +150,16 @@ class StandardInput(Stream):
 
 
 class Replay(Stream):
-    """Source that copies a finished MCAP file at so many times its speed, so that the copy grows as a live one does.
+    """Source that copies a finished MCAP file as fast as it was recorded, so that the copy grows as a live one does.
 
-    Raises InputError for a file that is no MCAP, or a speed not above zero.
+    Args:
+        path: of the file.
+        speed: how many times as fast.
+        folder: where it is written; None: a temporary one.
+        say: called with what goes wrong.
+
+    Raises:
+        InputError: it is no MCAP file, or the speed is not above zero.
     """
 
     def __init__(self, path: Path, speed: float, folder: Path | None, say: Callable[[str], None]) -> None:
@@ -170,8 +186,13 @@ class Replay(Stream):
 def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] = print) -> Source:
     """Return the source of a name: a path, `-` for standard input, ws:// of a Foxglove WebSocket bridge.
 
-    Streams are kept in the folder, if any; `say` is called with connections and their failures. Raises InputError when
-    a folder cannot be written, a library is not installed, or what is there is a device or a pipe.
+    Args:
+        what: its name.
+        folder: where streams are kept; None: nowhere.
+        say: called with connections and their failures.
+
+    Raises:
+        InputError: a folder cannot be written, a library is not installed, or what is there is a device or a pipe.
     """
     if what == "-":
         return StandardInput(folder, say=say)
@@ -207,8 +228,11 @@ class Spool:
         spool.flush()              # on the disk, whole, or still in memory
 
     What does not fit waits in memory and is tried again: readers of the file find whole pieces, in order, and at the
-    end everything if there is room by then. A disk that is full costs nothing but time until MAX_WAITING_BYTES wait;
-    `say` is called when there is no room, and when there is again.
+    end everything if there is room by then. A disk that is full costs nothing but time until MAX_WAITING_BYTES wait.
+
+    Args:
+        path: of the file.
+        say: called when there is no room, and when there is again.
     """
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:

@@ -354,10 +354,15 @@ def with_poses_moved(bundle: Bundle, step: Array) -> Bundle:
 def adjusted(
     bundle: Bundle, sights: Sights, fixed: int, additional: Additional, far: float = np.inf, steps: int = _STEPS
 ) -> tuple[Bundle, Rows]:
-    """Minimise the bundle's reprojection errors by at most so many steps of the Levenberg-Marquardt method.
+    """Minimise the bundle's reprojection errors by the Levenberg-Marquardt method.
 
-    The tag with the index `fixed` stays. A tag in a picture with a sum of squares beyond `far` counts less and less
-    (Geman, McClure).
+    Args:
+        bundle: where to start.
+        sights: what is seen.
+        fixed: index of the tag that stays.
+        additional: what is adjusted beside poses.
+        far: sum of squares of a tag in a picture beyond which it counts less and less (Geman, McClure).
+        steps: at most.
     """
     rows, damping = linearized(bundle, sights), 1e-4
     cost = _cost(rows, bundle, additional, far)

@@ -114,7 +114,11 @@ class Fit:
 def fitted(bundle: Bundle, sights: Sights, whole: Index, additional: Additional) -> Fit:
     """Adjust the bundle by maximum likelihood and reject false detections; the first tag stays.
 
-    Of the sights, with sigmas that are right among each other, those of the indices `whole` are looked at.
+    Args:
+        bundle: a start.
+        sights: with sigmas that are right among each other.
+        whole: which of them are looked at.
+        additional: what is adjusted beside poses.
     """
     sights, used = sights[whole], np.ones(len(whole), dtype=bool)
     # Where the start is it is not yet drawn to what is false.
@@ -249,7 +253,9 @@ class Covariance:
 def covariance(fit: Fit, view: Index) -> Covariance:
     """Compute the covariance of an adjusted bundle.
 
-    Pictures in a row in which nothing moved have the same number in `view` (f,), ascending.
+    Args:
+        fit: the bundle.
+        view: (f,) pictures in a row in which nothing moved have the same number, ascending.
     """
     bundle, sights, rows, additional = fit.bundle, fit.sights, fit.rows, fit.additional
     n, of_tags, free = len(bundle.body.ids), bend_rows(bundle, sights, rows), free_columns(bundle, 0, additional)
@@ -279,8 +285,10 @@ def covariance(fit: Fit, view: Index) -> Covariance:
 def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
     """Covariance (q, q) and step (q,) of the optimal estimate given the additional parameters' priors.
 
-    The fit, adjusted with independent errors, has the information (q, q) A + P; `found` (q, q) is the covariance of its
-    errors but for what the priors bring, (A + P)^-1 S (A + P)^-1.
+    Args:
+        fit: adjusted with independent errors.
+        information: (q, q) of that, A + P.
+        found: (q, q) covariance of its errors but for what the priors bring, (A + P)^-1 S (A + P)^-1.
     """
     additional = fit.additional
     q, precision = len(information), additional.precision

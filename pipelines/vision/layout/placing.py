@@ -71,7 +71,8 @@ class Sides:
 def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
     """Adjust the bundle of all tags; `body` gives initial tag poses, or None if unknown.
 
-    Raises InputError: the pictures do not distinguish the layout from its mirror image.
+    Raises:
+        InputError: the pictures do not distinguish the layout from its mirror image.
     """
     sights = with_flips(views.start, views.sights)
     sights = replace(sights, sigma=sights.sigma * lone_scale(views.start, sights))
@@ -110,7 +111,11 @@ def _in_frame(body: TagBody, given: TagBody) -> TagBody:
 
 
 def _right_side_out(start: Bundle, sights: Sights) -> TagBody:
-    """Select the body or its mirror image, by the fit of the pictures. Raises InputError: both fit."""
+    """Select the body or its mirror image, by the fit of the pictures.
+
+    Raises:
+        InputError: both fit.
+    """
     bodies, costs = [], []
     seen = sights[sights.together]
     for body in (start.body, mirrored(start.body, 0)):
@@ -144,9 +149,11 @@ def flip_resolved(fit: Fit, view: Index, tag: int) -> bool:
 
 
 def grown(bundle: Bundle, sights: Sights) -> TagBody:
-    """Place all tags, which pictures tie together, one by one, in the frame of the one most often seen with others.
+    """Place all tags one by one, in the frame of the tag most often seen together with others.
 
-    No pose in the bundle is looked at.
+    Args:
+        bundle: cameras, sizes; no pose in it is looked at.
+        sights: of tags that pictures tie together.
     """
     n = len(bundle.body.ids)
     body = replace(bundle.body, bRt=so3.identity(n), position=np.zeros((n, 3)))
@@ -213,8 +220,12 @@ def _thinned(rows: Index, most: int) -> Index:
 def vote(bundle: Bundle, sights: Sights, poses: Sides) -> tuple[Array, Array, Array]:
     """Refined proposals for one tag's pose: bRt (h, 4), position (h, 3), m, and cost (h,), by ascending cost.
 
-    The sights are those of this tag in pictures whose `poses` other tags determine. The error of a picture's own pose
-    is part of a corner's: its covariance is that of both.
+    The error of a picture's own pose is part of a corner's: its covariance is that of both.
+
+    Args:
+        bundle: cameras and body.
+        sights: of this tag, in pictures whose poses others determine.
+        poses: of all pictures.
     """
     cRb, position = poses.cRb[sights.picture], poses.position[sights.picture]
     there = np.isfinite(poses.cost[sights.picture])
@@ -304,7 +315,11 @@ def sides(bundle: Bundle, sights: Sights) -> Sides:
     """Find both candidate poses of each picture, for the tag poses of the bundle's body.
 
     Every pose of every tag in a picture is a start; the best is refined, and the best of those on the other side of
-    the flip. The bundle's poses of pictures are not looked at.
+    the flip.
+
+    Args:
+        bundle: cameras and body; its pictures' poses are not looked at.
+        sights: of the tags that are placed.
     """
     f = len(bundle.cRb)
     bRt, place = bundle.body.bRt[sights.tag][:, None], bundle.body.position[sights.tag][:, None]
