@@ -35,6 +35,8 @@ _TRANSLATED = ("protobuf/protobuf", "json/jsonschema")
 READABLE = (*_ROS, *_TRANSLATED)
 # Of a table of messages the column of the times at which these were recorded, unless they have a field of that name.
 LOG_TIME = "log_time"
+# Messages that show whether a type named like one of ROS is that.
+_FIRST = 100
 # Encoding that is not read -> how to get one that is.
 _CONVERSIONS = {
     "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
@@ -220,16 +222,18 @@ class MessageFormat:
         self._is_translated = translated is not None
         self.type = translated or self._recorded_type
         self.is_readable = self._wire is not None or self._is_translated
+        self._has_log_time: bool | None = None  # whether messages have a field of that name; unknown before the first
 
     @property
     def is_doubtful(self) -> bool:
         """Whether the type has the name of one of ROS in a package that is not known, and may be another."""
         return self._is_translated and not is_known(self._recorded_type)
 
-    def check_fit(self, data: bytes) -> None:
-        """Take the type for what it was recorded as where a message of it, readable by its definition, is not ROS's."""
-        with suppress(MessageError):
-            if not self._translation.fits(data):
+    def check_fit(self, block: MessageBlock) -> None:
+        """Take the type for what it was recorded as where none of a block's first messages is one of ROS's."""
+        with suppress(MessageError):  # of a definition that cannot be read, which reading will name
+            fits = [self._translation.fits(block.message(i)) for i in range(min(len(block.start), _FIRST))]
+            if False in fits and True not in fits:
                 self._is_translated, self.type, self.is_readable = False, self._recorded_type, False
 
     @property
@@ -296,7 +300,10 @@ class MessageFormat:
     def cells(self, block: MessageBlock) -> Iterator[dict[str, Any]]:
         """Yield a mapping from field path to number or word for each message of a block, whatever the type.
 
-        LOG_TIME is the time at which a message was recorded, Unix ns, or its own field. Raises MessageError.
+        LOG_TIME is the time at which a message was recorded, Unix ns, or its own field where the first one has it.
+
+        Raises:
+            MessageError: a message cannot be read.
         """
         assert self._schema is not None
         parse = parser(self._recorded if self._wire else self._schema)
@@ -306,7 +313,10 @@ class MessageFormat:
                     found = dict(cells(parse(block.message(i))))
                 except (ValueError, TypeError, AttributeError, OverflowError, RecursionError, MemoryError) as error:
                     raise MessageError(f"a message of {block.size[i]} bytes cannot be read ({error})") from error
-            found.setdefault(LOG_TIME, log_ns)
+            if self._has_log_time is None:
+                self._has_log_time = LOG_TIME in found
+            if not self._has_log_time:
+                found[LOG_TIME] = log_ns
             yield found
 
     def texts(self, block: MessageBlock, names: Sequence[str]) -> list[NDArray[np.str_]]:
@@ -382,14 +392,14 @@ class MessageFormat:
 
 
 def formats_of(container: Container) -> dict[int, MessageFormat]:
-    """Return the format of each channel; a doubtful type is one of ROS if its first message is."""
+    """Return the format of each channel; a doubtful type is one of ROS if one of its first messages is."""
     found = {
         number: MessageFormat(channel, container.schemas.get(channel.schema_id))
         for number, channel in container.channels.items()
     }
     doubtful = [number for number, each in found.items() if each.is_doubtful]
     for number, block in container.first_blocks(doubtful).items():
-        found[number].check_fit(block.message(0))
+        found[number].check_fit(block)
     return found
 
 

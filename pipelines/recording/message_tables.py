@@ -3,8 +3,8 @@
     columns:
       /imu: {file: /fmu/out/sensor_combined, time: timestamp, unit: us, gyro: ['gyro_rad[0]', 'gyro_rad[1]', ...]}
 
-So what a laboratory's own messages mean is described as the columns of a text file are. The last column is that of the
-times at which the messages were recorded.
+So what a laboratory's own messages mean is described as the columns of a text file are. The last column, log_time, is
+that of the times at which the messages were recorded, unless they have a field of that name.
 """
 
 from __future__ import annotations

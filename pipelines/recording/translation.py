@@ -11,6 +11,7 @@ import base64
 import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -80,16 +81,21 @@ class Translation:
             name = self._definition.name
             raise MessageError(f"a message of {len(data)} bytes does not translate into {name} ({reason})") from error
 
-    def fits(self, data: bytes) -> bool:
-        """Whether a message translates and has one of the ROS 2 type's fields, a header apart."""
+    def fits(self, data: bytes) -> bool | None:
+        """Whether a message translates and has one of the ROS 2 type's fields, a header apart; None if it is broken."""
         try:
-            self(data)
-        except MessageError:
-            return False
+            fields = _fields(self._parse(data))
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError):
+            return None
         own = {
             name for name, what in self._definition.fields(self._definition.name) if what != (Nodetype.NAME, _HEADER)
         }
-        return not own.isdisjoint(name.lower() for name, _ in _fields(self._parse(data)))
+        if own.isdisjoint(name.lower() for name, _ in fields):
+            return False
+        with suppress(MessageError):
+            self(data)
+            return True
+        return False
 
     def _message(self, kind: str, tree: Any) -> Any:
         if kind == _TIME:

@@ -110,7 +110,6 @@ def _names(session: Session) -> list[str]:
     return [q.name for q in session.problem().quantities]
 
 
-@pytest.mark.slow
 def test_one_recording_together_with_none_is_as_it_was() -> None:
     (one,) = sessions("head", [1], "")
     estimate = jointly([one]).estimate
@@ -119,6 +118,7 @@ def test_one_recording_together_with_none_is_as_it_was() -> None:
     assert "moved last by 0 sigmas" in estimate.message
 
 
+@pytest.mark.slow
 def test_five_recordings_make_sigmas_smaller_by_their_root() -> None:
     """With ideal sensors and wide priors, of what is shared; what belongs to a recording stays nearly as it is."""
     opened = sessions("indexer", range(5), WIDE)

@@ -373,6 +373,33 @@ def test_fields_of_ones_own_make_a_type_with_the_name_of_one_of_ros_another(
             recording.imu("/lab/raw")
 
 
+@pytest.mark.parametrize("odd", [b"{}", b"{broken", b'{"angular_velocity": "none"}'])
+def test_one_odd_message_does_not_make_a_type_another(odd: bytes, motion: Motion, tmp_path: Path) -> None:
+    """As of a driver whose sensor is not there yet."""
+    path, first = tmp_path / "j.mcap", [odd]
+    rate = {"angular_velocity": {"x": 1.0, "y": 2.0, "z": 3.0}}
+
+    def message(stamp: dict[str, int], _: dict[str, Any]) -> bytes:
+        return first.pop() if first else json.dumps({"header": {"stamp": stamp}, **rate}).encode()
+
+    write_mcap(path, motion, "json", ("lab.Imu", "jsonschema", b"{}"), message)
+    assert open_recording(path).topics["/lab/raw"].type == "sensor_msgs/msg/Imu"
+
+
+@pytest.mark.parametrize("in_first", [True, False])
+def test_log_times_of_a_topic_are_of_one_clock(in_first: bool, motion: Motion, tmp_path: Path) -> None:
+    path, count = tmp_path / "j.mcap", iter(range(10_000))
+
+    def message(_: dict[str, int], fields: dict[str, Any]) -> bytes:
+        own = {"log_time": 1.0} if next(count) % 2 == (not in_first) else {}
+        return json.dumps(own | fields).encode()
+
+    write_mcap(path, motion, "json", ("lab.Raw", "jsonschema", b"{}"), message)
+    texts, *_ = message_tables(open_container(path))["/lab/raw"].read(["log_time"])
+    second = "" if in_first else str(START + int(1e9 * motion.t[10]))
+    assert texts["log_time"][1] == second
+
+
 @pytest.mark.parametrize("rate", [{"x": 1.0, "y": 2.0, "z": 3.0}, [1.0, 2.0, 3.0]])
 def test_a_type_of_an_unknown_package_with_the_fields_of_ros_is_that_of_ros(
     rate: Any, motion: Motion, tmp_path: Path
