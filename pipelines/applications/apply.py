@@ -22,7 +22,7 @@ from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import replacing
+from alidade.pipelines.files import plain_json, replacing
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.methods.triads import numeric_jacobian
 from alidade.pipelines.recording import messages, series
@@ -227,3 +227,18 @@ def _of_stamps(corrected: series.Series, order: Stamps, stamps: Stamps, log_ns: 
     some = {name: getattr(corrected, name)[rows[same]] for name in ("t_ns", *corrected.COLUMNS)}
     encoder = encode_series(replace(corrected, **some))
     return encoder.block(0, len(encoder.t_ns))._replace(log_ns=log_ns[same])
+
+
+def applied_json(applied: Applied) -> str:
+    """JSON of `apply`: the file, its corrected topics, notes."""
+    topics = [
+        {
+            "name": topic.name,
+            "recorded": topic.recorded,
+            "sensors": topic.sensors,
+            "messages": len(topic.messages),
+            "frame_id": topic.messages.frame_id,
+        }
+        for topic in applied.topics
+    ]
+    return plain_json("applied", {"file": str(applied.path), "topics": topics, "notes": applied.notes})

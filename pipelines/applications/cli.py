@@ -671,8 +671,8 @@ def apply(
 
     Gyro, accelerometer, magnetometer: /imu/data becomes /imu/data_calibrated beside it.
     """
+    from alidade.pipelines.applications.apply import applied_json
     from alidade.pipelines.applications.apply import apply as run
-    from alidade.pipelines.reports.terminal import applied_json
 
     with progress.shown(quiet or as_json):
         applied = run(

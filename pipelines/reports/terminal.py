@@ -21,7 +21,6 @@ from alidade.pipelines.files import plain_json
 from alidade.pipelines.reports.report import Block, Bullets, Card, Code, Details, Heading, Report, Tables, Text, Tiles
 
 if TYPE_CHECKING:
-    from alidade.pipelines.applications.apply import Applied
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.recording.topics import SessionFacts
@@ -271,18 +270,3 @@ def facts_json(
         tables = {topic: table.model_dump(exclude_defaults=True) for topic, table in columns.columns.items()}
         content["columns"] = {"columns": tables, "reasons": list(columns.reasons), "doubts": list(columns.doubts)}
     return plain_json("info", content | {"unused": list(unused)})
-
-
-def applied_json(applied: Applied) -> str:
-    """JSON of `apply`: the file, its corrected topics, notes."""
-    topics = [
-        {
-            "name": topic.name,
-            "recorded": topic.recorded,
-            "sensors": topic.sensors,
-            "messages": len(topic.messages),
-            "frame_id": topic.messages.frame_id,
-        }
-        for topic in applied.topics
-    ]
-    return plain_json("applied", {"file": str(applied.path), "topics": topics, "notes": applied.notes})

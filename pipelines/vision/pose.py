@@ -48,8 +48,14 @@ class PoseFit:
 def refine(camera: Camera, corners: Array, pixels: Array, cRb: Array, position: Array) -> PoseFit | None:
     """Refine a pose to the local minimum of the reprojection errors; None if there is none.
 
-    The body, of corners (n, 3), m, seen at pixels (n, 2), begins at the attitude cRb (4,) and position (3,), m, in the
-    camera. By pycolmap, or by ourselves where it has no wheel.
+    By pycolmap, or by ourselves where it has no wheel.
+
+    Args:
+        camera: with its distortion.
+        corners: (n, 3) in the body's frame, m.
+        pixels: (n, 2) where they are seen.
+        cRb: (4,) attitude of the body in the camera to begin with.
+        position: (3,) of its origin, m.
     """
     return (refine_by_pycolmap if _has_pycolmap() else refine_here)(camera, corners, pixels, cRb, position)
 
@@ -243,7 +249,9 @@ def estimate_pose(
     (T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", 2014; OpenCV's IPPE_SQUARE) are the starts.
 
     Args:
-        camera, body, detections: tags of the body in a picture of the camera.
+        camera: the camera.
+        body: tags by id.
+        detections: tags in the picture.
         sigma_px: standard deviation of corners, px per axis; None takes the detections' own, or what the misfit shows
             if that is more (a layout that is not exact).
         expected: (4,) attitude cRb expected beforehand; it settles a flip that the corners leave open if the one pose
@@ -319,9 +327,12 @@ def angles(p: Array, q: Array) -> Array:
 
 
 def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array, Array]:
-    """Both pose solutions of each single tag of size (n,), m, with corners at pixels (n, 4, 2).
+    """Both pose solutions of each single tag: cRt (n, 2, 4) and position in c (n, 2, 3), m.
 
-    Returns cRt (n, 2, 4) and position in c (n, 2, 3), m.
+    Args:
+        camera: the camera.
+        size: (n,) m.
+        pixels: (n, 4, 2) corners.
     """
     import cv2
 
