@@ -8,6 +8,6 @@ biases, scales). The estimate minimises
 with whitened residuals r, a robust loss rho for measurements that may be outliers, a bias b_j that walks in pieces, and
 Gaussian priors. Covariances are those of the linearised problem at the minimum.
 
-Begin with `problem.py` (Problem, Step, Quantity, Estimate), then `gyro_chain.py`. No method, solver or recording is
-known here.
+Begin with `problem.py` (Problem, Step, Quantity, Estimate), then `gyro_chain.py`. It imports no method, solver
+or recording.
 """

@@ -44,6 +44,10 @@ Findings = Mapping[str, Sequence[Mapping[str, object]]]
 Coordinates = Callable[[gtsam.Values, int], tuple[Array, Array]]
 
 
+# Factor that takes rounding off half a turn.
+_ALMOST = 1.0 - 1e-12
+
+
 def vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
     """Coordinates of a vector variable: the vector itself."""
     vector = np.asarray(values.atVector(key), dtype=float)
@@ -66,7 +70,8 @@ class NearRotationVector:
         """Rotation vector (3,), rad, and its Jacobian by the variable."""
         phi = so3.log(so3.from_gtsam([values.atRot3(key)])[0])
         angle = float(np.linalg.norm(phi))
-        turns = round((float(phi @ self.reference) / angle - angle) / (2.0 * np.pi)) if angle > 0.0 else 0
+        away = (float(phi @ self.reference) / angle - angle) / (2.0 * np.pi) if angle > 0.0 else 0.0
+        turns = round(_ALMOST * away)  # what is half a turn off stays, whatever rounding says
         if turns != 0:
             phi = phi * (1.0 + 2.0 * np.pi * turns / angle)
         return phi, so3.right_jacobian_inverse(phi)

@@ -25,6 +25,8 @@ Picture = NDArray[np.uint8]
 
 # A pixel is integrated over n by n parts of its area: (n, contrast of the texture in it, grey levels, up to which).
 _PARTS = ((1, 20.0), (2, 80.0), (4, np.inf))
+# Off the middle of the picture, px, as principal points are.
+_OFF_CENTRE = (3.4, -2.7)
 # Grey levels of a printed tag in daylight.
 _BLACK, _WHITE = 20.0, 220.0
 # About so many at a time, which stay in the cache with all that is made of them on the way.
@@ -44,7 +46,8 @@ class PinholeCamera(ScenarioPart):
     @property
     def camera(self) -> Camera:
         """The camera. Raises InputError where none can have that distortion."""
-        f, x, y = self.focal_px, 0.5 * (self.width - 1.0) + 3.4, 0.5 * (self.height - 1.0) - 2.7
+        x, y = 0.5 * (np.array([self.width, self.height]) - 1.0) + _OFF_CENTRE
+        f = self.focal_px
         K = np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
         return Camera(self.width, self.height, K, "plumb_bob", np.array(self.distortion))
 

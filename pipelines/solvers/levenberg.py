@@ -150,6 +150,7 @@ def minimize(
             # A part of a full step, or more than one, is predicted to gain less.
             off = abs(decrease - length * (2.0 - length) * predicted)
             is_minimum = _is_minimum(enough, damping, predicted, decrease, off)
+            is_minimum &= decrease >= 0.0 or not deadline.passed()  # which leaves a step uncorrected
             if decrease > 0.0 or (is_minimum and decrease > -enough):
                 here = there
             if is_minimum:
@@ -168,16 +169,18 @@ def minimize(
 
 
 def states_first(engine: Linearization, values: Values) -> Values:
-    """Move all states to where they are best at the parameters given, if the cost falls.
+    """Move all states, and the bias, to where they are best at the other parameters given, if the cost falls.
 
     States aligned with single measurements repeat their noise. A parameter that multiplies a state would explain that
     noise: of ten minutes of a gimbal the scale of LOS errors took a step of 12 prior sigmas.
     """
     with suppress(IndeterminateStateError, np.linalg.LinAlgError):
         factorization = engine.at(values)[0].eliminate()
-        last = np.zeros((len(factorization.root) - 1, 1))
+        root, c = factorization.root, factorization.c
+        last = np.zeros((len(root) - 1, 1))
+        last[:c, 0] = np.linalg.solve(root[:c, :c], root[:c, -1])
         states, nodes = factorization.given(last)
-        move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
+        move = Tangent(states[..., 0], nodes[..., 0], last[c:, 0])
         return min(values, engine.layout.retract(values, move), key=engine.cost)
     return values
 

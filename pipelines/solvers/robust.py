@@ -66,10 +66,9 @@ def solve_robust(
     tolerance = _ROUGH_TOLERANCE * max(count, 1)
     rough = replace(config, max_iterations=most, cost_tolerance=tolerance)
     found = minimize(plain, states_first(plain, values), rough)
+    iterations, truncated = found.iterations, engine.under(loss)
     if not found.converged and deadline.passed():
-        return found
-    iterations = found.iterations
-    truncated = engine.under(loss)
+        return replace(found, engine=truncated, cost=truncated.cost(found.values))
     start = min(values, found.values, key=truncated.cost) if np.isfinite(found.cost) else values
     start, more = _graduated(engine, start, loss, config)
     # Inside the gate the truncated loss is no other than plain least squares.

@@ -143,6 +143,7 @@ def test_minimisations_end_with_the_time(recording: Path, clock: list[float], mo
     assert estimate.message == "not converged: stopped by the time limit of 3 s"
     assert not estimate.converged
     assert np.isfinite(estimate.values).all()
+    assert sum(estimate.rejected.values()) > 0, "outliers are not used, though time is over"
     assert made[0] == 3
 
 

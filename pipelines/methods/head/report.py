@@ -379,7 +379,14 @@ def carried(data: HeadData, attitudes: Attitudes, values: Mapping[str, float], a
 
 
 def between(helmet: GyroPath, platform: GyroPath | None, time: Array, bRv: Array, at: Array) -> Array:
-    """Attitudes (n, 4) at times, propagated by the gyros from known ones (k, 4), correct over gaps of several turns."""
+    """Attitudes bRv (n, 4) at times (n,), s, propagated by the gyros from known ones, whatever the turns between.
+
+    Args:
+        helmet, platform: gyros; without a second one the platform is at rest.
+        time: (k,) of the known attitudes, s, increasing.
+        bRv: (k, 4); before the first and after the last one they are carried from that one alone.
+        at: (n,) s.
+    """
 
     def by_gyros(t: Array) -> tuple[Array, Array]:
         return so3.identity(len(t)) if platform is None else platform.attitude(t), helmet.attitude(t)
