@@ -26,6 +26,7 @@ from functools import cached_property
 
 import numpy as np
 
+from alidade.factors.array import Array
 from alidade.pipelines import deadline
 from alidade.pipelines.solvers.chain import Factorization, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
@@ -175,14 +176,20 @@ def states_first(engine: Linearization, values: Values) -> Values:
     noise: of ten minutes of a gimbal the scale of LOS errors took a step of 12 prior sigmas.
     """
     with suppress(IndeterminateStateError, np.linalg.LinAlgError):
-        factorization = engine.at(values)[0].eliminate()
+        system, cost = engine.at(values)
+        factorization = system.eliminate()
         root, c = factorization.root, factorization.c
         last = np.zeros((len(root) - 1, 1))
         last[:c, 0] = np.linalg.solve(root[:c, :c], root[:c, -1])
-        states, nodes = factorization.given(last)
-        move = Tangent(states[..., 0], nodes[..., 0], last[c:, 0])
-        return min(values, engine.layout.retract(values, move), key=engine.cost)
+        there = engine.layout.retract(values, followed(factorization, last))
+        return there if engine.cost(there) < cost else values
     return values
+
+
+def followed(factorization: Factorization, last: Array) -> Tangent:
+    """Complete moves (c + s, 1) of last node and shared unknowns by the optimal moves of all states and nodes."""
+    states, nodes = factorization.given(last)
+    return Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
 
 
 def _length(predicted: float, before: float) -> float:

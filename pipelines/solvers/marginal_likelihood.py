@@ -756,7 +756,7 @@ def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...
 
 
 def _engine_at(linearization: Linearization, found: LikelihoodMaximum) -> Linearization:
-    """Linearisation at noise levels, without outliers and with widened sigmas of the other measurements."""
+    """Return a linearisation weighted by the noise levels of a likelihood maximum, and widened; outliers left out."""
     used = [np.isfinite(wide) for wide in found.widening]
     engine = apply_levels(linearization, found.levels).counting(used)
     groups = [

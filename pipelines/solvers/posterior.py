@@ -27,6 +27,7 @@ from alidade.pipelines.gaussian_prior import GaussianPrior, root_of_information
 from alidade.pipelines.solvers.chain import Chain, ChainFactorization, Factorization
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
+from alidade.pipelines.solvers.levenberg import followed
 from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization, System
 
 if TYPE_CHECKING:
@@ -416,12 +417,6 @@ def moved_to(compiled: Compiled, engine: Linearization, values: Values, numbers:
     factorization = engine.at(values)[0].eliminate()
     last = reported.root(factorization.root).last(du[:, None])
     return engine.layout.retract(values, followed(factorization, last))
-
-
-def followed(factorization: Factorization, last: Array) -> Tangent:
-    """Complete moves (c + s, 1) of last node and shared unknowns by the optimal moves of all states and nodes."""
-    states, nodes = factorization.given(last)
-    return Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
 
 
 def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -41,8 +41,8 @@ from alidade.factors.array import Array
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Point
-from alidade.pipelines.solvers.posterior import Reported, ReportedRoot, followed
+from alidade.pipelines.solvers.levenberg import Point, followed
+from alidade.pipelines.solvers.posterior import Reported, ReportedRoot
 
 # Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
 MAX_SIGMA = 0.3
