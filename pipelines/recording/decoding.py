@@ -35,8 +35,8 @@ _TRANSLATED = ("protobuf/protobuf", "json/jsonschema")
 READABLE = (*_ROS, *_TRANSLATED)
 # Of a table of messages the column of the times at which these were recorded, unless they have a field of that name.
 LOG_TIME = "log_time"
-# Messages that show whether a type named like one of ROS is that.
-_FIRST = 100
+# Messages that show what a topic holds: its fields, of which the first may lack some, and whether it is a ROS type.
+FIRST_MESSAGES = 100
 # Encoding that is not read -> how to get one that is.
 _CONVERSIONS = {
     "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
@@ -226,14 +226,19 @@ class MessageFormat:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the type has the name of one of ROS in a package that is not known, and may be another."""
+        """Whether the message type is named like one of ROS, in a package that is not known: it may be another type."""
         return self._is_translated and not is_known(self._recorded_type)
 
     def check_fit(self, block: MessageBlock) -> None:
         """Take the type for what it was recorded as where none of a block's first messages is one of ROS's."""
         with suppress(MessageError):  # of a definition that cannot be read, which reading will name
-            fits = [self._translation.fits(block.message(i)) for i in range(min(len(block.start), _FIRST))]
-            if False in fits and True not in fits:
+            is_other = False
+            for i in range(min(len(block.start), FIRST_MESSAGES)):
+                fits = self._translation.fits(block.message(i))
+                if fits:
+                    return
+                is_other |= fits is False
+            if is_other:
                 self._is_translated, self.type, self.is_readable = False, self._recorded_type, False
 
     @property

@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from alidade.factors.array import Stamps
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.container import Container, MessageBlock, MultiPartContainer
-from alidade.pipelines.recording.decoding import LOG_TIME, MessageFormat, formats_of
+from alidade.pipelines.recording.decoding import FIRST_MESSAGES, LOG_TIME, MessageFormat, formats_of
 from alidade.pipelines.recording.messages import SENSORS, MessageError
 from alidade.pipelines.recording.table_values import unit_in
 from alidade.pipelines.recording.tables import MOST_COLUMNS, Columns, TableHead
 
-# Messages whose fields are columns: the first may lack some.
-_FIRST = 100
 # Bytes of a message beyond which its numbers are those of a picture or a scan; a pose with covariances has 400.
 _LARGEST = 1 << 14
 # ns since 1970, of 1973.
@@ -57,7 +55,7 @@ class MessageTable:
         first: dict[str, object] = {}
         if self._first is not None:
             try:
-                for cells in islice(self._formats[self._first.channel].cells(self._first), _FIRST):
+                for cells in islice(self._formats[self._first.channel].cells(self._first), FIRST_MESSAGES):
                     first = {**cells, **first}
             except MessageError as error:
                 raise InputError(f"{self._container.path}: topic {self.name}: {error}") from error
@@ -72,7 +70,9 @@ class MessageTable:
         return next(self._container.blocks(set(self._formats)), None)
 
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], Stamps]:
-        """Return the named columns as texts, empty where a message lacks the field; no sentences; log times, Unix ns.
+        """Return the named columns as texts (N,), empty where a message lacks the field, and log times (N,), Unix ns.
+
+        Between them the list of sentences about rows left out, as tables of files have it: there are none.
 
         Args:
             names: of the columns.

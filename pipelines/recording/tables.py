@@ -277,7 +277,7 @@ def _numbers(path: Path, name: str, texts: NDArray[np.str_]) -> Array:
 
 
 def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Mask of cells that are neither empty nor a placeholder."""
+    """Mask (N,) of the cells of a column that hold something, neither empty nor a placeholder for no number."""
     return ~np.isin(np.char.lower(texts), list(_ABSENT))
 
 

@@ -11,7 +11,6 @@ import base64
 import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,8 @@ from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.container import Schema
 from alidade.pipelines.recording.messages import Definition, MessageError
 
+# Raised by parsing, translating or encoding a message that is not what its definition says.
+_BROKEN = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
 _HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
 # Last part of a type's name -> ROS 2 type; packages in which such a type is that of ROS, whatever its fields.
 _ROS = {name.rpartition("/")[2]: name for name in messages.SENSORS}
@@ -74,9 +75,8 @@ class Translation:
     def __call__(self, data: bytes) -> bytes:
         """Translate one message into the bytes of a CDR message."""
         try:
-            tree = self._parse(data)
-            return self._definition.encode(self._message(self._definition.name, tree))
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError) as error:
+            return self._encoded(self._parse(data))
+        except _BROKEN as error:
             reason = " ".join(str(error).split())[:200]
             name = self._definition.name
             raise MessageError(f"a message of {len(data)} bytes does not translate into {name} ({reason})") from error
@@ -84,18 +84,21 @@ class Translation:
     def fits(self, data: bytes) -> bool | None:
         """Whether a message translates and has one of the ROS 2 type's fields, a header apart; None if it is broken."""
         try:
-            fields = _fields(self._parse(data))
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError):
+            tree = self._parse(data)
+        except _BROKEN:
             return None
         own = {
             name for name, what in self._definition.fields(self._definition.name) if what != (Nodetype.NAME, _HEADER)
         }
-        if own.isdisjoint(name.lower() for name, _ in fields):
+        try:
+            self._encoded(tree)
+            return not own.isdisjoint(name.lower() for name, _ in _fields(tree))
+        except _BROKEN:
             return False
-        with suppress(MessageError):
-            self(data)
-            return True
-        return False
+
+    def _encoded(self, tree: Any) -> bytes:
+        """Encode a parsed message as CDR."""
+        return self._definition.encode(self._message(self._definition.name, tree))
 
     def _message(self, kind: str, tree: Any) -> Any:
         if kind == _TIME:
