@@ -296,7 +296,8 @@ def _two_minutes(seed: int) -> tuple[bool, Estimate, Estimate, Array]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 4])
-def test_after_two_minutes_the_answer_is_as_good_as_batch_though_nothing_tells_the_roll(seed: int) -> None:
+def test_after_two_minutes_an_answer_is_as_good_as_batch_though_nothing_tells_the_roll(seed: int) -> None:
+    """In the initialisation phase or after it."""
     _, estimate, batch, truth = _two_minutes(seed)
     assert _apart(estimate, batch) < 0.5
     size, numbers = nees(estimate.values, estimate.covariance, truth)
@@ -305,18 +306,20 @@ def test_after_two_minutes_the_answer_is_as_good_as_batch_though_nothing_tells_t
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "seed",
-    [
-        pytest.param(seed, marks=pytest.mark.xfail(strict=True, reason=reason))
-        for seed, reason in {
-            1: "the phase goes on: the roll is .09 of a variance to second order, and it ends below .001",
-            3: "the phase goes on: the roll is .08 of a variance to second order, and it ends below .001",
-            4: "the phase ends at 10 s, and the roll's sigma is 16 % below batch's",
-        }.items()
-    ],
+    "seed", [1, 3, pytest.param(4, marks=pytest.mark.xfail(strict=True, reason="one sigma is 16 % below batch's"))]
 )
-def test_the_initialisation_phase_ends_though_nothing_tells_the_roll(seed: int) -> None:
-    """After two minutes its sigmas are those of batch; else it would be solved anew until the tenth minute."""
-    initialising, estimate, batch, _ = _two_minutes(seed)
-    assert not initialising
+def test_after_two_minutes_sigmas_are_those_of_batch_though_nothing_tells_the_roll(seed: int) -> None:
+    """In the initialisation phase or after it."""
+    _, estimate, batch, _ = _two_minutes(seed)
     np.testing.assert_allclose(estimate.sigmas, batch.sigmas, rtol=0.05)
+
+
+_GOES_ON = pytest.mark.xfail(strict=True, reason=".08 of a variance is of second order; it ends at .001")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [pytest.param(1, marks=_GOES_ON), pytest.param(3, marks=_GOES_ON), 4])
+def test_the_initialisation_phase_ends_though_nothing_tells_the_roll(seed: int) -> None:
+    """Else the recording would be solved anew until the tenth minute."""
+    initialising, *_ = _two_minutes(seed)
+    assert not initialising
