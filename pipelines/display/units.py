@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from alidade.pipelines.estimation.problem import Quantity
+if TYPE_CHECKING:
+    from alidade.pipelines.estimation.problem import Quantity
 
 _G = 9.80665  # standard gravity, m/s^2
 

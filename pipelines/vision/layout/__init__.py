@@ -13,7 +13,6 @@ from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from alidade.factors import so3
 from alidade.factors.array import Array
@@ -149,6 +148,8 @@ def _unconnected(views: Gathered, given: TagBody) -> dict[int, str]:
 
 def _reached(sights: Sights, tags: int) -> NDArray[np.bool_]:
     """Mask (n,) of tags connected to the first tag by a chain of common pictures."""
+    from scipy.sparse.csgraph import connected_components
+
     _, chain = connected_components(joint(sights, tags))
     return np.asarray(chain == chain[0])
 
