@@ -64,7 +64,7 @@ class ErrorMapFactor(WrappedModel):
         return (*self.model.blocks, self.functions.shape[1] * self.axes)
 
     def __call__(self, *blocks: Array) -> Residuals:
-        """Residual (n, m) of the model minus the map's error, with Jacobians."""
+        """Evaluate the whitened residuals (n, m): those of the model less the whitened error of the map."""
         *own, c = blocks
         residuals, jacobians = self.model(*own)
         weight = self.model.sqrt_information[:, :, : self.axes]

@@ -249,7 +249,7 @@ def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
 def facts_json(
     facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str], columns: Columns | None = None
 ) -> str:
-    """JSON of `info`: the facts, and what each method has, lacks and could use."""
+    """JSON text of `info`: a recording's facts, and the topics that each method finds, lacks or could use."""
     suggested = {suggestion.method: suggestion for suggestion in found}
     content = asdict(facts)
     proposed = content.pop("proposed")

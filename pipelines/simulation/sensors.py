@@ -174,7 +174,7 @@ def read_by(rate: Array, sensor: str, values: Mapping[str, float], force: Array 
 
 
 def measured(warming: Warming | None, duration: float) -> Temperature | None:
-    """Temperatures as messages state them, from the start until the end, s; None without a topic."""
+    """Sample the temperature of a sensor from 0 to `duration`, s, as its topic states it; None without such a topic."""
     if warming is None:
         return None
     t = np.arange(np.floor(duration * warming.rate_hz) + 1.0) / warming.rate_hz

@@ -127,7 +127,14 @@ class Outcome:
 
 @dataclass(frozen=True, repr=False)
 class FleetResult:
-    """Results of a calibrated fleet: by recording, of parameters over units, of units over recordings; the files."""
+    """Results of a calibrated fleet, and the files they are written to.
+
+    Attributes:
+        outcome: the results by recording.
+        populations: of each parameter over the units.
+        histories: of each unit over its recordings.
+        written: the files.
+    """
 
     outcome: Outcome
     populations: Sequence[Population]
@@ -136,7 +143,7 @@ class FleetResult:
 
     @property
     def summary(self) -> list[str]:
-        """Summary: how many recordings with what verdicts, and which units need attention."""
+        """Sentences that sum up the fleet: number of recordings by verdict, and the units that need attention."""
         units = units_of_interest(self.outcome.results, self.populations, self.histories)
         return [*self.outcome.summary, sentence(units)]
 
@@ -177,10 +184,15 @@ def calibrate_fleet(
     jobs: int | None = None,
     names: str | None = None,
 ) -> Outcome:
-    """Calibrate every recording, by name, that has not been finished before with these settings and this version.
+    """Calibrate every recording that has not been finished before with these settings and this version.
 
-    Results are kept in the folder `out` as they come; `scheduler` and `jobs` are as `engine.cluster` has them, `names`,
-    a pattern of the file names, as `recordings.from_name`.
+    Args:
+        recordings: by name.
+        settings: for all of them.
+        out: folder; results are kept there as they come.
+        scheduler: address; None works on this machine.
+        jobs: how many local workers.
+        names: pattern of the file names, see recordings.from_name.
 
     Raises:
         InputError: out cannot be written to, no cluster can be had, or a name does not fit.
@@ -219,8 +231,13 @@ def calibrate_recording(
 ) -> RecordingResult | None:
     """Calibrate one recording on the worker; None if the known result was made from the same files.
 
-    A result without `sha256` is of a file that could not be read at all; the next run tries again. `unit` is as the
-    file's name has it; `known` are the SHA-256 of the recording and of the earlier calibration that were used before.
+    A result without `sha256` is of a file that could not be read at all; the next run tries again.
+
+    Args:
+        recording: where it is.
+        settings: how.
+        unit: as the file's name has it.
+        known: SHA-256 of the recording and of the earlier calibration that the result known was made of.
     """
     try:
         with local(recording.file, recording.is_bag) as path:

@@ -120,8 +120,15 @@ def run_study(
 ) -> Study:
     """Simulate and solve every seed that has not been finished before.
 
-    The scenario is a name or a YAML file, None the method's nominal one. Results are kept in the folder `out` as they
-    come; `scheduler` and `jobs` are as `engine.cluster` has them, `window` is the incremental solver's, s.
+    Args:
+        method: to simulate and solve.
+        scenario: name or YAML file; None is the method's nominal one.
+        seeds: one run each.
+        solvers: of SOLVERS.
+        out: folder; results are kept there as they come.
+        scheduler: address; None works on this machine.
+        jobs: how many local workers.
+        window: s, of the incremental solver; None keeps the whole history.
 
     Raises:
         InputError: no such method, scenario or solver, out cannot be written to, or no cluster can be had.
