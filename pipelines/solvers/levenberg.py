@@ -49,8 +49,6 @@ _DETERMINED = 1e-3
 # Damping of corrections, of the first damped step and of steps that need not go all the way, relative to the diagonal
 # of A'A; that of a correction over that of the step; and the damping below which steps are full ones again.
 INITIAL_DAMPING, _FIRMER, _MIN_DAMPING = 1e-6, 100.0, 1e-12
-# Corrections of a step that raises the cost, at most.
-_CORRECTIONS = 6
 
 
 @dataclass(frozen=True)
@@ -63,11 +61,14 @@ class LevenbergConfig:
             more than the root of it, in its own sigmas, and by far less once the step is taken. Sigmas are as large as
             the residuals where these are larger than stated.
         max_damping: above it no step is left.
+        corrections: of a step that raises the cost, at most. A rough minimisation makes none: it has few iterations,
+            and while outliers count its steps are not along any valley.
     """
 
     max_iterations: int = 100
     cost_tolerance: float = 2e-5
     max_damping: float = 1e8
+    corrections: int = 6
 
 
 DEFAULT = LevenbergConfig()
@@ -141,7 +142,7 @@ def minimize(
         if step is not None:
             length = _length(predicted, before) if damping == 0.0 else 1.0
             # Where there is nothing to be gained the cost rises by rounding.
-            most = _CORRECTIONS if predicted >= enough else 0
+            most = config.corrections if predicted >= enough else 0
             there, corrections = _reached(engine, here, step.times(length), damping, most)
             iteration += corrections
             decrease = here.cost - there.cost

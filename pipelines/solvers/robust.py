@@ -64,7 +64,7 @@ def solve_robust(
     count = sum(len(group.model.time) for group in engine.groups if group.is_measurement)
     most = min(_ROUGH_ITERATIONS, config.max_iterations)
     tolerance = _ROUGH_TOLERANCE * max(count, 1)
-    rough = replace(config, max_iterations=most, cost_tolerance=tolerance)
+    rough = replace(config, max_iterations=most, cost_tolerance=tolerance, corrections=0)
     found = minimize(plain, states_first(plain, values), rough)
     iterations, truncated = found.iterations, engine.under(loss)
     if not found.converged and deadline.passed():
@@ -90,7 +90,7 @@ def _hardened(engine: Linearization, values: Values, loss: TruncatedLoss, config
     A dozen pictures, three of them outliers, are explained by a gyro scale 200 sigmas from its prior, and every way
     from there leads past the minimum. While measurements are soft, priors and process models hold.
     """
-    few, softness = replace(config, max_iterations=_ROUGH_ITERATIONS), _SOFTNESS
+    few, softness = replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0), _SOFTNESS
     values = minimize(_soft(engine.under(None), softness), values, few).values
     few = replace(few, max_iterations=_HARDENING_ITERATIONS)
     while softness > 1.0 and not deadline.passed():
@@ -150,7 +150,7 @@ def _graduated(
         values, iterations = engine.layout.retract(here := values, step), iterations + 1
         residuals = engine.unweighted(values)
         if not relaxed.cost_of(residuals) < cost:
-            few = replace(config, max_iterations=_ROUGH_ITERATIONS)
+            few = replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0)
             values = minimize(relaxed, here, few, (system, cost)).values
             residuals = engine.unweighted(values)
         mu *= _MU_STEP

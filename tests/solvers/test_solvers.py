@@ -231,8 +231,7 @@ def test_a_lengthened_step_that_goes_too_far_proves_no_minimum(monkeypatch: pyte
     near = engine.layout.retract(start.values, step.times(1.0 - share))
     lengths = iter((3.0, *(10 * [1.0])))
     monkeypatch.setattr(levenberg, "_length", lambda *_: next(lengths))
-    monkeypatch.setattr(levenberg, "_CORRECTIONS", 0)
-    found = levenberg.minimize(engine, near, levenberg.LevenbergConfig())
+    found = levenberg.minimize(engine, near, levenberg.LevenbergConfig(corrections=0))
     assert engine.cost(near) - least == pytest.approx(0.05**2, rel=1e-3)
     assert found.converged
     assert found.cost - least < 1e-6
