@@ -708,7 +708,7 @@ class LikelihoodMaximum:
 
 
 def maximise_likelihood(
-    linearization: Linearization, start: LikelihoodMaximum, rounds: int = _ROUNDS, from_above: bool = False
+    linearization: Linearization, start: LikelihoodMaximum, rounds: int = _MOST_SOLUTIONS, from_above: bool = False
 ) -> LikelihoodMaximum:
     """Maximise the marginal likelihood by alternating noise levels and Gauss-Newton steps of the values.
 
@@ -717,14 +717,14 @@ def maximise_likelihood(
     Args:
         linearization: of the factors, with the noise stated.
         start: values near the solution, levels, what is widened and rejected.
-        rounds: linearisations.
+        rounds: linearisations, at most; two or more end once the levels have settled.
         from_above: whether another maximum is looked for, see `_from_above`.
     """
     _, _, nodes, c, _ = linearization.layout.sizes
-    for _ in range(rounds):
+    for number in range(rounds):
         if deadline.passed():
             break
-        chain = LinearChain.of(linearization, start.values)
+        chain, before = LinearChain.of(linearization, start.values), start.levels
         levels = estimate_levels(chain, start.levels, start.widening, from_above)
         widening, values = widened(chain, levels, start.widening), start.values
         solution = chain.solved(chain.variances(levels, widening))
@@ -732,7 +732,14 @@ def maximise_likelihood(
             step = Tangent(solution.states.reshape(chain.size), np.zeros((nodes, c)), solution.shared)
             values = linearization.layout.retract(values, step)
         start = LikelihoodMaximum(values, levels, widening)
+        if number and _settled(levels, before):
+            break
     return start
+
+
+def _settled(levels: Sequence[Level], before: Sequence[Level]) -> bool:
+    """Whether noise levels are the same as before."""
+    return all(abs(np.log(a.scale / b.scale)) < _STEADY for a, b in zip(levels, before, strict=True))
 
 
 def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...] | None:
@@ -797,8 +804,7 @@ def solve_likelihood(
         found = maximise_likelihood(engine, found, 1 if number else _ROUNDS, from_above=not number)
         solution = minimize(_engine_at(engine, found), found.values, config)
         found = replace(found, values=solution.values)
-        changed = max((abs(np.log(a.scale / b.scale)) for a, b in zip(found.levels, before, strict=True)), default=0.0)
-        if deadline.passed() or (number and changed < _STEADY):
+        if deadline.passed() or (number and _settled(found.levels, before)):
             break
     return compiled, solution, found.levels
 

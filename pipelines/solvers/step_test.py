@@ -266,8 +266,9 @@ def largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solutio
 
 
 def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[StepEstimate, ...]:
-    engine, values = compiled.engine, solution.values
+    values = solution.values
     parameters = [p for p in compiled.problem.parameters if p.key in compiled.problem.step_candidates]
+    engine = _with_wider_priors(compiled.engine, values, [p.key for p in parameters])
     used = solution.engine.inliers(values)
     outliers, transient = unwidened(used), unwidened([~_transient(~own) for own in used])
     base = _Fit.of(engine, values, levels, transient)
@@ -281,6 +282,21 @@ def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Soluti
         ]
         steps += [step for step in tried if step is not None]
     return tuple(sorted(steps, key=lambda step: (-step.statistic, -step.fall)))
+
+
+def _with_wider_priors(engine: Linearization, values: Values, keys: Sequence[int]) -> Linearization:
+    """Widen the priors of variables to how far the values are from them: a mount beyond its prior is no step of it.
+
+    Before a recording of one motion slips, motion alone knows nothing of the mount, and its prior would be the mount
+    then.
+    """
+    groups, own = list(engine.groups), engine.layout.at(keys)
+    for i, group in enumerate(groups):
+        if group.target == "shared" and not group.is_measurement and len(group.at) == 1:
+            far = np.linalg.norm(group.weighted(group.evaluate(values)[0]), axis=1)
+            wide = np.where(np.isin(group.at[0], own), np.maximum(far, 1.0), 1.0)
+            groups[i] = replace(group, weights=group.all_weights / wide[:, None])
+    return engine.with_groups(groups)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import alidade
+from alidade.factors import so3
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
@@ -168,3 +169,15 @@ def test_a_swung_accelerometer_begins_as_nominal(name: str, shared_data: Path) -
     assert accel.radius == pytest.approx(accel.strength)
     # The noise to begin with, which the graph lowers, has most readings inside the gate.
     assert 20.0 < accel.level < 60.0
+
+
+def test_a_large_slip_is_found_whose_pictures_before_pass_for_outliers(shared_data: Path) -> None:
+    """The noise levels of the solution with the slip are far from those without it: two rounds did not reach them."""
+    head = methods.method("head")
+    data = to_session(read_trial(shared_data / "broad" / "01_undisturbed_slow_rotation_A.mat"), 0, np.deg2rad(0.3))
+    slip = np.where((data.vision_t > 67.6)[:, None], np.deg2rad([2.4, -7.6, 0.8]), 0.0)
+    data = replace(data, vision_wxyz=so3.multiply(data.vision_wxyz, so3.exp(slip)), vision_cov=None)
+    found = Session(head, head.faults.segment(data, 28.0, 148.0), load_config(None)).calibrate("batch", report=False)
+    assert found.status == "inconsistent"
+    (change,) = (each for each in found.findings if each.kind == "change")
+    assert abs(change.evidence["time_s"] - 67.6) < 1.5

@@ -152,6 +152,20 @@ def test_a_world_that_is_found_anew_is_no_change() -> None:
     assert finding is None or finding.kind == "jump"
 
 
+def test_a_slip_before_the_first_motion_of_a_mount_beyond_its_prior_jumps() -> None:
+    """Before, the mount by motion alone is its prior, 7 sigmas from the true one: no step of 2 deg agreed with that."""
+    data, mount, begin = recorded(2), so3.exp(np.array([np.deg2rad(150.0), 0.0, 0.0])), 10.0
+    rng, wxyz, gyro = np.random.default_rng(0), data.vision_wxyz.copy(), data.head_gyro.copy()
+    moving, early = int(np.searchsorted(data.head_t, begin)), data.vision_t < begin
+    gyro[:moving] = gyro[:moving].mean(axis=0) + 5e-4 * rng.standard_normal((moving, 3))
+    noise = so3.exp(8.7e-3 * rng.standard_normal((int(early.sum()), 3)))
+    wxyz[early] = so3.multiply(np.broadcast_to(wxyz[np.argmin(early)], noise.shape), noise)
+    turned = so3.rotate(np.broadcast_to(mount, (len(gyro), 4)), gyro)
+    finding = found(slipped(replace(data, head_gyro=turned, vision_wxyz=wxyz), 4.0, begin - 0.2))[1]
+    assert finding is not None
+    assert (finding.kind, finding.severity) == ("jump", Severity.WEAK)
+
+
 def test_a_slip_in_an_outage_is_dated_by_the_pictures_around_it() -> None:
     """Two pictures a second, none for 3 s in the middle."""
     data = slipped(recorded(2), 3.0, 10.4)
