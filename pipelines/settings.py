@@ -112,6 +112,7 @@ class Noise(Section):
     los_roll: NoiseSigma | None = None  # rad per measurement
     encoder: NoiseOrZero | None = None  # rad per sample
     vision_attitude: NoiseSigma | None = None  # rad per axis and frame
+    vision_rate_noise: NoiseOrZero | None = None  # s: rad per axis and frame at 1 rad/s
     corner_px: NoiseSigma | None = None  # px per axis
     gyro_repeatability: NoiseOrZero | None = None  # rad/s, of means over a rest, beside white noise
     turn_repeatability: NoiseOrZero | None = None  # fraction of the angle turned from rest to rest

@@ -65,6 +65,7 @@ _NOISE: dict[str, tuple[str, float]] = {
     "los_map": ("µrad", 1e6),
     "encoder": ("arcsec", math.degrees(3600.0)),
     "vision_attitude": ("deg", math.degrees(1.0)),
+    "vision_rate_noise": ("ms", 1e3),
     "vision_map": ("deg", math.degrees(1.0)),
     "turn_rate": ("deg/h", math.degrees(3600.0)),
     "move_rate": ("deg/h", math.degrees(3600.0)),

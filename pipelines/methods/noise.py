@@ -69,23 +69,21 @@ def stated(
 
 
 def repeatability(sensor: str, config: Config, family: str) -> Level:
-    """Repeatability of a mean over a rest or turn, beside white noise: as stated, until estimated from residuals.
-
-    Where nobody states it, it counts as hardly known, and as none where noise is said to be known exactly.
-    """
-    level = estimated(f"{sensor}_repeatability", config, (family,), beside=True)
-    is_stated = level.noise.source == "config" or level.noise.known > 0.0
-    return level if is_stated else replace(level, scale=0.0)
+    """Repeatability of a mean over a rest or turn, beside white noise: as stated, until estimated from residuals."""
+    return estimated(f"{sensor}_repeatability", config, (family,), beside=True)
 
 
 def estimated(
     name: str, config: Config, families: Sequence[str], message: float | None = None, beside: bool = False
 ) -> Level:
-    """Noise level for estimation by marginal likelihood, its prior the statement, else a default within a factor 7."""
+    """Noise level for estimation by marginal likelihood, its prior the statement, else a default within a factor 7.
+
+    Where noise is said to be known exactly there is none `beside` it unless that is stated.
+    """
     noise = replace(stated(name, config, message, families), beside=beside)
-    if noise.source == "default" and noise.known:
-        return Level(replace(noise, known=_HARDLY))
-    return Level(noise)
+    if noise.source != "default":
+        return Level(noise)
+    return Level(replace(noise, known=_HARDLY) if noise.known else replace(noise, stated=0.0 if beside else noise.stated))
 
 
 def sampled(noise: Noise, time: Array, samples: Array) -> Level:

@@ -43,11 +43,13 @@ MOVES = ("change", "jump", "device_change")
 _MOVED = "What to do: see what moved at that time; if it may have been the mount, record again."
 _WALK = "Calibrate the recordings after the last change together, or let the parameter walk: `share` in the config."
 _OF_GYRO = "unit, signs and order of the gyro's axes, and that it belongs to the rest"
+_OF_VISION = "that gyro and vision are of one device and time, and the meaning of the quaternions"
 _CHECK = {
     "corner_px": "camera_info (lens, size and rectification of the pictures) and the layout of the tags",
     "gyro_density": _OF_GYRO,
     "gyro_rate_noise": _OF_GYRO,
-    "vision_attitude": "that gyro and vision are of one device and time, and the meaning of the quaternions",
+    "vision_attitude": _OF_VISION,
+    "vision_rate_noise": _OF_VISION,
 }
 _PRIOR = "prior of "
 # Smaller shares are summed, and so are those after so many.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from alidade.factors import so3
+from alidade.factors.chi_square import quantile
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.noise import Level
@@ -43,7 +44,7 @@ def test_levels_found_are_where_the_likelihood_is_largest() -> None:
     linear, levels = chain()
     found = estimate_levels(linear, levels)
     free = [i for i, level in enumerate(levels) if level.noise.estimated]
-    assert len(free) == 3
+    assert len(free) == 4
 
     def value(scales: np.ndarray) -> float:
         tried = list(found)
@@ -159,6 +160,29 @@ def test_white_noise_and_noise_that_grows_with_the_rate_are_told_apart(density: 
     larger = int(np.argmax(true))
     assert found[larger] == pytest.approx(true[larger], rel=0.25)
     assert found[1 - larger] < 0.2 * found[larger]
+
+
+def test_noise_of_vision_in_motion_is_not_the_gyros() -> None:
+    """A device at rest for most of the time: one level of vision is that of the rest, and its mount was 3 deg off."""
+    swings = [{"amplitude_deg": 20.0, "frequency_hz": f, "end_s": 6.0} for f in (0.33, 0.5, 0.67)]
+    moved = {"yaw": swings[:1], "pitch": swings[1:2], "roll": swings[2:]}
+    noise = {"vision_attitude": 3e-4, "vision_rate_noise": 4e-3, "gyro_density": 2e-4}
+    scenario = HeadScenario.model_validate(SCENARIO.model_dump() | {"head": moved, "noise": noise})
+    total, dof = 0.0, 0
+    for seed in range(3):
+        data, truth = simulate_head(scenario, seed)
+        estimate = solve_batch(
+            methods.method("head").problem(replace(data, vision_cov=None, gyro_density=None), load_config(None))
+        )
+        used = {level.noise.name: level.used for level in estimate.levels}
+        assert used["vision_rate_noise"] == pytest.approx(4e-3, rel=0.2)
+        assert used["vision_attitude"] == pytest.approx(3e-4, rel=0.1)
+        assert used["gyro_rate_noise"] < 1e-3
+        rows = [i for i, name in enumerate(estimate.names) if name.startswith(("helmet_mount", "gyro_bias", "time"))]
+        error = estimate.values[rows] - [truth[estimate.names[i]] for i in rows]
+        total += float(error @ np.linalg.solve(estimate.covariance[np.ix_(rows, rows)], error))
+        dof += len(rows)
+    assert quantile(0.005, dof) < total < quantile(0.995, dof)
 
 
 @cache

@@ -50,9 +50,6 @@ _NEGLIGIBLE = 0.1
 # All noise over the rate, 1/sqrt(Hz), beyond which it is none: healthy gyros in motion have .019 at most (UPenn), those
 # with an axis inverted .031 and more.
 _NO_NOISE = 0.025
-# rad: motion capture of a hand that hardly turns errs by so much from picture to picture, and by .02 deg at rest (BROAD
-# 12). Levels are found where it rests, and what it errs by in motion passes for the gyro's noise.
-_JITTER = np.deg2rad(0.1)
 # So far from its stamp, s, the gyros carry an attitude to where its picture was taken.
 _NEAR = 0.1
 _FEWEST_FRAMES = 10
@@ -160,9 +157,8 @@ def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
     density = [noises["gyro_density"].used, noises["gyro_rate_noise"].used * _rate(data)]
     if "platform_gyro_density" in noises:
         density.append(noises["platform_gyro_density"].used)
-    return min(
-        _SHARED, (_NEGLIGIBLE * noises["vision_attitude"].used) ** 2 / max(float(np.square(density).sum()), 1e-300)
-    )
+    vision = noises["vision_attitude"].used, noises["vision_rate_noise"].used * _rate(data)
+    return min(_SHARED, _NEGLIGIBLE**2 * float(np.square(vision).sum()) / max(float(np.square(density).sum()), 1e-300))
 
 
 def _rate(data: HeadData) -> float:
@@ -180,12 +176,13 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     density = at_least_at_rest(density, data.head_t, data.head_gyro, data.head_force)
     rate = max(_rate(data), 1e-12)
     no_noise = max(density.noise.spec.no_noise, _NO_NOISE * rate)
-    pictures_hz = (len(data.vision_t) - 1) / max(float(np.ptp(data.vision_t)), 1e-9)
-    in_motion = max(no_noise, _JITTER * np.sqrt(2.0 * pictures_hz))
+    vision = estimated("vision_attitude", config, (_FAMILY,), typical(data.vision_cov, 0, 1, 2))
+    by_rate = estimated("vision_rate_noise", config, (_FAMILY,), beside=True)
     found = [
-        estimated("vision_attitude", config, (_FAMILY,), typical(data.vision_cov, 0, 1, 2)),
+        vision,
+        _bounded(by_rate, vision.noise.spec.no_noise / rate),
         _bounded(density, no_noise),
-        _bounded(estimated("gyro_rate_noise", config, ("gyro",), beside=True), in_motion / rate),
+        _bounded(estimated("gyro_rate_noise", config, ("gyro",), beside=True), no_noise / rate),
         Level(stated("gyro_bias_walk", config)),
     ]
     if data.platform_t is not None and data.platform_gyro is not None:
@@ -409,7 +406,20 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     )
     states = [chain.state(k) for k in of]
     keys = p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys
-    return [Factor.of(_FAMILY, seen.on(states, chain.bias_keys(of), *keys, loss=model.loss))]
+    bound = seen.on(states, chain.bias_keys(of), *keys, loss=model.loss)
+    sigma = np.sqrt(3.0) / np.linalg.norm(seen.sqrt_information, axis=(1, 2))
+    return [Factor.of(_FAMILY, bound, np.linalg.norm(_rate_in_pictures(model, rows), axis=1) / sigma)]
+
+
+def _rate_in_pictures(model: _Model, rows: Index) -> Array:
+    """Rate (n, 3), rad/s, of the helmet in the camera's sight at some pictures, by the first guess of the mounts."""
+    helmet, platform = model.carriers
+    rate = helmet.rate(model.taken[rows])
+    if platform is None:
+        return rate
+    cRb, vRh = model.camera_guess, model.helmet_guess
+    bRv = so3.compose(so3.inverse(cRb), model.measured[rows], so3.inverse(vRh))
+    return np.asarray(rate - so3.rotate(so3.inverse(bRv), platform.rate(model.taken[rows])))
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:

@@ -84,6 +84,7 @@ class HeadNoise(ScenarioPart):
     platform_gyro_density: NotNegative = 1e-5  # rad/s/sqrt(Hz)
     accel_density: NotNegative = 2e-3  # m/s^2/sqrt(Hz), of the helmet
     vision_attitude: NotNegative = 8.7e-3  # rad per axis of frame h
+    vision_rate_noise: NotNegative = 0.0  # s: rad per axis at 1 rad/s of the helmet in the camera's sight
 
 
 class HeadScenario(ScenarioPart):
@@ -213,6 +214,8 @@ def head_config(scenario: HeadScenario, images: bool = False) -> str:
     noise = scenario.noise.model_dump()
     if scenario.platform is None:
         del noise["platform_gyro_density"]
+    if not scenario.noise.vision_rate_noise:
+        del noise["vision_rate_noise"]
     if not images:
         return recording_config("head", scenario, noise)
     del noise["vision_attitude"]
@@ -265,6 +268,11 @@ def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array
     return t, at, so3.multiply(cRh[0], so3.exp((1.0 + effects["vision_scale"]) * turned))
 
 
+def _rate(scenario: HeadScenario, at: Array, h: float = 1e-3) -> Array:
+    """Angular rate of the helmet on its platform, (K, 3) rad/s in v, by differences over 2 h s."""
+    return so3.local(scenario.head.attitude(at - h), scenario.head.attitude(at + h)) / (2.0 * h)
+
+
 def _acceleration(scenario: HeadScenario, at: Array, h: float = 2e-3) -> Array:
     """Angular acceleration of the helmet on its platform, (K, 3) rad/s^2 in v, by differences over h s."""
     before, now, after = (scenario.head.attitude(at + late) for late in (-h, 0.0, h))
@@ -276,12 +284,13 @@ def _vision(
     scenario: HeadScenario, effects: Mapping[str, float], rng: np.random.Generator, seed: int
 ) -> tuple[Array, Array]:
     """Stamps, s, and measured attitudes cRh (K, 4)."""
-    t, _, cRh = _sights(scenario, effects)
+    t, at, cRh = _sights(scenario, effects)
     if scenario.vision_map:
         seen = so3.matrix(cRh).reshape(-1, 9)
         cRh = so3.multiply(cRh, so3.exp(smooth_map(seen, 3, scenario.vision_map, seed)))
-    n = len(t)
-    error = so3.exp(scenario.noise.vision_attitude * rng.standard_normal((n, 3)))
+    n, noise = len(t), scenario.noise
+    sigma = np.hypot(noise.vision_attitude, noise.vision_rate_noise * np.linalg.norm(_rate(scenario, at), axis=1))
+    error = so3.exp(sigma[:, None] * rng.standard_normal((n, 3)))
     axis = rng.standard_normal((n, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     is_outlier = rng.random(n) < scenario.outlier_fraction
