@@ -344,8 +344,8 @@ def _dominant_prior(e: Mapping[str, Any], severity: Severity, _: Quantities) -> 
     what = figure.replace(".", " ").replace("_", " ")
     if severity == Severity.NOTE:
         return (
-            f"Up to {share} of the variance of a required parameter comes from {what}, which the recording does not "
-            f"determine: check sensors.{figure} (now {e['stated']:.2g}), see the error budget."
+            f"Up to {share} of a required parameter's variance comes from {what}, which the recording does not "
+            f"determine: check sensors.{figure} (now {e['stated']:.2g})."
         )
     return (
         f"{share} of that variance comes from {what}: state sensors.{figure} (now {e['stated']:.2g}) if it is better."
