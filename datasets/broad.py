@@ -88,17 +88,17 @@ def gyro_bias_at_rest(trial: Trial) -> Array:
     return np.asarray(trial.gyro[~trial.moving].mean(axis=0))
 
 
-def to_session(trial: Trial, seed: int, sigma: float = VISION_SIGMA) -> HeadData:
+def to_session(trial: Trial, seed: int, sigma: float = VISION_SIGMA, rate_hz: float = VISION_RATE_HZ) -> HeadData:
     """Convert a trial to a session; b: the motion capture's world, h: its marker body, v: the IMU.
 
-    Vision is the motion-capture sample nearest to each 1/25 s, at that sample's own stamp, times Exp(delta) with
+    Vision is the motion-capture sample nearest to each 1/`rate_hz` s, at that sample's own stamp, times Exp(delta) with
     Gaussian delta of `sigma` rad an axis; without any the session states no covariance. The truth is the motion capture
     itself: bRh, at its own clock. It stands in for bRv to within the mount vRh (below a degree) and the time offset,
     both of which a calibration estimates.
     """
     seen = np.isfinite(trial.attitude[:, 0])
     half_sample = 0.5 * (trial.t[1] - trial.t[0])
-    nearest = np.searchsorted(trial.t + half_sample, np.arange(0.0, trial.t[-1], 1.0 / VISION_RATE_HZ))
+    nearest = np.searchsorted(trial.t + half_sample, np.arange(0.0, trial.t[-1], 1.0 / rate_hz))
     vision = nearest[seen[nearest]]
     noise = sigma * np.random.default_rng(seed).standard_normal((len(vision), 3))
     return HeadData(
