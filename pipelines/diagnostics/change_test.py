@@ -136,8 +136,8 @@ def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Seq
     """Most severe finding of kind `change` or `jump` on significant steps; None if no step is significant.
 
     A change is a step that motion alone shows too, and the same one; it is a NOTE where it is not material. A `jump` is
-    a material one that motion attributes neither to the mount nor to the reference. The most significant of the steps
-    comes first; `duration` is the recording's, s.
+    a material one that motion does not attribute to the mount. The most significant of the steps comes first; `duration`
+    is the recording's, s.
     """
     found = [f for s in steps if (f := _changed(s, duration, quantities)) is not None]
     jumps = [s for s in steps if _is_jump(s, duration) and _is_material(s, quantities)]
@@ -155,8 +155,8 @@ def _changed(step: StepEstimate, duration: float, quantities: Sequence[Quantity]
 
 
 def _jump(step: StepEstimate) -> Finding:
-    """Finding that the vision reference jumped: WEAK beyond the size of a healthy reference's jumps, else NOTE."""
-    severity = Severity.WEAK if _certain_size(step) > _USUAL_JUMP else Severity.NOTE
+    """Finding that vision jumped: a NOTE if it is the reference by its motion, or by its size, else WEAK."""
+    severity = Severity.WEAK if step.agrees and _certain_size(step) > _USUAL_JUMP else Severity.NOTE
     sizes = {"size": step.size, "sigma": step.ratio * step.sigma}
     return Finding("jump", severity, {"since_s": step.since_s, "time_s": step.time_s, **sizes})
 
@@ -174,7 +174,7 @@ def _is_material(step: StepEstimate, quantities: Sequence[Quantity]) -> bool:
 
 def _is_jump(step: StepEstimate, duration: float) -> bool:
     """Whether the vision reference jumps significantly at a step, by the mount's slip or by its own error."""
-    return step.jumped and step.agrees and step_stability(replace(step, by_motion=np.inf), duration).changed
+    return step.jumped and step_stability(replace(step, by_motion=np.inf, apart=0.0), duration).changed
 
 
 def with_change(estimate: Estimate, change: Finding) -> Estimate:

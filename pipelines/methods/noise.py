@@ -83,7 +83,9 @@ def estimated(
     noise = replace(stated(name, config, message, families), beside=beside)
     if noise.source != "default":
         return Level(noise)
-    return Level(replace(noise, known=_HARDLY) if noise.known else replace(noise, stated=0.0 if beside else noise.stated))
+    return Level(
+        replace(noise, known=_HARDLY) if noise.known else replace(noise, stated=0.0 if beside else noise.stated)
+    )
 
 
 def sampled(noise: Noise, time: Array, samples: Array) -> Level:

@@ -282,10 +282,10 @@ def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) ->
     return f"Change {_when(e)}{': ' if steps else ''}{', '.join(steps)}.{small}"
 
 
-def _jump(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+def _jump(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     size, sigma = (to_digits_of(math.degrees(e[name]), math.degrees(e["sigma"])) for name in ("size", "sigma"))
-    what = "the motion does not show whether the mount or the reference"
-    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}; {what}."
+    undecided = "; the motion does not show whether the mount or the reference"
+    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}{undecided if severity > Severity.NOTE else ''}."
 
 
 def _when(e: Mapping[str, Any]) -> str:

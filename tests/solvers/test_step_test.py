@@ -198,7 +198,8 @@ def test_what_is_a_change_and_what_is_a_jump() -> None:
     assert judged(step(by_motion=20.0, size=0.01)) == ("jump", Severity.NOTE)
     assert judged(step(by_motion=20.0, jumped=False)) is None
     assert judged(step(by_motion=20.0, size=0.005)) is None
-    assert judged(step(by_motion=60.0, apart=30.0)) is None
+    assert judged(step(by_motion=60.0, apart=30.0)) == ("jump", Severity.NOTE)
+    assert judged(step(by_motion=60.0, apart=30.0, jumped=False)) is None
     assert judged(step(size=0.005), step(by_motion=20.0)) == ("jump", Severity.WEAK)
     assert judged(step(by_motion=60.0, apart=30.0, ratio=1.7, ratio_by_motion=1.7)) == ("jump", Severity.WEAK)
 
