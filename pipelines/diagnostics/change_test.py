@@ -136,8 +136,8 @@ def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Seq
     """Most severe finding of kind `change` or `jump` on significant steps; None if no step is significant.
 
     A change is a step that motion alone shows too, and the same one; it is a NOTE where it is not material. A `jump` is
-    a material one that motion does not attribute to the mount. The most significant of the steps comes first; `duration`
-    is the recording's, s.
+    a material one that motion does not attribute to the mount. The most significant of the steps comes first.
+    `duration` is the recording's, s.
     """
     found = [f for s in steps if (f := _changed(s, duration, quantities)) is not None]
     jumps = [s for s in steps if _is_jump(s, duration) and _is_material(s, quantities)]
