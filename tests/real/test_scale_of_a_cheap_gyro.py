@@ -102,13 +102,13 @@ def test_the_noise_of_the_gyro_is_at_least_that_at_rest_and_visions_grows_with_t
 ) -> None:
     """9.5e-4 rad/s/sqrt(Hz) by its Allan deviation; 6e-6 also has a maximum of the likelihood.
 
-    Healthy gyros have .019 of the rate at most.
+    Healthy gyros have .008 of the rate at most.
     """
     path = shared_data / "upenn_imu_vicon" / f"{name}.mcap"
     levels = {each.noise.name: each for each in calibrated(path, "{}").estimate.levels}
     rate = np.sqrt((alidade.open(path, method="head").data.head_gyro ** 2).sum(axis=1).mean())
     assert levels["gyro_density"].used > 6e-4
-    assert levels["gyro_density"].together.used < 0.019 * rate
+    assert levels["gyro_density"].together.used < 0.008 * rate
     assert 1e-3 < levels["vision_rate_noise"].used < 2e-3
 
 

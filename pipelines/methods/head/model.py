@@ -47,9 +47,9 @@ from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 _SHARED, _LONGEST_INCREMENT = 0.1, 0.25
 # Pictures share a keyframe as far as what gyro noise adds on the way is at most this part of vision's.
 _NEGLIGIBLE = 0.1
-# All noise over the rate, 1/sqrt(Hz), beyond which it is none: healthy gyros in motion have .019 at most (UPenn), those
-# with an axis inverted .031 and more.
-_NO_NOISE = 0.025
+# All noise over the rate, 1/sqrt(Hz), beyond which it is none: healthy gyros in motion have .008 at most (UPenn), those
+# with an axis inverted .025 and more (BROAD).
+_NO_NOISE = 0.014
 # So far from its stamp, s, the gyros carry an attitude to where its picture was taken.
 _NEAR = 0.1
 _FEWEST_FRAMES = 10
