@@ -27,7 +27,7 @@ from benchmarks.broad import DATA
 from datasets.broad import read_trial, to_session
 
 _MOUNT = tuple(f"helmet_mount_{axis}" for axis in "xyz")
-# Of the whole trial's own mount, rad, and time offset, s: sigmas.
+# Sigmas of the mount, rad, and the time offset, s, that the whole trial gives.
 _KNOWN_MOUNT, _KNOWN_OFFSET = np.deg2rad(0.03), 2e-4
 
 
@@ -64,7 +64,7 @@ class Alteration:
 
     @classmethod
     def drawn(cls, seed: int, durations: Sequence[float]) -> Alteration:
-        """Draw one, of trials that last so long, s."""
+        """Draw an alteration of one of some trials, by their durations, s."""
         rng = np.random.default_rng(seed)
         trial = int(rng.integers(len(durations)))
         length = min(float(rng.choice([25.0, 40.0, 60.0, 120.0])), durations[trial])
@@ -88,7 +88,7 @@ class Alteration:
         )
 
     def of(self, data: HeadData) -> HeadData:
-        """Apply it to a whole trial without noise, vision at `rate_hz`, and cut the part out."""
+        """Alter a whole trial, whose vision has `rate_hz` and no noise, and cut the part out."""
         rng, n = np.random.default_rng([self.seed, 1]), len(data.head_t) // self.every
         assert data.head_force is not None
 

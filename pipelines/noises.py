@@ -40,7 +40,9 @@ _SPECS = (
     NoiseSpec("los_roll", "rad", "Roll of the picture about the line of sight, per measurement.", 2.0e-4),
     NoiseSpec("encoder", "rad", "Encoder reading, per sample.", 1.0e-5),
     NoiseSpec("vision_attitude", "rad", "Vision attitude, per picture and axis.", 8.7e-3, 6.09e-2),
-    NoiseSpec("vision_rate_noise", "s", "Vision attitude, what grows with the rate, per picture and axis.", 1.0e-4),
+    NoiseSpec(
+        "vision_rate_noise", "s", "Vision attitude noise proportional to the rate, per picture and axis.", 1.0e-4
+    ),
     NoiseSpec("corner_px", "px", "Tag corner in a picture, per axis.", 0.3, 1.5),
     NoiseSpec("gyro_repeatability", "rad/s", "Gyro mean at rest, beyond white noise.", 2.0e-5),
     NoiseSpec("turn_repeatability", "", "Angle turned between rests, beyond white noise.", 1.0e-3),

@@ -79,13 +79,20 @@ def estimated(
     """Noise level for estimation by marginal likelihood, its prior the statement, else a default within a factor 7.
 
     Where noise is said to be known exactly there is none `beside` it unless that is stated.
+
+    Args:
+        name: of the noise, as in the config.
+        config: of the recording.
+        families: of measurements or processes that it drives.
+        message: its figure in the recording's messages, SI.
+        beside: whether it adds to the noise that its factors are whitened by, see `Noise.beside`.
     """
     noise = replace(stated(name, config, message, families), beside=beside)
     if noise.source != "default":
         return Level(noise)
-    return Level(
-        replace(noise, known=_HARDLY) if noise.known else replace(noise, stated=0.0 if beside else noise.stated)
-    )
+    if noise.known:
+        return Level(replace(noise, known=_HARDLY))
+    return Level(replace(noise, stated=0.0) if beside else noise)
 
 
 def sampled(noise: Noise, time: Array, samples: Array) -> Level:

@@ -57,7 +57,8 @@ _MOST_STEPS, _LONGEST_STEP, _SETTLED = 12, 1.5, 0.05
 _HALVINGS, _FINE = 6, 1e-3
 # s, within which errors may be correlated however they are.
 SANDWICH_BLOCK_S = 5.0
-# Linearisations before the first solution, solutions at most; levels have settled whose logarithms move by less.
+# Linearisations before the first solution; solutions, and linearisations without solutions between, at most; levels have
+# settled whose logarithms move by less.
 _ROUNDS, _MOST_SOLUTIONS, _STEADY = 2, 6, 0.05
 # Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`, and up to which a default
 # is expected.
@@ -645,11 +646,12 @@ def _shares(chain: LinearChain, levels: Sequence[Level], which: Sequence[int]) -
 def _effective(
     chain: LinearChain, levels: Sequence[Level], free: Sequence[int], covariance: Array
 ) -> tuple[Level, ...]:
-    """Set the effective total noise of each level whose rows an additional noise shares.
+    """Set the effective total noise of each level whose rows an additional noise shares that nobody states.
 
     `covariance` (k, k) is of the logarithms of the free ones.
     """
-    out, added = list(levels), {f for level in levels if level.noise.beside for f in level.noise.families}
+    unstated = [level.noise for level in levels if level.noise.beside and level.noise.source == "default"]
+    out, added = list(levels), {family for noise in unstated for family in noise.families}
     for i, level in enumerate(levels):
         own = [k for k, rows in enumerate(chain.rows) if rows.family in added & {*level.noise.families}]
         if level.noise.beside or not own:
@@ -743,7 +745,7 @@ def _settled(levels: Sequence[Level], before: Sequence[Level]) -> bool:
 
 
 def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...] | None:
-    """Alternative start for two noises of the same rows: at `_ABOVE`, with equal shares; None if there is no pair.
+    """Alternative start for all pairs of noises of the same rows: at `_ABOVE`, with equal shares; None without a pair.
 
     -2 log L is flat in the logarithm of a level whose share vanishes: what begins there stays, and another noise takes
     its part.
@@ -844,7 +846,8 @@ def levels_settled(
     """Whether noise levels suffice for the measurements to come: determined, and the same as from less.
 
     A default is determined if the measurements exclude levels above it as its prior does: at `_ABOVE` of the prior's
-    sigmas -2 log L rises by as much as the prior adds there. At rest it does not for what grows with motion. Levels are
+    sigmas -2 log L rises by as much as the prior adds there. At rest it does not for what grows with motion; of
+    measurements, that does not matter while it is a fifth of their noise even there. Levels are
     the same that give the measurements since then the same noise, to a fifth, as the levels before.
 
     Args:
@@ -867,6 +870,11 @@ def levels_settled(
             continue
         above = replace(level, scale=level.scale * float(np.exp(_ABOVE * level.noise.known)))
         larger = [*levels[:i], above, *levels[i + 1 :]]
+        own = [rows for rows in chain.rows if rows.has(level.noise)]
+        if own and all(
+            r.is_measurement and r.variance(larger).mean() < _SAME**2 * r.variance(levels).mean() for r in own
+        ):
+            continue
         tried = chain.solved(chain.variances(larger, widening, NO_SAY))
         if tried is not None and tried.value < found.value + _ABOVE**2:
             return False

@@ -285,10 +285,9 @@ def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Soluti
 
 
 def _with_wider_priors(engine: Linearization, values: Values, keys: Sequence[int]) -> Linearization:
-    """Widen the priors of variables to how far the values are from them: a mount beyond its prior is no step of it.
+    """Widen the priors of variables to how far the values are from them.
 
-    Before a recording of one motion slips, motion alone knows nothing of the mount, and its prior would be the mount
-    then.
+    At rest before a slip, motion alone says nothing of the mount, and its prior would count as the mount then.
     """
     groups, own = list(engine.groups), engine.layout.at(keys)
     for i, group in enumerate(groups):

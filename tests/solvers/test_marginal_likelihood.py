@@ -185,6 +185,17 @@ def test_noise_of_vision_in_motion_is_not_the_gyros() -> None:
     assert quantile(0.005, dof) < total < quantile(0.995, dof)
 
 
+def test_a_noise_in_motion_that_is_stated_contradicts_no_white_noise() -> None:
+    """The total was compared with the white part's figure: "4 times the config's value", where both are right."""
+    noise = {"vision_attitude": 2e-3, "vision_rate_noise": 1e-2}
+    scenario = HeadScenario.model_validate(SCENARIO.model_dump() | {"duration_s": 15.0, "noise": noise})
+    of = methods.method("head").problem(simulate_head(scenario, 2).data, load_config(head_config(scenario).encode()))
+    levels = {level.noise.name: level for level in solve_batch(of).levels}
+    assert levels["vision_rate_noise"].noise.source == "config"
+    assert levels["vision_attitude"].together.scale == pytest.approx(1.0, rel=0.3)
+    assert levels["gyro_density"].effective is not None
+
+
 @cache
 def levels_with(gap_s: float, pictures_too: bool) -> dict[str, float]:
     """Levels found of a recording without samples for a while, and without pictures then."""

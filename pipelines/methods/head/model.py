@@ -412,7 +412,7 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
 
 
 def _rate_in_pictures(model: _Model, rows: Index) -> Array:
-    """Rate (n, 3), rad/s, of the helmet in the camera's sight at some pictures, by the first guess of the mounts."""
+    """Rate (n, 3), rad/s, of the helmet relative to the camera at some pictures, by the first guess of the mounts."""
     helmet, platform = model.carriers
     rate = helmet.rate(model.taken[rows])
     if platform is None:

@@ -84,7 +84,7 @@ class HeadNoise(ScenarioPart):
     platform_gyro_density: NotNegative = 1e-5  # rad/s/sqrt(Hz)
     accel_density: NotNegative = 2e-3  # m/s^2/sqrt(Hz), of the helmet
     vision_attitude: NotNegative = 8.7e-3  # rad per axis of frame h
-    vision_rate_noise: NotNegative = 0.0  # s: rad per axis at 1 rad/s of the helmet in the camera's sight
+    vision_rate_noise: NotNegative = 0.0  # s: rad per axis at 1 rad/s relative to the camera
 
 
 class HeadScenario(ScenarioPart):
@@ -214,7 +214,7 @@ def head_config(scenario: HeadScenario, images: bool = False) -> str:
     noise = scenario.noise.model_dump()
     if scenario.platform is None:
         del noise["platform_gyro_density"]
-    if not scenario.noise.vision_rate_noise:
+    if images or not scenario.noise.vision_rate_noise:
         del noise["vision_rate_noise"]
     if not images:
         return recording_config("head", scenario, noise)
