@@ -57,7 +57,7 @@ _MOST_STEPS, _LONGEST_STEP, _SETTLED = 12, 1.5, 0.05
 _HALVINGS, _FINE = 6, 1e-3
 # s, within which errors may be correlated however they are.
 SANDWICH_BLOCK_S = 5.0
-# Linearisations before the first solution; solutions, and linearisations without solutions between, at most; levels have
+# Linearisations before the first solution; solutions at most, or linearisations without solutions between; levels have
 # settled whose logarithms move by less.
 _ROUNDS, _MOST_SOLUTIONS, _STEADY = 2, 6, 0.05
 # Sigmas above what is stated at which two noises of the same rows begin, see `_from_above`, and up to which a default
