@@ -40,9 +40,9 @@ class Thresholds:
     process_dof: float = 100.0  # processes with fewer are not tested
     correlated: float = 0.10
     prior_z: float = 4.0
-    far_from_prior: float = 5.0  # in prior sigmas: of a calibrated parameter a note, of another one never just a note
+    far_from_prior: float = 5.0  # of a calibrated parameter, in prior sigmas
     no_device: float = 50.0  # z of a prior: 5 sigmas of a device ten times worse than usual; beyond is a data fault
-    determined: float = 0.7  # posterior over prior sigma; above it a prior conflict nearer than that is a note
+    determined: float = 0.7  # posterior over prior sigma; above it a prior conflict that a device can have is a note
     inseparable: float = 0.9  # correlation
     material: float = 0.5  # effect over requirement
 
@@ -146,8 +146,7 @@ def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple
         shift = sensitivities[:, j] * (x[j] - worst.prior_mean)
         effect = {q.name: float(shift[i]) for i, q in enumerate(quantities) if q.required and shift[i]}
         material = any(abs(effect.get(q.name, 0.0)) >= LIMITS.material * q.require for q in quantities if q.required)
-        far = abs(x[j] - worst.prior_mean) > LIMITS.far_from_prior * worst.scale
-        severe = material and (far or sigma[j] < LIMITS.determined * worst.scale)
+        severe = material and (abs(z[j]) > LIMITS.no_device or sigma[j] < LIMITS.determined * worst.scale)
         others = tuple(sorted(quantities[k].name for k in same))
         found.append((material, _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)))
         left = [k for k in left[1:] if k not in same]
