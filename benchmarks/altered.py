@@ -132,7 +132,7 @@ def errors(found: Calibration, whole: Calibration, by: Alteration) -> tuple[Arra
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table."""
+    """Print how altered parts of BROAD trials are calibrated, a line each; then shares of errors, and verdicts."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.altered", description="Real recordings, altered.")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the trials")
     parser.add_argument("--parts", type=int, default=60)

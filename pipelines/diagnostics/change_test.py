@@ -155,7 +155,7 @@ def _changed(step: StepEstimate, duration: float, quantities: Sequence[Quantity]
 
 
 def _jump(step: StepEstimate) -> Finding:
-    """Finding that vision jumped: a NOTE if motion excludes the mount or references jump as far, else WEAK."""
+    """Finding that vision's attitudes jumped: a NOTE if not by the mount, or no farther than usual, else WEAK."""
     severity = Severity.WEAK if step.agrees and _certain_size(step) > _USUAL_JUMP else Severity.NOTE
     sizes = {"size": step.size, "sigma": step.ratio * step.sigma}
     return Finding("jump", severity, {"since_s": step.since_s, "time_s": step.time_s, **sizes})

@@ -69,14 +69,14 @@ def stated(
 
 
 def repeatability(sensor: str, config: Config, family: str) -> Level:
-    """Repeatability of a mean over a rest or turn, beside white noise: as stated, until estimated from residuals."""
+    """Level of what a sensor's means over a rest or turn scatter by beside white noise, estimated from residuals."""
     return estimated(f"{sensor}_repeatability", config, (family,), beside=True)
 
 
 def estimated(
     name: str, config: Config, families: Sequence[str], message: float | None = None, beside: bool = False
 ) -> Level:
-    """Noise level for estimation by marginal likelihood, its prior the statement, else a default within a factor 7.
+    """Level of a noise to be estimated from residuals: its prior the stated figure, else a default within a factor 7.
 
     Where noise is said to be known exactly there is none `beside` it unless that is stated.
 

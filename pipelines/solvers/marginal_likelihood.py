@@ -740,12 +740,12 @@ def maximise_likelihood(
 
 
 def _settled(levels: Sequence[Level], before: Sequence[Level]) -> bool:
-    """Whether noise levels are the same as before."""
+    """Whether no noise level moved by `_STEADY` in its logarithm from the one before."""
     return all(abs(np.log(a.scale / b.scale)) < _STEADY for a, b in zip(levels, before, strict=True))
 
 
 def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...] | None:
-    """Alternative start for all pairs of noises of the same rows: at `_ABOVE`, with equal shares; None without a pair.
+    """Start levels with equal shares, at `_ABOVE`, of all noises that have rows in common; None where none have any.
 
     -2 log L is flat in the logarithm of a level whose share vanishes: what begins there stays, and another noise takes
     its part.
@@ -847,8 +847,8 @@ def levels_settled(
 
     A default is determined if the measurements exclude levels above it as its prior does: at `_ABOVE` of the prior's
     sigmas -2 log L rises by as much as the prior adds there. At rest it does not for what grows with motion; of
-    measurements, that does not matter while it is a fifth of their noise even there. Levels are
-    the same that give the measurements since then the same noise, to a fifth, as the levels before.
+    measurements, that does not matter while it is a fifth of their noise even there. Levels are the same that give the
+    measurements since then the same noise, to a fifth, as the levels before.
 
     Args:
         compiled, levels, solution: as above.

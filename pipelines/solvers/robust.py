@@ -90,7 +90,7 @@ def _hardened(engine: Linearization, values: Values, loss: TruncatedLoss, config
     A dozen pictures, three of them outliers, are explained by a gyro scale 200 sigmas from its prior, and every way
     from there leads past the minimum. While measurements are soft, priors and process models hold.
     """
-    few, softness = replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0), _SOFTNESS
+    few, softness = _few(config), _SOFTNESS
     values = minimize(_soft(engine.under(None), softness), values, few).values
     few = replace(few, max_iterations=_HARDENING_ITERATIONS)
     while softness > 1.0 and not deadline.passed():
@@ -98,6 +98,11 @@ def _hardened(engine: Linearization, values: Values, loss: TruncatedLoss, config
         values = minimize(relaxed, values, few).values
         softness /= _MU_STEP
     return values
+
+
+def _few(config: LevenbergConfig) -> LevenbergConfig:
+    """Options of a minimisation that need not reach the minimum: few iterations, none of them corrections."""
+    return replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0)
 
 
 def _soft(engine: Linearization, softness: float) -> Linearization:
@@ -150,8 +155,7 @@ def _graduated(
         values, iterations = engine.layout.retract(here := values, step), iterations + 1
         residuals = engine.unweighted(values)
         if not relaxed.cost_of(residuals) < cost:
-            few = replace(config, max_iterations=_ROUGH_ITERATIONS, corrections=0)
-            values = minimize(relaxed, here, few, (system, cost)).values
+            values = minimize(relaxed, here, _few(config), (system, cost)).values
             residuals = engine.unweighted(values)
         mu *= _MU_STEP
     return values, iterations

@@ -238,7 +238,7 @@ def _prepare(
     else:
         parameters = before.parameters
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
-    sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
+    sigma = float(1.0 / np.median(1.0 / _sigmas(sqrt_information)))
     if before is None:
         gyro = GyroPath(data.head_t, data.head_gyro)
         cRb = so3.identity()
@@ -391,7 +391,8 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     chain, p = model.chain, model.parameters
     # Carried through a gap of the gyro's record a picture says less of its keyframe.
     information, unseen = model.sqrt_information[rows], chain.gyro.unseen(chain.time[of], model.taken[rows])
-    less = 1.0 / np.sqrt(1.0 + unseen * np.square(information).sum(axis=(1, 2)) / 3.0)
+    sigma = _sigmas(information)
+    less = 1.0 / np.sqrt(1.0 + unseen / sigma**2)
     seen = VisionAttitudeFactor(
         model.stamps[rows],
         model.measured[rows],
@@ -407,8 +408,12 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     states = [chain.state(k) for k in of]
     keys = p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys
     bound = seen.on(states, chain.bias_keys(of), *keys, loss=model.loss)
-    sigma = np.sqrt(3.0) / np.linalg.norm(seen.sqrt_information, axis=(1, 2))
-    return [Factor.of(_FAMILY, bound, np.linalg.norm(_rate_in_pictures(model, rows), axis=1) / sigma)]
+    return [Factor.of(_FAMILY, bound, np.linalg.norm(_rate_in_pictures(model, rows), axis=1) * less / sigma)]
+
+
+def _sigmas(sqrt_information: Array) -> Array:
+    """Sigmas (n,), rad an axis, of attitudes with square-root information (n, 3, 3): of their mean precision."""
+    return np.asarray(np.sqrt(3.0) / np.linalg.norm(sqrt_information, axis=(1, 2)))
 
 
 def _rate_in_pictures(model: _Model, rows: Index) -> Array:
