@@ -357,17 +357,19 @@ class LinearChain:
                     J, y = self.rows[kind].states[0][1][row], right[kind][row]
                     JP = J @ P[own]
                     S, v = JP @ np.swapaxes(J, 1, 2), variances[kind][row][:, None, None] * np.eye(y.shape[1])
-                    both = np.concatenate([y + J @ x[own], JP], axis=2)
+                    both = y + J @ x[own]
                     z = np.linalg.solve(np.linalg.cholesky(S + v), both)
                     square = np.square(z[..., 0]).sum(axis=1)
                     wide = square > limits[kind]
                     if wide.any():
                         v[wide] *= (square[wide] / limits[kind])[:, None, None]
                         z[wide] = np.linalg.solve(np.linalg.cholesky(S[wide] + v[wide]), both[wide])
-                    squares[kind][row], whitened[kind][row] = square, z[..., :q]
-                    gain = np.swapaxes(z[..., q:], 1, 2)
-                    x[own] -= gain @ z[..., :q]
-                    P[own] -= gain @ z[..., q:]
+                    squares[kind][row], whitened[kind][row] = square, z
+                    gain = np.swapaxes(np.linalg.solve(S + v, JP), 1, 2)
+                    x[own] -= gain @ both
+                    # Joseph's form stays positive where a measurement is better by 1e8 than the prediction.
+                    rest = np.eye(d) - gain @ J
+                    P[own] = rest @ P[own] @ np.swapaxes(rest, 1, 2) + gain @ v @ np.swapaxes(gain, 1, 2)
         return {kind: Innovations(squares[kind], whitened[kind]) for kind in seen}
 
     def transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
