@@ -322,7 +322,7 @@ class _Table:
             kind = _kind(name) or self._kind_of_units(columns)
             # ROS calls linear acceleration what has gravity in it.
             is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
-            norms = self._norms(columns)
+            norms = self._norms(columns) * UNITS.get(self._common_unit(columns, kind), 1.0)
             if len(norms) > 1 and not any(np.ptp(self._values[i]) for i in columns):
                 continue  # a placeholder
             if is_linear or (kind == "accel" and len(norms) and lacks_gravity(norms)):

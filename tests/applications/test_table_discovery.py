@@ -263,6 +263,14 @@ def test_units_in_a_header_say_what_columns_are(tmp_path: Path) -> None:
     assert found.columns["/imu"].time == "epoch_ms"
 
 
+def test_fast_motion_in_g_is_not_gravity_taken_off(tmp_path: Path) -> None:
+    """Of 1.5 g typically, and between 0.5 and 3: in m/s^2 these numbers would be motion alone."""
+    moving = np.random.default_rng(0).uniform(0.3, 3.0, (len(SECONDS), 1)) * DIRECTIONS
+    found = propose_columns(open_recording(write(tmp_path / "a.csv", "t [s],ax [g],ay [g],az [g]", SECONDS, moving)))
+    assert found is not None
+    assert found.columns["/imu"].accel == ("ax [g]", "ay [g]", "az [g]")
+
+
 def test_a_table_without_columns_is_told_what_is_lacking(tmp_path: Path, alidade: Command) -> None:
     path = write(tmp_path / "lab.csv", "t,mx,my,mz", SECONDS, 45.0 * DIRECTIONS)
     (tmp_path / "twice.yaml").write_text("columns: {/mag: {time: t, field: [mx, my, my]}}")
