@@ -11,6 +11,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.message_tables import message_tables
 from alidade.pipelines.recording.messages import IMU
-from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
+from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, PLAUSIBLE, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import Table, TableTopic, tables_of
 from alidade.pipelines.recording.table_values import (
@@ -64,6 +65,8 @@ _ANGLES = (r"yaw(?!.*rate)|^heading$", r"pitch(?!.*rate)", r"roll(?!.*rate)")
 _ROTATION_VECTOR = re.compile(r"^r$|rot\w*.?vec|helical|axis.?angle")
 _TURNS = ("yaw_pitch_roll", "rotation_vector")
 _OTHERS = ("wxyz", *_TURNS, "vector", "joints", "latitude_deg")
+# Names of latitude and longitude.
+_PLACE = (r"^lat", r"^lon|^lng")
 # Errors of a tracker in elevation, about x, and in azimuth, about z.
 _LOS_ERRORS = (r"^el\w*err|^err\w*_el", r"^az\w*err|^err\w*_az")
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
@@ -175,55 +178,55 @@ class _Table:
         texts, *_ = table.read(names, _ROWS)
         self._texts = list(texts.values())
         self._values = [self._numbers(i) for i in range(len(names))]
+        self._clocks: dict[int | None, dict[str, Any]] = {}
 
     def topics(self) -> dict[str, TableTopic]:
         """Return topic -> its columns."""
-        time = self._time()
+        times = self._times()
         triads = self._triads()
         named = {kind: columns for kind, columns in triads.items() if kind in _WORDS}
         out: dict[str, TableTopic] = {}
 
-        def add(topic: str, **given: Any) -> None:
+        def add(topic: str, of: Sequence[int], **given: Any) -> None:
             chosen = {key: value for key, value in given.items() if value}
             try:
-                out[topic] = TableTopic(file=self._file, **time, **chosen)
+                out[topic] = TableTopic(file=self._file, **self._time_of(of, times), **chosen)
             except ValueError as error:
                 self.doubts.append(f"{self._where}{topic}: {error}")
 
-        if not time:
-            time = {"rate": self._rate or 100.0}
-            if self._rate:
-                self.reasons.append(f"{self._where}no column of time; {self._rate:g} Hz by its preamble")
-            else:
-                self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
         units = {kind: self._unit(kind, columns) for kind, columns in named.items()}
-        imu = {kind: self._names(columns) for kind, columns in named.items() if kind != "field"}
-        if imu:
-            both = {kind: unit for kind, unit in units.items() if kind in imu and unit and UNITS[unit] != 1.0}
-            alone = {"gyro": "/imu/gyro", "accel": "/imu/accel"} if self._file else {}
-            add(alone.get("".join(imu), "/imu"), **imu, units=both)
+        imu = {kind: columns for kind, columns in named.items() if kind != "field"}
+        clocks = {kind: self._time_of(columns, times) for kind, columns in imu.items()}
+        together = all(clock == next(iter(clocks.values())) for clock in clocks.values())
+        for kinds in [(kind,) for kind in imu] if not together else [tuple(imu)] if imu else []:
+            own = {kind: units[kind] for kind in kinds if units[kind] and UNITS[units[kind]] != 1.0}
+            alone = {("gyro",): "/imu/gyro", ("accel",): "/imu/accel"} if self._file or not together else {}
+            given = {kind: self._names(imu[kind]) for kind in kinds}
+            add(alone.get(kinds, "/imu"), imu[kinds[0]], **given, units=own)
         if "field" in named:
-            unit = units["field"]
-            add("/mag", field=self._names(named["field"]), units={"field": unit} if unit and UNITS[unit] != 1.0 else {})
+            unit, field = units["field"], named["field"]
+            own = {"field": unit} if unit and UNITS[unit] != 1.0 else {}
+            add("/mag", field, field=self._names(field), units=own)
         attitude = "/vision/attitude" if _VISION.search(self.path.stem.lower()) else "/attitude"
         if wxyz := self._quaternion():
-            add(attitude, wxyz=wxyz)
+            add(attitude, wxyz, wxyz=self._names(wxyz))
         for key, angles in self._angles().items() if not wxyz else ():
             unit = self._unit(key, angles)
-            add(attitude, **{key: self._names(angles)}, units={key: unit} if unit == "deg" else {})
+            add(attitude, angles, **{key: self._names(angles)}, units={key: unit} if unit == "deg" else {})
         errors = self._first_of(_LOS_ERRORS)
         if len(errors) == len(_LOS_ERRORS):
             (x, z), unit = self._names(errors), self._common_unit(errors)
             self.doubts.append(f"{self._where}{x} and {z} are angles, in {unit or 'rad'}, about x and z")
-            add("/los/error", vector=[x, None, z], units={"vector": unit} if unit in ("deg", "mrad") else {})
+            add("/los/error", errors, vector=[x, None, z], units={"vector": unit} if unit in ("deg", "mrad") else {})
         for topic, joints in _JOINTS.items():
             there = self._first_of([rf"^{joint}" for joint in joints])
             if len(there) == len(joints):
                 named_so = dict(zip(joints, self._names(there), strict=True))
-                add(topic, joints=named_so, units={"joints": "deg"} if self._common_unit(there) == "deg" else {})
-        place = {key: self._called(word) for key, word in (("latitude_deg", r"^lat"), ("longitude_deg", r"^lon|^lng"))}
-        if all(place.values()):
-            add("/fix", **place, height=self._called(r"^(alt|height|elev)") or "")
+                add(topic, there, joints=named_so, units={"joints": "deg"} if self._common_unit(there) == "deg" else {})
+        if len(place := self._first_of(_PLACE)) == len(_PLACE):
+            given = dict(zip(("latitude_deg", "longitude_deg"), self._names(place), strict=True))
+            height = next(iter(self._names(self._first_of([r"^(alt|height|elev)"]))), "")
+            add("/fix", place, **given, height=height)
         for topic, table in out.items():
             kinds = [kind for kind in (*_WORDS, *_OTHERS) if getattr(table, kind)]
             self.reasons.append(f"{self._where}{topic} has {' and '.join(kinds)}")
@@ -242,26 +245,55 @@ class _Table:
         names = self._form.names
         return [names[i] if names.count(names[i]) == 1 else f"column {i + 1}" for i in columns]
 
-    def _called(self, word: str) -> str | None:
-        return next(iter(self._names(self._first_of([word]))), None)
-
     def _first_of(self, words: Sequence[str]) -> list[int]:
         """Return the first column that each word is in the name of, without those that are in none."""
         names = [bare_name(name) for name in self._form.names]
         found = (next((i for i, name in enumerate(names) if re.search(word, name)), None) for word in words)
         return [i for i in found if i is not None]
 
-    def _time(self) -> dict[str, Any]:
-        """Return column and unit of the time: an increasing column, by its name; without names the first column."""
+    def _times(self) -> list[int]:
+        """Return the columns that are times: increasing ones, by their names; without names the first column."""
         increasing = [i for i in range(len(self._values)) if self._increases(i)]
         called = [i for i in increasing if TIME_NAME.search(bare_name(self._form.names[i]))]
-        called += [i for i in increasing if self._stated(i) in TIME_UNITS]
-        unnamed = self._form.names[0] == "column 1"
-        chosen: int | None = next(iter(called), 0 if unnamed and increasing[:1] == [0] else None)
-        if chosen is None:
+        called += [i for i in increasing if self._stated(i) in TIME_UNITS and i not in called]
+        if not called and self._form.names[0] == "column 1" and increasing[:1] == [0]:
+            return [0]
+        if not called:
             still = [name for name in self._form.names if TIME_NAME.search(bare_name(name))]
             self.doubts += [f"{self._where}{name} is no time: it does not increase from row to row" for name in still]
-            return {}
+        return called
+
+    def _time_of(self, columns: Sequence[int], times: Sequence[int]) -> dict[str, Any]:
+        """Return column and unit of a sensor's time, or its rate.
+
+        Sensors side by side have a time each, before their columns; of several together a message's stamp is that of
+        the measurement, others are of its arrival or the same in another form.
+        """
+        passed = [int(np.sum(self._varies[:i])) for i in times]
+        block = max((n for i, n in zip(times, passed, strict=True) if i < min(columns)), default=None)
+        own = [i for i, n in zip(times, passed, strict=True) if block in (None, n)]
+        stamps = [i for i in own if "header.stamp" in bare_name(self._form.names[i])]
+        chosen = next(iter([*stamps, *own]), None)
+        if chosen not in self._clocks:
+            self._clocks[chosen] = self._timed(chosen)
+        return self._clocks[chosen]
+
+    @cached_property
+    def _varies(self) -> list[bool]:
+        """Whether each column holds numbers that vary and do not just increase: of a sensor."""
+        return [
+            bool((np.nanmax(x) > np.nanmin(x)) and not self._increases(i)) if np.isfinite(x).any() else False
+            for i, x in enumerate(self._values)
+        ]
+
+    def _timed(self, chosen: int | None) -> dict[str, Any]:
+        """Return column and unit of a time, or the rate where there is none, with its reason or doubt."""
+        if chosen is None:
+            if self._rate:
+                self.reasons.append(f"{self._where}no column of time; {self._rate:g} Hz by its preamble")
+            else:
+                self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
+            return {"rate": self._rate or 100.0}
         name = self._names([chosen])[0]
         if ":" in str(self._texts[chosen][0]):
             self.reasons.append(f"{self._where}{name} is the time, as a date or clock time")
@@ -275,7 +307,7 @@ class _Table:
         power = float(np.log10(steps)) if steps > 0.0 and by == "steps" else 0.0
         if round(power) != 0 and abs(power - round(power)) < _ALIKE:
             self.doubts.append(f"{self._where}{name} is in no known unit by the preamble's {self._rate:g} Hz: not used")
-            return {}
+            return self._timed(None)
         self.reasons.append(f"{self._where}{name} is the time, in {unit} by its {by}")
         return {"time": name} if unit == "s" else {"time": name, "unit": unit}
 
@@ -320,12 +352,11 @@ class _Table:
             if "covariance" in name:
                 continue
             kind = _kind(name) or self._kind_of_units(columns)
-            # ROS calls linear acceleration what has gravity in it.
-            is_linear = _LINEAR.search(name) and not self._size(kind, columns) if kind == "accel" else False
+            is_linear = kind == "accel" and _LINEAR.search(name) is not None
             norms = self._norms(columns) * UNITS.get(self._common_unit(columns, kind), 1.0)
             if len(norms) > 1 and not any(np.ptp(self._values[i]) for i in columns):
                 continue  # a placeholder
-            if is_linear or (kind == "accel" and len(norms) and lacks_gravity(norms)):
+            if kind == "accel" and len(norms) and lacks_gravity(norms, is_linear):
                 self.doubts.append(f"{self._where}{self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
             elif kind and kind not in out:
                 out[kind] = columns
@@ -372,10 +403,13 @@ class _Table:
             found = "rad/s" if most < MAX_RATE_RAD_S else "deg/s" if most < _MOST_DEG_S else ""
         else:
             found = self._size(kind, columns)
+            low, high = PLAUSIBLE["accel"]
+            if kind == "accel" and not found and len(norms) and low < float(np.median(norms)) < high:
+                found = "m/s^2"  # of a fast motion
         self.doubts.append(f"{self._where}{kind} is in {found or 'counts'} by its size")
         return found
 
-    def _quaternion(self) -> list[str]:
+    def _quaternion(self) -> list[int]:
         """Return the columns w, x, y, z of a quaternion of unit norm, or those numbered so; empty without one."""
         names = [re.sub(r"\W", "", bare_name(name)) for name in self._form.names]
         for axes in ("wxyz", "0123", "1234"):
@@ -384,11 +418,11 @@ class _Table:
                 if not all(f"{stem}{axis}" in names for axis in axes):
                     continue
                 columns = [names.index(f"{stem}{axis}") for axis in axes]
-                if abs(float(np.median(self._norms(columns))) - 1.0) < 0.01:
-                    found = self._names(columns)
+                moves = any(np.ptp(self._values[i][np.isfinite(self._values[i])]) for i in columns)
+                if moves and abs(float(np.median(self._norms(columns))) - 1.0) < 0.01:
                     if axes != "wxyz":
-                        self.doubts.append(f"{self._where}{', '.join(found)} are taken as w, x, y, z")
-                    return found
+                        self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are taken as w, x, y, z")
+                    return columns
         return []
 
     def _angles(self) -> dict[str, Sequence[int]]:

@@ -83,12 +83,15 @@ def likely_unit(kind: str, norm: float) -> str:
     return next((unit for unit, (low, high) in _LIKELY[kind].items() if low <= norm < high), "")
 
 
-def lacks_gravity(norms: Array) -> bool:
-    """Whether accelerometer norms (N,), m/s^2 or g, are those of motion with gravity removed."""
+def lacks_gravity(norms: Array, is_linear: bool = False) -> bool:
+    """Whether accelerometer norms (N,), m/s^2 or g, are those of motion with gravity removed.
+
+    `is_linear` of what is called linear acceleration, as ROS calls what has gravity in it, and phones what has not.
+    """
     norm = float(np.median(norms))
-    if len(norms) < _FEWEST or norm > PLAUSIBLE["accel"][1] or any(low < norm < high for low, high in _WITH_GRAVITY):
+    if norm > PLAUSIBLE["accel"][1] or any(low < norm < high for low, high in _WITH_GRAVITY):
         return False
-    return bool(np.mean(norms < _LOW * norm) > _LOW_SHARE)
+    return is_linear or bool(len(norms) >= _FEWEST and np.mean(norms < _LOW * norm) > _LOW_SHARE)
 
 
 def wrapped_bits(values: Array) -> int:

@@ -23,6 +23,8 @@ N = 400
 DIRECTIONS = RNG.normal(size=(N, 3))
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 RATES = 0.5 * RNG.normal(size=(N, 3))
+ATTITUDES = RNG.normal(size=(N, 4))
+ATTITUDES /= np.linalg.norm(ATTITUDES, axis=1)[:, None]
 
 
 def write(path: Path, header: str, *columns: object) -> Path:
@@ -129,27 +131,64 @@ CASES = {
     "a pose as rostopic writes it": (
         "%time,field.header.seq,field.pose.position.x,field.pose.position.y,field.pose.position.z,"
         + ",".join(f"field.pose.orientation.{axis}" for axis in "xyzw"),
-        (1.5e18 + 1e7 * np.arange(N), np.arange(N), 0.5 * DIRECTIONS, np.full((N, 4), 0.5)),
+        (1.5e18 + 1e7 * np.arange(N), np.arange(N), 0.5 * DIRECTIONS, ATTITUDES),
         {"/attitude": {"time": "time", "unit": "ns", "wxyz": [f"field.pose.orientation.{axis}" for axis in "wxyz"]}},
     ),
-    "an IMU as rostopic writes it": (
-        "%time,"
-        + ",".join(f"field.angular_velocity.{axis}" for axis in "xyz")
-        + ","
-        + ",".join(f"field.{of}_covariance{i}" for of in ("orientation", "angular_velocity") for i in range(9)),
-        (1.5e18 + 1e7 * np.arange(N), RATES, np.ones((N, 18))),
-        {"/imu": {"time": "time", "unit": "ns", "gyro": [f"field.angular_velocity.{axis}" for axis in "xyz"]}},
+    "an IMU without an attitude as rostopic writes it, fast": (
+        ",".join(
+            [
+                "%time,field.header.seq,field.header.stamp",
+                *(f"field.orientation.{axis}" for axis in "xyzw"),
+                *(f"field.orientation_covariance{i}" for i in range(9)),
+                *(f"field.angular_velocity.{axis}" for axis in "xyz"),
+                *(f"field.angular_velocity_covariance{i}" for i in range(9)),
+                *(f"field.linear_acceleration.{axis}" for axis in "xyz"),
+            ]
+        ),
+        (
+            1.5e18 + 1e7 * np.arange(N) + 1e6 * RATES[:, 0],
+            np.arange(N),
+            1.5e18 + 1e7 * np.arange(N),
+            np.tile([0.0, 0.0, 0.0, 1.0, -1.0, *8 * [0.0]], (N, 1)),
+            RATES,
+            np.ones((N, 9)),
+            15.0 * DIRECTIONS,
+        ),
+        {
+            "/imu": {
+                "time": "field.header.stamp",
+                "unit": "ns",
+                "gyro": [f"field.angular_velocity.{axis}" for axis in "xyz"],
+                "accel": [f"field.linear_acceleration.{axis}" for axis in "xyz"],
+            }
+        },
+    ),
+    "two devices side by side, a time each": (
+        "imu_time,gx,gy,gz,frame,mocap_time,mocap_ms,qw,qx,qy,qz",
+        (SECONDS, RATES, np.arange(N), 1.03 * SECONDS + 0.5, 1030.0 * SECONDS + 500.0, ATTITUDES),
+        {
+            "/imu": {"time": "imu_time", "gyro": ["gx", "gy", "gz"]},
+            "/attitude": {"time": "mocap_time", "wxyz": ["qw", "qx", "qy", "qz"]},
+        },
+    ),
+    "a gyro and an accelerometer with a time each": (
+        "t_gyro,gx,gy,gz,t_acc,ax,ay,az",
+        (SECONDS, RATES, 1.03 * SECONDS + 0.5, 9.81 * DIRECTIONS),
+        {
+            "/imu/gyro": {"time": "t_gyro", "gyro": ["gx", "gy", "gz"]},
+            "/imu/accel": {"time": "t_acc", "accel": ["ax", "ay", "az"]},
+        },
     ),
     "a rigid body as Motive exports it": (
         "Format Version,1.23,Take Name,Take,Capture Frame Rate,100.000000,Rotation Type,Quaternion\n\n"
         f",Type{8 * ',Rigid Body'}\n,Name{8 * ',Head'}\n,ID{8 * ',1'}\n"
         f",{4 * ',Rotation'}{3 * ',Position'},Mean Marker Error\nFrame,Time (Seconds),X,Y,Z,W,X,Y,Z,",
-        (np.arange(N), SECONDS, np.full((N, 4), 0.5), DIRECTIONS, np.full(N, 3e-4)),
+        (np.arange(N), SECONDS, ATTITUDES, DIRECTIONS, np.full(N, 3e-4)),
         {"/attitude": {"time": "Time (Seconds)", "wxyz": ["W", "column 3", "column 4", "column 5"]}},
     ),
     "a quaternion by numbers, a clock of 0.1 ms beside the rate": (
         "// Update Rate: 100.0Hz\nSampleTimeFine,Gyr_X,Gyr_Y,Gyr_Z,Quat_q0,Quat_q1,Quat_q2,Quat_q3",
-        (100 * np.arange(N), RATES, np.full((N, 4), 0.5)),
+        (100 * np.arange(N), RATES, ATTITUDES),
         {
             "/imu": {"rate": 100.0, "gyro": ["Gyr_X", "Gyr_Y", "Gyr_Z"]},
             "/attitude": {"rate": 100.0, "wxyz": [f"Quat_q{i}" for i in range(4)]},
@@ -171,7 +210,7 @@ CASES = {
     ),
     "a quaternion in brackets": (
         "timestamp,q[0],q[1],q[2],q[3],delta_q_reset[0],delta_q_reset[1],delta_q_reset[2],delta_q_reset[3]",
-        (1e4 * np.arange(N), np.full((N, 4), 0.5), np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))),
+        (1e4 * np.arange(N), ATTITUDES, np.tile([1.0, 0.0, 0.0, 0.0], (N, 1))),
         {"/attitude": {"time": "timestamp", "unit": "us", "wxyz": [f"q[{i}]" for i in range(4)]}},
     ),
     "a segment as Vicon exports it": (
@@ -205,7 +244,7 @@ CASES = {
     ),
     "a pose": (
         "timestamp,qw,qx,qy,qz",
-        (1.79e9 + SECONDS, np.tile([0.5, 0.5, 0.5, 0.5], (N, 1))),
+        (1.79e9 + SECONDS, ATTITUDES),
         {"/attitude": {"time": "timestamp", "wxyz": ["qw", "qx", "qy", "qz"]}},
     ),
     "linear acceleration": (
