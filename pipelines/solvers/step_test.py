@@ -397,8 +397,9 @@ def _solved_again(
     D = so3.right_jacobian_inverse(turn) @ (second - so3.matrix(so3.exp(-turn)) @ first)
     C, moved = joined.covariance(D), alone.covariance(D)
     step, by_motion = turn + D @ joined.shared, turn + D @ alone.shared
-    ratio_moved = _ratio(fit.chain, apart, D, alone.shared)
-    ratio = max(_ratio(fit.chain, fit.variances, D, joined.shared), ratio_moved)
+    sides = (D, first, second)
+    ratio_moved = _ratio(fit.chain, apart, sides, alone.shared)
+    ratio = max(_ratio(fit.chain, fit.variances, sides, joined.shared), ratio_moved)
     fall = without.minus_two_log_likelihood - fit.minus_two_log_likelihood
     # Log det of the step's information is what a prior of its width would pay: no evidence for a step.
     fall -= float(np.linalg.slogdet(C)[1])
@@ -447,11 +448,23 @@ def _leads_to(rows: Rows, keyframe: int) -> Mask:
     return np.asarray(rows.states[1][0] == keyframe)
 
 
-def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, at: Array) -> float:
-    """Largest ratio of sandwich to nominal sigma over all directions of numbers with Jacobian D by the shared ones."""
+def _ratio(chain: LinearChain, variances: Sequence[Array], by_shared: Sequence[Array], at: Array) -> float:
+    """Largest ratio of sandwich to nominal sigma, at least 1, over all directions of any of some vectors.
+
+    A step near an end has few blocks on that side; errors there are correlated as on the other one.
+
+    Args:
+        chain: about the solution without `at`.
+        variances: (n,) of each kind of rows.
+        by_shared: Jacobians of the vectors by the shared parameters.
+        at: (p,) the solution.
+    """
     nominal, robust, _ = sandwich(chain, variances, at)
-    root = np.linalg.inv(np.linalg.cholesky(D @ nominal @ D.T))
-    return max(1.0, float(np.linalg.eigvalsh(root @ D @ robust @ D.T @ root.T)[-1]) ** 0.5)
+    found = [1.0]
+    for D in by_shared:
+        root = np.linalg.inv(np.linalg.cholesky(D @ nominal @ D.T))
+        found.append(float(np.linalg.eigvalsh(root @ D @ robust @ D.T @ root.T)[-1]) ** 0.5)
+    return max(found)
 
 
 def split(

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from alidade.factors import so3
+from alidade.factors.array import Array
+from alidade.pipelines import methods
+from alidade.pipelines.estimation.finding import Severity
 from benchmarks.altered import Alteration, calibrated, errors
 from datasets.broad import read_trial, to_session
 
@@ -28,3 +33,36 @@ def test_slips_are_found_and_healthy_parts_are_right(seeds: tuple[int, ...], sha
             assert found.status != "inconsistent", (seed, found.headline)
             off, sigmas = errors(found, calibrated(to_session(trial, 0, 0.0)), by)
             assert np.abs(off / sigmas).max() < 4.0, seed
+
+
+def _correlated(t: Array, sigma: float, length: float, seed: int) -> Array:
+    """Errors (n, 3), rad, of a sigma, whose correlation falls to 1 / e within `length` s."""
+    rng = np.random.default_rng(seed)
+    kept = np.exp(-np.diff(t, prepend=-np.inf) / length)
+    x = sigma * rng.standard_normal((len(t), 3)) * np.sqrt(1.0 - kept**2)[:, None]
+    for k in range(1, len(t)):
+        x[k] += kept[k] * x[k - 1]
+    return x
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "length", "seed"),
+    [
+        ("30_disturbed_stationary_magnet_C", 80.0, 0.1, 0),
+        pytest.param("28_disturbed_stationary_magnet_A", 80.0, 0.1, 2, marks=pytest.mark.slow),
+        pytest.param("28_disturbed_stationary_magnet_A", 80.0, 2.0, 2, marks=pytest.mark.slow),
+        pytest.param("28_disturbed_stationary_magnet_A", 80.0, 2.0, 3, marks=pytest.mark.slow),
+        pytest.param("30_disturbed_stationary_magnet_C", 80.0, 2.0, 0, marks=pytest.mark.slow),
+        pytest.param("30_disturbed_stationary_magnet_C", 36.0, 2.0, 1, marks=pytest.mark.slow),
+        pytest.param("30_disturbed_stationary_magnet_C", 36.0, 2.0, 2, marks=pytest.mark.slow),
+    ],
+)
+def test_correlated_errors_of_vision_are_no_slip(
+    name: str, begin: float, length: float, seed: int, shared_data: Path
+) -> None:
+    """Of half a degree: near an end of the recording a few seconds of them would pass for a step of the mount."""
+    trial = read_trial(shared_data / "broad" / f"{name}.mat")
+    data = methods.method("head").faults.segment(to_session(trial, 0, 0.0, 15.0), begin, begin + 45.0)
+    errors = so3.exp(_correlated(data.vision_t, np.deg2rad(0.5), length, seed))
+    found = calibrated(replace(data, vision_wxyz=so3.multiply(data.vision_wxyz, errors)))
+    assert not {finding.kind for finding in found.findings if finding.severity > Severity.NOTE} & {"change", "jump"}
