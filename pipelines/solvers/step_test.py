@@ -397,9 +397,8 @@ def _solved_again(
     D = so3.right_jacobian_inverse(turn) @ (second - so3.matrix(so3.exp(-turn)) @ first)
     C, moved = joined.covariance(D), alone.covariance(D)
     step, by_motion = turn + D @ joined.shared, turn + D @ alone.shared
-    sides = (D, first, second)
-    ratio_moved = _ratio(fit.chain, apart, sides, alone.shared)
-    ratio = max(_ratio(fit.chain, fit.variances, sides, joined.shared), ratio_moved)
+    ratio_moved = _ratio(fit.chain, apart, D, first, alone.shared)
+    ratio = max(_ratio(fit.chain, fit.variances, D, first, joined.shared), ratio_moved)
     fall = without.minus_two_log_likelihood - fit.minus_two_log_likelihood
     # Log det of the step's information is what a prior of its width would pay: no evidence for a step.
     fall -= float(np.linalg.slogdet(C)[1])
@@ -448,23 +447,30 @@ def _leads_to(rows: Rows, keyframe: int) -> Mask:
     return np.asarray(rows.states[1][0] == keyframe)
 
 
-def _ratio(chain: LinearChain, variances: Sequence[Array], by_shared: Sequence[Array], at: Array) -> float:
-    """Largest ratio of sandwich to nominal sigma, at least 1, over all directions of any of some vectors.
+def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, mount: Array, at: Array) -> float:
+    """Largest ratio of sandwich to nominal sigma, at least 1, over all directions of a step, and of the mount with it.
 
-    A step near an end has few blocks on that side; errors there are correlated as on the other one.
+    Near an end few blocks determine the step; errors there are correlated as in all of them, which determine the mount
+    where the step is held fixed.
 
     Args:
         chain: about the solution without `at`.
         variances: (n,) of each kind of rows.
-        by_shared: Jacobians of the vectors by the shared parameters.
+        D, mount: Jacobians (3, p) of the step and of the mount before it by the shared parameters.
         at: (p,) the solution.
     """
     nominal, robust, _ = sandwich(chain, variances, at)
-    found = [1.0]
-    for D in by_shared:
-        root = np.linalg.inv(np.linalg.cholesky(D @ nominal @ D.T))
-        found.append(float(np.linalg.eigvalsh(root @ D @ robust @ D.T @ root.T)[-1]) ** 0.5)
-    return max(found)
+    information = np.linalg.inv(nominal)
+    fixed = np.linalg.qr(D.T, mode="complete")[0][:, len(D) :]
+    C = np.linalg.inv(fixed.T @ information @ fixed)
+    kept = C @ fixed.T @ information
+    return max(1.0, _largest(D, nominal, robust), _largest(mount @ fixed, C, kept @ robust @ kept.T))
+
+
+def _largest(J: Array, nominal: Array, robust: Array) -> float:
+    """Largest ratio of robust to nominal sigma over all directions of numbers with Jacobian J by the unknowns."""
+    root = np.linalg.inv(np.linalg.cholesky(J @ nominal @ J.T))
+    return float(np.linalg.eigvalsh(root @ J @ robust @ J.T @ root.T)[-1]) ** 0.5
 
 
 def split(
