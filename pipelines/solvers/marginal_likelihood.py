@@ -611,12 +611,11 @@ def widened(chain: LinearChain, levels: Sequence[Level], widening: Widening) -> 
     return found
 
 
-def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = None) -> tuple[Array, Array, int]:
-    """Nominal and sandwich covariance (p, p) of the shared parameters, and the number of blocks.
+def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = None) -> tuple[Array, Array, int]:
+    """Information (p, p) of the shared parameters, the same by scores of blocks (p, p), and the number of blocks.
 
-    With innovations e and their derivatives G by the shared parameters, C = (G'G + prior)^-1 is the nominal covariance,
-    and C B C, B the sum over blocks of `SANDWICH_BLOCK_S` of G'e e'G and the prior's information, what it is whatever
-    is correlated within blocks (Liang, Zeger, Biometrika 1986).
+    With innovations e and their derivatives G by the shared parameters the one is G'G, the other the sum over blocks of
+    `SANDWICH_BLOCK_S` of G'e e'G, what the noise is whatever is correlated within blocks; both with the prior's.
 
     Args:
         chain: about the solution.
@@ -636,8 +635,16 @@ def sandwich(chain: LinearChain, variances: Sequence[Array], at: Array | None = 
         sums = np.zeros((blocks, p))
         np.add.at(sums, block, np.einsum("nmi,nm->ni", G, e))
         middle += sums.T @ sums
+    return information, middle, blocks
+
+
+def sandwich(information: Array, by_scores: Array) -> tuple[Array, Array]:
+    """Nominal C and sandwich covariance C B C of parameters with information C^-1, and B by their scores.
+
+    Liang, Zeger, Biometrika 1986.
+    """
     C = np.asarray(np.linalg.pinv(information, hermitian=True))
-    return C, C @ middle @ C, blocks
+    return C, C @ by_scores @ C
 
 
 def _shares(chain: LinearChain, levels: Sequence[Level], which: Sequence[int]) -> list[list[Array]]:
@@ -830,7 +837,8 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     """
     chain, variances = _at(compiled, levels, solution)
     reported = Reported.of(compiled, solution.values).jacobian[:, compiled.layout.sizes[3] :]
-    nominal, robust, blocks = sandwich(chain, variances)
+    information, by_scores, blocks = scores(chain, variances)
+    nominal, robust = sandwich(information, by_scores)
     above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
     ratio = sigma_ratio(below, above)
     return np.where(ratio > certain_ratio(blocks), np.maximum(ratio, 1.0), 1.0)

@@ -18,6 +18,7 @@ Limits: a parameter of which all measurements hold the same variable; steps of a
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,7 +28,7 @@ from alidade.factors.array import Array, Mask
 from alidade.factors.model import ROT3
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
 from alidade.pipelines.estimation.problem import APART, Factor, Parameter, StepEstimate
-from alidade.pipelines.solvers.chain import IndeterminateStateError, Index
+from alidade.pipelines.solvers.chain import UNDETERMINED, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Solution
@@ -41,6 +42,7 @@ from alidade.pipelines.solvers.marginal_likelihood import (
     add_blocks,
     maximise_likelihood,
     sandwich,
+    scores,
     unwidened,
     widened,
 )
@@ -277,10 +279,10 @@ def _largest_steps(compiled: Compiled, levels: Sequence[Level], solution: Soluti
     scans = [(p, found) for p, found in scans if found.fall.max() >= NOTHING]
     if scans:
         without = _maximised(engine, values, levels, outliers, transient)
-        tried = [
-            _solved_again(without, base, outliers, transient, p, found, i) for p, found in scans for i in found.best()
-        ]
-        steps += [step for step in tried if step is not None]
+        for p, found in scans:
+            for i in found.best():
+                with suppress(IndeterminateStateError, np.linalg.LinAlgError):
+                    steps.append(_solved_again(without, base, outliers, transient, p, found, i))
     return tuple(sorted(steps, key=lambda step: (-step.statistic, -step.fall)))
 
 
@@ -378,18 +380,19 @@ def _length(step: Array, covariance: Array) -> tuple[float, float]:
 
 def _solved_again(
     without: _Fit, base: _Fit, outliers: Widening, transient: Widening, parameter: Parameter, found: Scan, i: int
-) -> StepEstimate | None:
-    """Re-estimate with a step at candidate i, noise levels and widening included; None if undetermined."""
+) -> StepEstimate:
+    """Re-estimate with a step at candidate i, noise levels and widening included.
+
+    Raises:
+        IndeterminateStateError, numpy.linalg.LinAlgError: undetermined with the step.
+    """
     engine, values, late = split(base.engine, base.values, parameter.key, float(found.time[i]), found.step[i])
-    try:
-        fit = _maximised(engine, values, base.levels, outliers, transient)
-    except IndeterminateStateError:
-        return None
+    fit = _maximised(engine, values, base.levels, outliers, transient)
     link = [_leads_to(rows, int(found.keyframe[i])) for rows in fit.chain.rows]
     apart = [np.where(to, np.inf, v) for v, to in zip(fit.variances, link, strict=True)]
     joined, alone = fit.chain.solved(fit.variances), fit.chain.solved(apart)
     if joined is None or alone is None:
-        return None
+        raise IndeterminateStateError(UNDETERMINED)
     layout, c = engine.layout, engine.layout.sizes[3]
     first, second = (layout.root_columns(key)[:, c:] for key in (parameter.key, late))
     turn = so3.local(layout.of_key(fit.values, parameter.key), layout.of_key(fit.values, late))
@@ -459,12 +462,10 @@ def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, mount: Arra
         D, mount: Jacobians (3, p) of the step and of the mount before it by the shared parameters.
         at: (p,) the solution.
     """
-    nominal, robust, _ = sandwich(chain, variances, at)
-    information = np.linalg.inv(nominal)
+    information, by_scores, _ = scores(chain, variances, at)
     fixed = np.linalg.qr(D.T, mode="complete")[0][:, len(D) :]
-    C = np.linalg.inv(fixed.T @ information @ fixed)
-    kept = C @ fixed.T @ information
-    return max(1.0, _largest(D, nominal, robust), _largest(mount @ fixed, C, kept @ robust @ kept.T))
+    held = sandwich(*(fixed.T @ each @ fixed for each in (information, by_scores)))
+    return max(1.0, _largest(D, *sandwich(information, by_scores)), _largest(mount @ fixed, *held))
 
 
 def _largest(J: Array, nominal: Array, robust: Array) -> float:
