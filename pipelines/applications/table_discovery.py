@@ -12,7 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,8 @@ _PLACE = (r"^lat", r"^lon|^lng")
 _LOS_ERRORS = (r"^el\w*err|^err\w*_el", r"^az\w*err|^err\w*_az")
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
 _QUATERNION = "q|quat|orientation|rot|attitude"
+# Endings of a stamp's whole seconds, and of the ns beyond them.
+_SECONDS, _NANOSECONDS = ("secs", "sec", "seconds"), ("nsecs", "nsec", "nanosec", "nanoseconds")
 # Unix time of the years 1985 to 2128, s.
 _UNIX_S = (0.5e9, 5e9)
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
@@ -194,15 +196,15 @@ class _Table:
             except ValueError as error:
                 self.doubts.append(f"{self._where}{topic}: {error}")
 
+        clocks = {kind: self._time_of(columns, times) for kind, columns in named.items()}
         units = {kind: self._unit(kind, columns) for kind, columns in named.items()}
         imu = {kind: columns for kind, columns in named.items() if kind != "field"}
-        clocks = {kind: self._time_of(columns, times) for kind, columns in imu.items()}
-        together = all(clock == next(iter(clocks.values())) for clock in clocks.values())
-        for kinds in [(kind,) for kind in imu] if not together else [tuple(imu)] if imu else []:
+        together = all(clocks[kind] == clocks[other] for kind, other in pairwise(imu))
+        alone = {"gyro": "/imu/gyro", "accel": "/imu/accel"} if self._file or not together else {}
+        for kinds in filter(None, [list(imu)] if together else [[kind] for kind in imu]):
             own = {kind: units[kind] for kind in kinds if units[kind] and UNITS[units[kind]] != 1.0}
-            alone = {("gyro",): "/imu/gyro", ("accel",): "/imu/accel"} if self._file or not together else {}
             given = {kind: self._names(imu[kind]) for kind in kinds}
-            add(alone.get(kinds, "/imu"), imu[kinds[0]], **given, units=own)
+            add(alone.get("".join(kinds), "/imu"), imu[kinds[0]], **given, units=own)
         if "field" in named:
             unit, field = units["field"], named["field"]
             own = {"field": unit} if unit and UNITS[unit] != 1.0 else {}
@@ -224,12 +226,12 @@ class _Table:
                 named_so = dict(zip(joints, self._names(there), strict=True))
                 add(topic, there, joints=named_so, units={"joints": "deg"} if self._common_unit(there) == "deg" else {})
         if len(place := self._first_of(_PLACE)) == len(_PLACE):
-            given = dict(zip(("latitude_deg", "longitude_deg"), self._names(place), strict=True))
+            latitude, longitude = self._names(place)
             height = next(iter(self._names(self._first_of([r"^(alt|height|elev)"]))), "")
-            add("/fix", place, **given, height=height)
+            add("/fix", place, latitude_deg=latitude, longitude_deg=longitude, height=height)
         for topic, table in out.items():
-            kinds = [kind for kind in (*_WORDS, *_OTHERS) if getattr(table, kind)]
-            self.reasons.append(f"{self._where}{topic} has {' and '.join(kinds)}")
+            has = [kind for kind in (*_WORDS, *_OTHERS) if getattr(table, kind)]
+            self.reasons.append(f"{self._where}{topic} has {' and '.join(has)}")
         if not out:
             self.doubts.append(f"{self._where}nothing known in {', '.join(self._form.names[:20])}")
         return out
@@ -253,8 +255,8 @@ class _Table:
 
     def _times(self) -> list[int]:
         """Return the columns that are times: increasing ones, by their names; without names the first column."""
-        increasing = [i for i in range(len(self._values)) if self._increases(i)]
-        called = [i for i in increasing if TIME_NAME.search(bare_name(self._form.names[i]))]
+        increasing = [i for i in range(len(self._values)) if self._increases(i) and i not in self._beyond.values()]
+        called = [*self._beyond, *(i for i in increasing if TIME_NAME.search(bare_name(self._form.names[i])))]
         called += [i for i in increasing if self._stated(i) in TIME_UNITS and i not in called]
         if not called and self._form.names[0] == "column 1" and increasing[:1] == [0]:
             return [0]
@@ -279,6 +281,17 @@ class _Table:
         return self._clocks[chosen]
 
     @cached_property
+    def _beyond(self) -> dict[int, int]:
+        """Columns of whole seconds, as in a message's stamp, and those of the ns beyond them."""
+        names, found = [bare_name(name) for name in self._form.names], {}
+        for i, name in enumerate(names):
+            parts = [f"{name.removesuffix(end)}{ns}" for end in _SECONDS if name.endswith(end) for ns in _NANOSECONDS]
+            for j in [names.index(part) for part in parts if part in names]:
+                if _rises(self._values[i] + 1e-9 * self._values[j]):
+                    found[i] = j
+        return found
+
+    @cached_property
     def _varies(self) -> list[bool]:
         """Whether each column holds numbers that vary and do not just increase: of a sensor."""
         return [
@@ -294,6 +307,10 @@ class _Table:
             else:
                 self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
             return {"rate": self._rate or 100.0}
+        if chosen in self._beyond:
+            both = self._names([chosen, self._beyond[chosen]])
+            self.reasons.append(f"{self._where}{both[0]} and {both[1]} are the time, in s and ns")
+            return {"time": both}
         name = self._names([chosen])[0]
         if ":" in str(self._texts[chosen][0]):
             self.reasons.append(f"{self._where}{name} is the time, as a date or clock time")
@@ -321,12 +338,7 @@ class _Table:
         return stated.pop() if len(stated) == 1 else ""
 
     def _increases(self, i: int) -> bool:
-        if ":" in str(self._texts[i][0] if len(self._texts[i]) else ""):
-            return True
-        values = self._values[i][np.isfinite(self._values[i])]
-        steps = np.diff(values)
-        # A counter may run over, a logger start again, two sensors share a stamp.
-        return len(steps) > 2 and bool(np.mean(steps >= 0.0) > 0.99) and bool(np.mean(steps > 0.0) > 0.4)
+        return ":" in str(self._texts[i][0] if len(self._texts[i]) else "") or _rises(self._values[i])
 
     def _triads(self) -> dict[str, tuple[int, ...]]:
         """Return kind -> columns along x, y, z: by names, as a file's only three, or, without a header, by numbers."""
@@ -437,6 +449,12 @@ class _Table:
             return {}
         self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are {how}")
         return {key: columns}
+
+
+def _rises(values: Array) -> bool:
+    """Whether numbers increase as times do: a counter may run over, a logger start again, two sensors share a stamp."""
+    steps = np.diff(values[np.isfinite(values)])
+    return len(steps) > 2 and bool(np.mean(steps >= 0.0) > 0.99) and bool(np.mean(steps > 0.0) > 0.4)
 
 
 def _kind(name: str) -> str:

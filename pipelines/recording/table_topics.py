@@ -41,6 +41,7 @@ from alidade.pipelines.recording.topics import Axes, along
 
 # Rows of named columns: a text file, or the messages of a topic.
 Table = CsvFile | MessageTable
+_Two = Annotated[tuple[str, str], Field(strict=False)]
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _ThreeOrNone = Annotated[tuple[str | None, str | None, str | None], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]
@@ -70,7 +71,7 @@ class TableTopic(BaseModel):
 
     Attributes:
         file: name of the file, needed where there are several tables; or of the topic whose messages are the rows.
-        time: column of the stamps: numbers, or dates as ISO 8601 has them.
+        time: column of the stamps, numbers or dates as ISO 8601 has them; or two, of whole seconds and ns beyond them.
         unit: what they count; without it what the header says, else s.
         rate: Hz, of rows without a time.
         gyro, accel: columns of an IMU's rates and accelerations, or of one of them.
@@ -91,7 +92,7 @@ class TableTopic(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     file: str | None = None
-    time: str | None = None
+    time: str | _Two | None = None
     unit: Literal["s", "ms", "us", "ns"] | None = None
     rate: Annotated[float, Field(gt=0.0, le=1e6, strict=False)] | None = None
     gyro: _Three | None = None
@@ -120,6 +121,8 @@ class TableTopic(BaseModel):
             raise ValueError(f"exactly one of {', '.join(_KINDS)}, joints, video is needed, not {found}")
         if (self.time is None) == (self.rate is None):
             raise ValueError("either time, the column of the stamps, or rate, in Hz, is needed")
+        if self.unit is not None and not isinstance(self.time, str):
+            raise ValueError("unit goes with one column of time: two are in s and ns")
         for name, unit in self.units.items():
             if name not in _QUANTITIES:
                 raise ValueError(f"units.{name}: only {', '.join(_QUANTITIES)} have units")
@@ -136,8 +139,7 @@ class TableTopic(BaseModel):
     @property
     def names(self) -> list[str]:
         """Names of the table's columns that the topic needs."""
-        stamps = [] if self.time is None else [self.time]
-        return [*stamps, *self.where, *(name for found in self._given.values() for name in found)]
+        return [*self._stamps, *self.where, *(name for found in self._given.values() for name in found)]
 
     def to_series(
         self,
@@ -167,9 +169,11 @@ class TableTopic(BaseModel):
         if self.time is None:
             t_ns, unit = of_rate(len(filled), self.rate or 1.0)[filled], "s"
         else:
-            filled &= numbers_or_times(columns[self.time])
+            for name in self._stamps:
+                filled &= numbers_or_times(columns[name])
+            first, *beyond = (columns[name][filled] for name in self._stamps)
             unit = self._time_unit(form, notes)
-            t_ns = nanoseconds(path, columns[self.time][filled], unit)
+            t_ns = nanoseconds(path, first, unit) + sum(nanoseconds(path, each, "ns") for each in beyond)
         values = {name: one[filled] for name, one in values.items()}
         log_ns = None if logged is None else logged[rows][filled]
         if log_ns is None:
@@ -205,6 +209,11 @@ class TableTopic(BaseModel):
         return kind(t_ns, **shaped), log_ns, notes
 
     @property
+    def _stamps(self) -> list[str]:
+        """Columns of the stamps; none of rows at a rate."""
+        return [self.time] if isinstance(self.time, str) else [*(self.time or ())]
+
+    @property
     def _given(self) -> dict[str, list[str]]:
         """Quantity -> names of its columns."""
         return {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
@@ -226,7 +235,7 @@ class TableTopic(BaseModel):
 
     def _time_unit(self, form: TableHead, notes: list[str]) -> str:
         """Unit of time by the config, else by the header, else s."""
-        stated = "" if self.time is None else form.units[form.index(self.time)]
+        stated = form.units[form.index(self.time)] if isinstance(self.time, str) else ""
         if self.unit is not None or stated not in TIME_UNITS:
             return self.unit or "s"
         if stated != "s":

@@ -163,6 +163,23 @@ CASES = {
             }
         },
     ),
+    "a pose as bagpy writes it": (
+        "Time,header.seq,header.stamp.secs,header.stamp.nsecs,"
+        + ",".join(f"pose.orientation.{axis}" for axis in "xyzw"),
+        (
+            1.5e9 + SECONDS + 1e-3 * RATES[:, 0],
+            np.arange(N),
+            1.5e9 + SECONDS // 1.0,
+            np.rint(1e9 * (SECONDS % 1.0)),
+            ATTITUDES,
+        ),
+        {
+            "/attitude": {
+                "time": ["header.stamp.secs", "header.stamp.nsecs"],
+                "wxyz": [f"pose.orientation.{axis}" for axis in "wxyz"],
+            }
+        },
+    ),
     "two devices side by side, a time each": (
         "imu_time,gx,gy,gz,frame,mocap_time,mocap_ms,qw,qx,qy,qz",
         (SECONDS, RATES, np.arange(N), 1.03 * SECONDS + 0.5, 1030.0 * SECONDS + 500.0, ATTITUDES),

@@ -142,6 +142,11 @@ def test_what_stands_for_no_number_is_none_and_a_last_row_that_is_cut_is_left_ou
             "is the unit s|is the unit ms",
         ),
         ([HEADER, *rows()], "columns: {/mag: {field: [mx, my, mz]}}", "either time, .*or rate, in Hz, is needed"),
+        (
+            [HEADER, *rows()],
+            "columns: {/mag: {time: [t, mx], unit: us, field: [mx, my, mz]}}",
+            "unit goes with one column of time",
+        ),
         (["1 January", "no numbers here"], CONFIG, "no line of numbers in it"),
         ([HEADER, *rows(",", ",")], CONFIG, "commas separate columns and mark decimals, 4 names over 8 cells"),
     ],
@@ -163,6 +168,15 @@ def test_units_in_a_header_are_those_of_a_config_that_says_none(tmp_path: Path) 
     np.testing.assert_allclose(imu.gyro, np.deg2rad(FIELD), rtol=1e-15)
     np.testing.assert_allclose(imu.accel, 9.80665 * FIELD, rtol=1e-15)
     assert any("gyro is in deg/s by its header" in note for note in recording.notes)
+
+
+def test_seconds_and_nanoseconds_in_two_columns_are_one_time(tmp_path: Path) -> None:
+    seconds, ns = np.divmod(1_790_000_000_995_000_000 + 20_000_000 * np.arange(N), 1_000_000_000)
+    lines = [",".join(map(str, [seconds[i], ns[i], *FIELD[i].tolist()])) for i in range(N)]
+    (tmp_path / "x.csv").write_text("\n".join(["header.stamp.sec,header.stamp.nanosec,mx,my,mz", *lines]))
+    config = "columns: {/mag: {time: [header.stamp.sec, header.stamp.nanosec], field: [mx, my, mz]}}"
+    found = described(tmp_path / "x.csv", config).magnetic("/mag")
+    np.testing.assert_array_equal(found.t_ns, 1_000_000_000 * seconds + ns)
 
 
 @pytest.mark.parametrize("key", ["yaw_pitch_roll", "rotation_vector"])
