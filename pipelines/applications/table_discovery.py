@@ -71,8 +71,11 @@ _PLACE = (r"^lat", r"^lon|^lng")
 _LOS_ERRORS = (r"^el\w*err|^err\w*_el", r"^az\w*err|^err\w*_az")
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
 _QUATERNION = "q|quat|orientation|rot|attitude"
-# Endings of a stamp's whole seconds, and of the ns beyond them.
+# Endings of a stamp's whole seconds, and of the nanoseconds to be added; a message's stamp, after its topic's name.
 _SECONDS, _NANOSECONDS = ("secs", "sec", "seconds"), ("nsecs", "nsec", "nanosec", "nanoseconds")
+_STAMP = re.compile(r"(.*?)header\W+stamp")
+# Rows in which two times are compared, at least.
+_FEWEST_TIMES = 10
 # Unix time of the years 1985 to 2128, s.
 _UNIX_S = (0.5e9, 5e9)
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
@@ -233,6 +236,7 @@ class _Table:
             has = [kind for kind in (*_WORDS, *_OTHERS) if getattr(table, kind)]
             self.reasons.append(f"{self._where}{topic} has {' and '.join(has)}")
         if not out:
+            self._described_time(next(iter(times), None))
             self.doubts.append(f"{self._where}nothing known in {', '.join(self._form.names[:20])}")
         return out
 
@@ -255,49 +259,77 @@ class _Table:
 
     def _times(self) -> list[int]:
         """Return the columns that are times: increasing ones, by their names; without names the first column."""
-        increasing = [i for i in range(len(self._values)) if self._increases(i) and i not in self._beyond.values()]
-        called = [*self._beyond, *(i for i in increasing if TIME_NAME.search(bare_name(self._form.names[i])))]
-        called += [i for i in increasing if self._stated(i) in TIME_UNITS and i not in called]
-        if not called and self._form.names[0] == "column 1" and increasing[:1] == [0]:
+        later = self._nanoseconds_of.values()
+        increasing = [i for i in range(len(self._values)) if self._increases(i) and i not in later]
+        called = {i for i in increasing if TIME_NAME.search(bare_name(self._form.names[i]))}
+        times = sorted(called | self._nanoseconds_of.keys())
+        times += [i for i in increasing if self._stated(i) in TIME_UNITS and i not in times]
+        if not times and self._form.names[0] == "column 1" and increasing[:1] == [0]:
             return [0]
-        if not called:
+        if not times:
             still = [name for name in self._form.names if TIME_NAME.search(bare_name(name))]
             self.doubts += [f"{self._where}{name} is no time: it does not increase from row to row" for name in still]
-        return called
+        return times
 
     def _time_of(self, columns: Sequence[int], times: Sequence[int]) -> dict[str, Any]:
         """Return column and unit of a sensor's time, or its rate.
 
-        Sensors side by side have a time each, before their columns; of several together a message's stamp is that of
-        the measurement, others are of its arrival or the same in another form.
+        The stamp of its message if there is one; else the last time before its columns, if that is another clock than
+        the table's first time, as of devices side by side.
         """
-        passed = [int(np.sum(self._varies[:i])) for i in times]
-        block = max((n for i, n in zip(times, passed, strict=True) if i < min(columns)), default=None)
-        own = [i for i, n in zip(times, passed, strict=True) if block in (None, n)]
-        stamps = [i for i in own if "header.stamp" in bare_name(self._form.names[i])]
-        chosen = next(iter([*stamps, *own]), None)
+        names = [bare_name(name) for name in self._form.names]
+        stamps = {i: found[1] for i in times if (found := _STAMP.match(names[i]))}
+        own = [i for i, prefix in stamps.items() if names[columns[0]].startswith(prefix)]
+        if own or not times:
+            return self._described_time(next(iter(own), None))
+        last = max((i for i in times if i < min(columns)), default=times[0])
+        if not self._is_another_clock(times[0], last):
+            return self._described_time(times[0])
+        return self._described_time(next(i for i in times if i == last or not self._is_another_clock(i, last)))
+
+    def _is_another_clock(self, i: int, other: int) -> bool:
+        """Whether two times differ by more than a constant, and have more than half of the longer one in common."""
+        if i == other or np.isfinite(self._values[i] + self._values[other]).sum() < _FEWEST_TIMES:
+            return False  # nor are dates compared
+        a, b = self._seconds(i), self._seconds(other)
+        if np.nanstd(b - a) < 0.5 * _median_step(a):
+            return False
+        (first, last), (begin, end) = ((np.nanmin(x), np.nanmax(x)) for x in (a, b))
+        return bool(min(last, end) - max(first, begin) > 0.5 * max(last - first, end - begin))
+
+    def _seconds(self, i: int) -> Array:
+        """Times of a column, s."""
+        if i in self._nanoseconds_of:
+            return np.asarray(self._values[i] + 1e-9 * self._values[self._nanoseconds_of[i]])
+        return np.asarray(self._values[i] * (1e-9 * TIME_UNITS[self._unit_of_time(i)[0]]))
+
+    @cached_property
+    def _nanoseconds_of(self) -> dict[int, int]:
+        """Columns of whole seconds, as of a message's stamp, and the columns of the nanoseconds to be added."""
+        names, found = [bare_name(name) for name in self._form.names], {}
+        for i, name in enumerate(names):
+            parts = {f"{name.removesuffix(end)}{ns}" for end in _SECONDS if name.endswith(end) for ns in _NANOSECONDS}
+            near = sorted((abs(j - i), j) for j, other in enumerate(names) if other in parts)
+            if not near:
+                continue
+            _, j = near[0]
+            both = np.stack([self._values[i], self._values[j]])
+            seconds, ns = both[:, np.isfinite(both).all(axis=0)]
+            if (seconds == np.rint(seconds)).all() and ((ns >= 0.0) & (ns < 1e9)).all() and _rises(seconds + 1e-9 * ns):
+                found[i] = j
+        return found
+
+    def _described_time(self, chosen: int | None) -> dict[str, Any]:
+        """Return column and unit of a time, or the rate where there is none; its reason or doubt is given once."""
         if chosen not in self._clocks:
             self._clocks[chosen] = self._timed(chosen)
         return self._clocks[chosen]
 
-    @cached_property
-    def _beyond(self) -> dict[int, int]:
-        """Columns of whole seconds, as in a message's stamp, and those of the ns beyond them."""
-        names, found = [bare_name(name) for name in self._form.names], {}
-        for i, name in enumerate(names):
-            parts = [f"{name.removesuffix(end)}{ns}" for end in _SECONDS if name.endswith(end) for ns in _NANOSECONDS]
-            for j in [names.index(part) for part in parts if part in names]:
-                if _rises(self._values[i] + 1e-9 * self._values[j]):
-                    found[i] = j
-        return found
-
-    @cached_property
-    def _varies(self) -> list[bool]:
-        """Whether each column holds numbers that vary and do not just increase: of a sensor."""
-        return [
-            bool((np.nanmax(x) > np.nanmin(x)) and not self._increases(i)) if np.isfinite(x).any() else False
-            for i, x in enumerate(self._values)
-        ]
+    def _unit_of_time(self, i: int) -> tuple[str, str]:
+        """Return the unit of a time, and by what: its header, or its steps."""
+        stated = self._stated(i) or _unit_word(bare_name(self._form.names[i]))
+        unit = stated if stated in TIME_UNITS else _time_unit(self._values[i])
+        return unit, "header" if stated == unit else "steps"
 
     def _timed(self, chosen: int | None) -> dict[str, Any]:
         """Return column and unit of a time, or the rate where there is none, with its reason or doubt."""
@@ -307,18 +339,15 @@ class _Table:
             else:
                 self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
             return {"rate": self._rate or 100.0}
-        if chosen in self._beyond:
-            both = self._names([chosen, self._beyond[chosen]])
+        if chosen in self._nanoseconds_of:
+            both = self._names([chosen, self._nanoseconds_of[chosen]])
             self.reasons.append(f"{self._where}{both[0]} and {both[1]} are the time, in s and ns")
             return {"time": both}
         name = self._names([chosen])[0]
         if ":" in str(self._texts[chosen][0]):
             self.reasons.append(f"{self._where}{name} is the time, as a date or clock time")
             return {"time": name}
-        full = self._form.names[chosen]
-        stated = self._stated(chosen) or _unit_word(bare_name(full))
-        unit = stated if stated in TIME_UNITS else _time_unit(self._values[chosen])
-        by = "header" if stated == unit else "steps"
+        unit, by = self._unit_of_time(chosen)
         # Another unit than these, as the 0.1 ms of Xsens's SampleTimeFine: other numbers are of something else.
         steps = 1e-9 * TIME_UNITS[unit] * _median_step(self._values[chosen]) * self._rate
         power = float(np.log10(steps)) if steps > 0.0 and by == "steps" else 0.0
@@ -364,11 +393,14 @@ class _Table:
             if "covariance" in name:
                 continue
             kind = _kind(name) or self._kind_of_units(columns)
-            is_linear = kind == "accel" and _LINEAR.search(name) is not None
-            norms = self._norms(columns) * UNITS.get(self._common_unit(columns, kind), 1.0)
+            norms, size = self._norms(columns), UNITS.get(self._common_unit(columns, kind))
             if len(norms) > 1 and not any(np.ptp(self._values[i]) for i in columns):
                 continue  # a placeholder
-            if kind == "accel" and len(norms) and lacks_gravity(norms, is_linear):
+            if (
+                kind == "accel"
+                and len(norms)
+                and (lacks_gravity(norms * (size or 1.0), size is not None) or self._is_linear(name, columns))
+            ):
                 self.doubts.append(f"{self._where}{self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
             elif kind and kind not in out:
                 out[kind] = columns
@@ -376,6 +408,18 @@ class _Table:
                 more = ", ".join(self._names(columns))
                 self.doubts.append(f"{self._where}{more} are another {kind}, not used: name them instead if meant")
         return out
+
+    def _is_linear(self, name: str, columns: Sequence[int]) -> bool:
+        """Whether a name says that gravity has been taken off, and the size does not deny it.
+
+        ROS calls linear acceleration, beside angular velocity, what has gravity in it.
+        """
+        if not _LINEAR.search(name) or self._size("accel", columns):
+            return False
+        ros = "linear_acceleration" in name and any("angular_velocity" in other for other in self._form.names)
+        return not (
+            ros and _SIZES["accel"]["m/s^2"][0] < float(np.median(self._norms(columns))) < PLAUSIBLE["accel"][1]
+        )
 
     def _kind_of_units(self, columns: Sequence[int]) -> str:
         """Return the kind of sensor that measures in the unit of three columns; empty for none."""
@@ -430,11 +474,16 @@ class _Table:
                 if not all(f"{stem}{axis}" in names for axis in axes):
                     continue
                 columns = [names.index(f"{stem}{axis}") for axis in axes]
-                moves = any(np.ptp(self._values[i][np.isfinite(self._values[i])]) for i in columns)
-                if moves and abs(float(np.median(self._norms(columns))) - 1.0) < 0.01:
-                    if axes != "wxyz":
-                        self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are taken as w, x, y, z")
-                    return columns
+                each = np.stack([self._values[i] for i in columns])
+                each = each[:, np.isfinite(each).all(axis=0)]
+                if not each.size or abs(float(np.median(np.linalg.norm(each, axis=0))) - 1.0) >= 0.01:
+                    continue
+                if each.shape[1] > 1 and not np.ptp(each, axis=1).any():
+                    self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are constant: not used")
+                    continue
+                if axes != "wxyz":
+                    self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are taken as w, x, y, z")
+                return columns
         return []
 
     def _angles(self) -> dict[str, Sequence[int]]:

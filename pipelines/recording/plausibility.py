@@ -83,15 +83,15 @@ def likely_unit(kind: str, norm: float) -> str:
     return next((unit for unit, (low, high) in _LIKELY[kind].items() if low <= norm < high), "")
 
 
-def lacks_gravity(norms: Array, is_linear: bool = False) -> bool:
-    """Whether accelerometer norms (N,), m/s^2 or g, are those of motion with gravity removed.
+def lacks_gravity(norms: Array, is_si: bool = False) -> bool:
+    """Whether accelerometer norms (N,) are those of motion with gravity removed.
 
-    `is_linear` of what is called linear acceleration, as ROS calls what has gravity in it, and phones what has not.
+    In m/s^2 if `is_si`, else in that or in g, of which both have to say so.
     """
-    norm = float(np.median(norms))
-    if norm > PLAUSIBLE["accel"][1] or any(low < norm < high for low, high in _WITH_GRAVITY):
+    norm, with_gravity = float(np.median(norms)), _WITH_GRAVITY[: 1 if is_si else 2]
+    if len(norms) < _FEWEST or norm > PLAUSIBLE["accel"][1] or any(low < norm < high for low, high in with_gravity):
         return False
-    return is_linear or bool(len(norms) >= _FEWEST and np.mean(norms < _LOW * norm) > _LOW_SHARE)
+    return bool(np.mean(norms < _LOW * norm) > _LOW_SHARE)
 
 
 def wrapped_bits(values: Array) -> int:

@@ -10,13 +10,13 @@ columns:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from alidade.factors import so3
 from alidade.factors.array import Array, Stamps
@@ -41,7 +41,6 @@ from alidade.pipelines.recording.topics import Axes, along
 
 # Rows of named columns: a text file, or the messages of a topic.
 Table = CsvFile | MessageTable
-_Two = Annotated[tuple[str, str], Field(strict=False)]
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _ThreeOrNone = Annotated[tuple[str | None, str | None, str | None], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]
@@ -71,8 +70,8 @@ class TableTopic(BaseModel):
 
     Attributes:
         file: name of the file, needed where there are several tables; or of the topic whose messages are the rows.
-        time: column of the stamps, numbers or dates as ISO 8601 has them; or two, of whole seconds and ns beyond them.
-        unit: what they count; without it what the header says, else s.
+        time: column of the stamps, numbers or dates as ISO 8601 has them; or two, of whole seconds and of nanoseconds.
+        unit: what the numbers of one column count; without it what the header says, else s.
         rate: Hz, of rows without a time.
         gyro, accel: columns of an IMU's rates and accelerations, or of one of them.
         wxyz, position: columns of a pose.
@@ -92,7 +91,7 @@ class TableTopic(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     file: str | None = None
-    time: str | _Two | None = None
+    time: str | tuple[str, ...] | None = None
     unit: Literal["s", "ms", "us", "ns"] | None = None
     rate: Annotated[float, Field(gt=0.0, le=1e6, strict=False)] | None = None
     gyro: _Three | None = None
@@ -112,6 +111,16 @@ class TableTopic(BaseModel):
     units: dict[str, str] = {}
     axes: Axes | None = None
     where: dict[str, str | float | int] = {}
+
+    @field_validator("time", mode="before")
+    @classmethod
+    def _one_or_two(cls, value: object) -> object:
+        if value is None or isinstance(value, str):
+            return value
+        names = value if isinstance(value, (list, tuple)) else ()
+        if len(names) != 2 or names[0] == names[1] or not all(isinstance(name, str) for name in names):
+            raise ValueError("must be a column, or two: of whole seconds and of nanoseconds")
+        return tuple(names)
 
     @model_validator(mode="after")
     def _complete(self) -> TableTopic:
@@ -171,15 +180,14 @@ class TableTopic(BaseModel):
         else:
             for name in self._stamps:
                 filled &= numbers_or_times(columns[name])
-            first, *beyond = (columns[name][filled] for name in self._stamps)
             unit = self._time_unit(form, notes)
-            t_ns = nanoseconds(path, first, unit) + sum(nanoseconds(path, each, "ns") for each in beyond)
+            t_ns = self._times(path, [columns[name][filled] for name in self._stamps], unit)
         values = {name: one[filled] for name, one in values.items()}
         log_ns = None if logged is None else logged[rows][filled]
         if log_ns is None:
             t_ns, values = _without_erased(path, t_ns, values, notes)
         is_slow = any(getattr(self, name) is not None for name in _SLOW)
-        if not is_slow and self.time is not None:
+        if not is_slow and isinstance(self.time, str):
             check_steps(path, topic, t_ns, unit, SLOWEST_GYRO_S if self.gyro else SLOWEST_S)
         scales = {name: self._scale(name, form, notes) for name in values}
         values = {
@@ -232,6 +240,16 @@ class TableTopic(BaseModel):
         value = getattr(self, name)
         each = [value] if isinstance(value, str) else value.values() if isinstance(value, dict) else value
         return [column for column in each if column is not None]
+
+    def _times(self, path: Path, texts: Sequence[NDArray[np.str_]], unit: str) -> Stamps:
+        """Return stamps (n,), ns, from the texts of the columns of time. Raises InputError at one that is none."""
+        t_ns = nanoseconds(path, texts[0], unit)
+        for more in texts[1:]:
+            ns = nanoseconds(path, more, "ns")
+            if (t_ns % 1_000_000_000).any() or ((ns < 0) | (ns >= 1_000_000_000)).any():
+                raise InputError(f"{path}: {' and '.join(self._stamps)} are no whole seconds and nanoseconds of these")
+            t_ns = t_ns + ns
+        return t_ns
 
     def _time_unit(self, form: TableHead, notes: list[str]) -> str:
         """Unit of time by the config, else by the header, else s."""

@@ -612,10 +612,11 @@ def widened(chain: LinearChain, levels: Sequence[Level], widening: Widening) -> 
 
 
 def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = None) -> tuple[Array, Array, int]:
-    """Information (p, p) of the shared parameters, the same by scores of blocks (p, p), and the number of blocks.
+    """Return information (p, p) of the shared parameters, covariance (p, p) of its scores, and the number of blocks.
 
-    With innovations e and their derivatives G by the shared parameters the one is G'G, the other the sum over blocks of
-    `SANDWICH_BLOCK_S` of G'e e'G, what the noise is whatever is correlated within blocks; both with the prior's.
+    With innovations e and their derivatives G by the shared parameters the one is G'G, the other, which is the same for
+    white noise, the sum over blocks of `SANDWICH_BLOCK_S` of G'e e'G, whatever is correlated within blocks. Both have
+    the prior's information.
 
     Args:
         chain: about the solution.
@@ -624,7 +625,7 @@ def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = No
     """
     p = chain.prior.shape[1] - 1
     known = chain.prior[:, :p].T @ chain.prior[:, :p]
-    information, middle, blocks = known.copy(), known.copy(), 0
+    information, of_scores, blocks = known.copy(), known.copy(), 0
     for kind, each in chain.innovations(variances, chain.limits, by_shared=True).items():
         time = chain.rows[kind].time
         G = each.whitened[..., 1:]
@@ -634,17 +635,17 @@ def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = No
         blocks = int(block.max()) + 1
         sums = np.zeros((blocks, p))
         np.add.at(sums, block, np.einsum("nmi,nm->ni", G, e))
-        middle += sums.T @ sums
-    return information, middle, blocks
+        of_scores += sums.T @ sums
+    return information, of_scores, blocks
 
 
-def sandwich(information: Array, by_scores: Array) -> tuple[Array, Array]:
-    """Nominal C and sandwich covariance C B C of parameters with information C^-1, and B by their scores.
+def sandwich(information: Array, of_scores: Array) -> tuple[Array, Array]:
+    """Return nominal and sandwich covariance from the information (p, p) and the covariance of its scores (p, p).
 
-    Liang, Zeger, Biometrika 1986.
+    C = information^-1 and C B C with B of the scores: Liang, Zeger, Biometrika 1986.
     """
     C = np.asarray(np.linalg.pinv(information, hermitian=True))
-    return C, C @ by_scores @ C
+    return C, C @ of_scores @ C
 
 
 def _shares(chain: LinearChain, levels: Sequence[Level], which: Sequence[int]) -> list[list[Array]]:
@@ -837,8 +838,8 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     """
     chain, variances = _at(compiled, levels, solution)
     reported = Reported.of(compiled, solution.values).jacobian[:, compiled.layout.sizes[3] :]
-    information, by_scores, blocks = scores(chain, variances)
-    nominal, robust = sandwich(information, by_scores)
+    information, of_scores, blocks = scores(chain, variances)
+    nominal, robust = sandwich(information, of_scores)
     above, below = (np.einsum("ri,ij,rj->r", reported, C, reported) for C in (robust, nominal))
     ratio = sigma_ratio(below, above)
     return np.where(ratio > certain_ratio(blocks), np.maximum(ratio, 1.0), 1.0)

@@ -400,8 +400,8 @@ def _solved_again(
     D = so3.right_jacobian_inverse(turn) @ (second - so3.matrix(so3.exp(-turn)) @ first)
     C, moved = joined.covariance(D), alone.covariance(D)
     step, by_motion = turn + D @ joined.shared, turn + D @ alone.shared
-    ratio_moved = _ratio(fit.chain, apart, D, first, alone.shared)
-    ratio = max(_ratio(fit.chain, fit.variances, D, first, joined.shared), ratio_moved)
+    ratio_moved, _ = sandwich_ratios(fit.chain, apart, D, first, alone.shared)
+    ratio = max(*sandwich_ratios(fit.chain, fit.variances, D, first, joined.shared), ratio_moved)
     fall = without.minus_two_log_likelihood - fit.minus_two_log_likelihood
     # Log det of the step's information is what a prior of its width would pay: no evidence for a step.
     fall -= float(np.linalg.slogdet(C)[1])
@@ -450,11 +450,13 @@ def _leads_to(rows: Rows, keyframe: int) -> Mask:
     return np.asarray(rows.states[1][0] == keyframe)
 
 
-def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, mount: Array, at: Array) -> float:
-    """Largest ratio of sandwich to nominal sigma, at least 1, over all directions of a step, and of the mount with it.
+def sandwich_ratios(
+    chain: LinearChain, variances: Sequence[Array], D: Array, mount: Array, at: Array
+) -> tuple[float, float]:
+    """Return the largest ratios of sandwich to nominal sigma of a step, and of the mount with the step held fixed.
 
     Near an end few blocks determine the step; errors there are correlated as in all of them, which determine the mount
-    where the step is held fixed.
+    where the step is known. Of all directions of each; at least 1.
 
     Args:
         chain: about the solution without `at`.
@@ -462,16 +464,16 @@ def _ratio(chain: LinearChain, variances: Sequence[Array], D: Array, mount: Arra
         D, mount: Jacobians (3, p) of the step and of the mount before it by the shared parameters.
         at: (p,) the solution.
     """
-    information, by_scores, _ = scores(chain, variances, at)
+    information, of_scores, _ = scores(chain, variances, at)
     fixed = np.linalg.qr(D.T, mode="complete")[0][:, len(D) :]
-    held = sandwich(*(fixed.T @ each @ fixed for each in (information, by_scores)))
-    return max(1.0, _largest(D, *sandwich(information, by_scores)), _largest(mount @ fixed, *held))
+    held = sandwich(*(fixed.T @ each @ fixed for each in (information, of_scores)))
+    return _largest(D, *sandwich(information, of_scores)), _largest(mount @ fixed, *held)
 
 
 def _largest(J: Array, nominal: Array, robust: Array) -> float:
-    """Largest ratio of robust to nominal sigma over all directions of numbers with Jacobian J by the unknowns."""
+    """Largest ratio of robust to nominal sigma, at least 1, over all directions of numbers with Jacobian J."""
     root = np.linalg.inv(np.linalg.cholesky(J @ nominal @ J.T))
-    return float(np.linalg.eigvalsh(root @ J @ robust @ J.T @ root.T)[-1]) ** 0.5
+    return max(1.0, float(np.linalg.eigvalsh(root @ J @ robust @ J.T @ root.T)[-1]) ** 0.5)
 
 
 def split(

@@ -188,6 +188,59 @@ CASES = {
             "/attitude": {"time": "mocap_time", "wxyz": ["qw", "qx", "qy", "qz"]},
         },
     ),
+    "one clock in two forms": (
+        "t,gx,gy,gz,unix_time,uptime_ms,qw,qx,qy,qz",
+        (SECONDS, RATES, 1.79e9 + SECONDS, 1e3 * SECONDS + 250.0, ATTITUDES),
+        {
+            "/imu": {"time": "t", "gyro": ["gx", "gy", "gz"]},
+            "/attitude": {"time": "t", "wxyz": ["qw", "qx", "qy", "qz"]},
+        },
+    ),
+    "messages of two topics as PlotJuggler exports them, by the alphabet": (
+        ",".join(
+            [
+                "__time",
+                *(f"/imu/angular_velocity/{axis}" for axis in "xyz"),
+                "/imu/header/stamp/nanosec,/imu/header/stamp/sec",
+                *(f"/imu/linear_acceleration/{axis}" for axis in "xyz"),
+                "/mag/header/stamp",
+                *(f"/mag/magnetic_field/{axis}" for axis in "xyz"),
+            ]
+        ),
+        (
+            0.05 + SECONDS,
+            RATES,
+            np.rint(1e9 * (SECONDS % 1.0)),
+            SECONDS // 1.0,
+            15.0 * DIRECTIONS,
+            SECONDS + 0.002,
+            5e-5 * DIRECTIONS,
+        ),
+        {
+            "/imu": {
+                "time": ["/imu/header/stamp/sec", "/imu/header/stamp/nanosec"],
+                "gyro": [f"/imu/angular_velocity/{axis}" for axis in "xyz"],
+                "accel": [f"/imu/linear_acceleration/{axis}" for axis in "xyz"],
+            },
+            "/mag": {"time": "/mag/header/stamp", "field": [f"/mag/magnetic_field/{axis}" for axis in "xyz"]},
+        },
+    ),
+    "the whole time in seconds and in nanoseconds": (
+        "time_sec,time_nsec,gx,gy,gz",
+        (SECONDS, np.rint(1e9 * SECONDS), RATES),
+        {"/imu": {"time": "time_sec", "gyro": ["gx", "gy", "gz"]}},
+    ),
+    "a logger whose attitude is off": (
+        "t,gx,gy,gz,qw,qx,qy,qz",
+        (SECONDS, RATES, np.full((N, 4), np.nan)),
+        {"/imu": {"time": "t", "gyro": ["gx", "gy", "gz"]}},
+    ),
+    "user acceleration in g": (
+        "t,userAccelerationX (G),userAccelerationY (G),userAccelerationZ (G)",
+        (SECONDS, 0.065 * RNG.normal(size=(N, 3))),
+        {},
+    ),
+    "free acceleration, fast": ("t,FreeAcc_X,FreeAcc_Y,FreeAcc_Z", (SECONDS, 14.0 * DIRECTIONS), {}),
     "a gyro and an accelerometer with a time each": (
         "t_gyro,gx,gy,gz,t_acc,ax,ay,az",
         (SECONDS, RATES, 1.03 * SECONDS + 0.5, 9.81 * DIRECTIONS),
@@ -317,6 +370,14 @@ def test_units_in_a_header_say_what_columns_are(tmp_path: Path) -> None:
     assert found is not None
     assert found.columns["/imu"].gyro == ("rate_p(deg/s)", "rate_q(deg/s)", "rate_r(deg/s)")
     assert found.columns["/imu"].time == "epoch_ms"
+
+
+def test_an_attitude_that_never_moves_is_not_used_and_that_is_written(tmp_path: Path) -> None:
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (N, 1))
+    found = propose_columns(open_recording(write(tmp_path / "a.csv", "t,gx,gy,gz,qx,qy,qz,qw", SECONDS, RATES, still)))
+    assert found is not None
+    assert list(found.columns) == ["/imu"]
+    assert "qw, qx, qy, qz are constant: not used" in found.doubts
 
 
 def test_fast_motion_in_g_is_not_gravity_taken_off(tmp_path: Path) -> None:

@@ -147,6 +147,18 @@ def test_what_stands_for_no_number_is_none_and_a_last_row_that_is_cut_is_left_ou
             "columns: {/mag: {time: [t, mx], unit: us, field: [mx, my, mz]}}",
             "unit goes with one column of time",
         ),
+        (
+            [HEADER, *rows()],
+            "columns: {/mag: {time: [t, mx], field: [mx, my, mz]}}",
+            "are no whole seconds and nanosec",
+        ),
+        (
+            [HEADER, *rows()],
+            "columns: {/mag: {time: [t, t], field: [mx, my, mz]}}",
+            "must be a column, or two: of whole",
+        ),
+        ([HEADER, *rows()], "columns: {/mag: {time: [t], field: [mx, my, mz]}}", "must be a column, or two: of whole"),
+        ([HEADER, *rows()], "columns: {/mag: {time: 5, field: [mx, my, mz]}}", "must be a column, or two: .*, not 5"),
         (["1 January", "no numbers here"], CONFIG, "no line of numbers in it"),
         ([HEADER, *rows(",", ",")], CONFIG, "commas separate columns and mark decimals, 4 names over 8 cells"),
     ],

@@ -113,6 +113,17 @@ def test_innovations_are_white_and_of_unit_variance() -> None:
     assert abs((e[1:] * e[:-1]).mean()) < 4.0 * n**-0.5
 
 
+@pytest.mark.parametrize("share", [1e-8, 1e-12])
+def test_measurements_may_be_far_better_than_what_is_predicted(share: float) -> None:
+    """Attitudes rounded to 0.01 that rest: rounding once took positive covariances away, and the command stopped."""
+    linear, levels = chain()
+    variances = linear.variances(levels)
+    better = [v * (share if len(rows.states) == 1 else 1.0) for v, rows in zip(variances, linear.rows, strict=True)]
+    (found,) = linear.innovations(better, [np.inf] * len(linear.rows)).values()
+    assert np.isfinite(found.whitened).all()
+    np.testing.assert_allclose(np.square(found.whitened[..., 0]).sum(axis=1), found.squares)
+
+
 def test_glitches_are_widened_and_nothing_is_left_out() -> None:
     data, _ = simulate_head(SCENARIO.model_copy(update={"duration_s": 15.0}), 1)
     wxyz = data.vision_wxyz.copy()

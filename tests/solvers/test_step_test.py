@@ -20,9 +20,9 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, head_config,
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.marginal_likelihood import LinearChain
+from alidade.pipelines.solvers.marginal_likelihood import LinearChain, sandwich, scores
 from alidade.pipelines.solvers.robust import solve_robust
-from alidade.pipelines.solvers.step_test import STEP_PRIOR, scan, split
+from alidade.pipelines.solvers.step_test import STEP_PRIOR, sandwich_ratios, scan, split
 
 DURATION_S = 30.0
 SCENARIO = HeadScenario.model_validate(
@@ -102,6 +102,30 @@ def test_the_scan_is_exact() -> None:
         apart = by_motion - moved
         assert tested.apart[i] == pytest.approx(apart @ np.linalg.solve(C, apart), rel=1e-3, abs=1e-6)
     assert STEP_PRIOR == 0.35
+
+
+def test_with_the_step_held_fixed_the_mount_is_as_sure_as_without_one() -> None:
+    """However near the end: its ratio of sandwich to nominal sigma is that of the chain in which nothing steps."""
+    compiled = Compiled.of(problem(recorded(1)), "chain")
+    engine = compiled.engine
+    assert isinstance(engine, Linearization)
+    values = solve_robust(engine, compiled.initial, compiled.problem.loss).values
+    chain, key = LinearChain.of(engine, values), compiled.problem.step_candidates[0]
+    variances = chain.variances(compiled.problem.noises)
+    mount = engine.layout.root_columns(key)[:, engine.layout.sizes[3] :]
+    nominal, robust = sandwich(*scores(chain, variances)[:2])
+    inverse = np.linalg.inv(np.linalg.cholesky(mount @ nominal @ mount.T))
+    ratios = np.linalg.eigvalsh(inverse @ mount @ robust @ mount.T @ inverse.T) ** 0.5
+    of_steps = []
+    for time in (15.0, DURATION_S - 1.5):
+        with_step = LinearChain.of(*split(engine, values, key, time, np.zeros(3))[:2])
+        p = with_step.prior.shape[1] - 1
+        first = np.pad(mount, ((0, 0), (0, 3)))
+        D = np.eye(p)[-3:] - first
+        of_step, of_mount = sandwich_ratios(with_step, variances, D, first, np.zeros(p))
+        assert of_mount == pytest.approx(max(1.0, ratios[-1]), rel=1e-4)
+        of_steps.append(of_step)
+    assert abs(of_steps[0] - of_steps[1]) > 0.01
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
