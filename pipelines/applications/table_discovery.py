@@ -11,7 +11,6 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
@@ -19,24 +18,16 @@ from typing import Any
 import numpy as np
 
 from alidade.factors.array import Array
+from alidade.pipelines.applications.table_times import Times
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
-from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
+from alidade.pipelines.recording.checks import MAX_RATE_RAD_S
 from alidade.pipelines.recording.message_tables import message_tables
 from alidade.pipelines.recording.messages import IMU
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, PLAUSIBLE, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import Table, TableTopic, tables_of
-from alidade.pipelines.recording.table_values import (
-    COMPATIBLE,
-    TIME_NAME,
-    TIME_UNITS,
-    UNITS,
-    bare_name,
-    unit_hinted,
-    unit_named,
-    unit_of,
-)
+from alidade.pipelines.recording.table_values import COMPATIBLE, UNITS, bare_name, unit_of
 from alidade.pipelines.recording.tables import numbers
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
@@ -50,8 +41,6 @@ _WORDS = {
 # SI units of the sensors.
 _SI = {"gyro": "rad/s", "accel": "m/s^2", "field": "T"}
 _LINEAR = re.compile(r"lin|free|user|without.?g|gravity|acceleration.?no.?g")
-# In a preamble: a rate by name, or, as Vicon's, a number alone in its line.
-_RATE = re.compile(r"(?:rate|\bfs\b|freq\w*|sampling)\W*(\d+(?:\.\d+)?)|^(\d+(?:\.\d+)?)\W*$", re.IGNORECASE)
 _VISION = re.compile(r"vision|visual|pose|mocap|vicon|optitrack|tracker|ground|trajectory")
 # Median norms, in a unit; of an accelerometer gravity, of a magnetometer the earth's field and some iron.
 _SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
@@ -71,17 +60,8 @@ _PLACE = (r"^lat", r"^lon|^lng")
 _LOS_ERRORS = (r"^el\w*err|^err\w*_el", r"^az\w*err|^err\w*_az")
 _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
 _QUATERNION = "q|quat|orientation|rot|attitude"
-# Endings of a stamp's whole seconds, and of the nanoseconds to be added; a message's stamp, after its topic's name.
-_SECONDS, _NANOSECONDS = ("secs", "sec", "seconds"), ("nsecs", "nsec", "nanosec", "nanoseconds")
-_STAMP = re.compile(r"(.*?)header\W+stamp")
-# Rows in which two times are compared, at least.
-_FEWEST_TIMES = 10
-# Unix time of the years 1985 to 2128, s.
-_UNIX_S = (0.5e9, 5e9)
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
 _TURNED = 0.1
-# Rates by steps and by a preamble are alike up to this power of ten, 5 %.
-_ALIKE = 0.02
 # Rows looked at.
 _ROWS = 20_000
 # Rates beyond a gyro's in rad/s are in deg/s up to what a gyro of 4000 deg/s may read on three axes; beyond, counts.
@@ -178,16 +158,13 @@ class _Table:
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
-        rate = next((found for line in self._form.preamble if (found := _RATE.search(line))), None)
-        self._rate = float(rate[rate.lastindex or 0]) if rate else 0.0  # Hz, by its preamble
         texts, *_ = table.read(names, _ROWS)
         self._texts = list(texts.values())
         self._values = [self._numbers(i) for i in range(len(names))]
-        self._clocks: dict[int | None, dict[str, Any]] = {}
+        self._times = Times(self._form, self._texts, self._values, self._where, self.reasons, self.doubts)
 
     def topics(self) -> dict[str, TableTopic]:
         """Return topic -> its columns."""
-        times = self._times()
         triads = self._triads()
         named = {kind: columns for kind, columns in triads.items() if kind in _WORDS}
         out: dict[str, TableTopic] = {}
@@ -195,48 +172,48 @@ class _Table:
         def add(topic: str, of: Sequence[int], **given: Any) -> None:
             chosen = {key: value for key, value in given.items() if value}
             try:
-                out[topic] = TableTopic(file=self._file, **self._time_of(of, times), **chosen)
+                out[topic] = TableTopic(file=self._file, **self._times.of(of), **chosen)
             except ValueError as error:
                 self.doubts.append(f"{self._where}{topic}: {error}")
 
-        clocks = {kind: self._time_of(columns, times) for kind, columns in named.items()}
+        clocks = {kind: self._times.of(columns) for kind, columns in named.items()}
         units = {kind: self._unit(kind, columns) for kind, columns in named.items()}
         imu = {kind: columns for kind, columns in named.items() if kind != "field"}
         together = all(clocks[kind] == clocks[other] for kind, other in pairwise(imu))
         alone = {"gyro": "/imu/gyro", "accel": "/imu/accel"} if self._file or not together else {}
         for kinds in filter(None, [list(imu)] if together else [[kind] for kind in imu]):
             own = {kind: units[kind] for kind in kinds if units[kind] and UNITS[units[kind]] != 1.0}
-            given = {kind: self._names(imu[kind]) for kind in kinds}
+            given = {kind: self._form.called(imu[kind]) for kind in kinds}
             add(alone.get("".join(kinds), "/imu"), imu[kinds[0]], **given, units=own)
         if "field" in named:
             unit, field = units["field"], named["field"]
             own = {"field": unit} if unit and UNITS[unit] != 1.0 else {}
-            add("/mag", field, field=self._names(field), units=own)
+            add("/mag", field, field=self._form.called(field), units=own)
         attitude = "/vision/attitude" if _VISION.search(self.path.stem.lower()) else "/attitude"
         if wxyz := self._quaternion():
-            add(attitude, wxyz, wxyz=self._names(wxyz))
+            add(attitude, wxyz, wxyz=self._form.called(wxyz))
         for key, angles in self._angles().items() if not wxyz else ():
             unit = self._unit(key, angles)
-            add(attitude, angles, **{key: self._names(angles)}, units={key: unit} if unit == "deg" else {})
+            add(attitude, angles, **{key: self._form.called(angles)}, units={key: unit} if unit == "deg" else {})
         errors = self._first_of(_LOS_ERRORS)
         if len(errors) == len(_LOS_ERRORS):
-            (x, z), unit = self._names(errors), self._common_unit(errors)
+            (x, z), unit = self._form.called(errors), self._common_unit(errors)
             self.doubts.append(f"{self._where}{x} and {z} are angles, in {unit or 'rad'}, about x and z")
             add("/los/error", errors, vector=[x, None, z], units={"vector": unit} if unit in ("deg", "mrad") else {})
         for topic, joints in _JOINTS.items():
             there = self._first_of([rf"^{joint}" for joint in joints])
             if len(there) == len(joints):
-                named_so = dict(zip(joints, self._names(there), strict=True))
+                named_so = dict(zip(joints, self._form.called(there), strict=True))
                 add(topic, there, joints=named_so, units={"joints": "deg"} if self._common_unit(there) == "deg" else {})
         if len(place := self._first_of(_PLACE)) == len(_PLACE):
-            latitude, longitude = self._names(place)
-            height = next(iter(self._names(self._first_of([r"^(alt|height|elev)"]))), "")
+            latitude, longitude = self._form.called(place)
+            height = next(iter(self._form.called(self._first_of([r"^(alt|height|elev)"]))), "")
             add("/fix", place, latitude_deg=latitude, longitude_deg=longitude, height=height)
         for topic, table in out.items():
             has = [kind for kind in (*_WORDS, *_OTHERS) if getattr(table, kind)]
             self.reasons.append(f"{self._where}{topic} has {' and '.join(has)}")
         if not out:
-            self._described_time(next(iter(times), None))
+            self._times.of([0])
             self.doubts.append(f"{self._where}nothing known in {', '.join(self._form.names[:20])}")
         return out
 
@@ -246,134 +223,22 @@ class _Table:
         except InputError:
             return np.full(len(self._texts[i]), np.nan)
 
-    def _names(self, columns: Sequence[int]) -> list[str]:
-        """Return the names of columns, numbers in place of names that occur twice."""
-        names = self._form.names
-        return [names[i] if names.count(names[i]) == 1 else f"column {i + 1}" for i in columns]
-
     def _first_of(self, words: Sequence[str]) -> list[int]:
         """Return the first column that each word is in the name of, without those that are in none."""
         names = [bare_name(name) for name in self._form.names]
         found = (next((i for i, name in enumerate(names) if re.search(word, name)), None) for word in words)
         return [i for i in found if i is not None]
 
-    def _times(self) -> list[int]:
-        """Return the columns that are times: increasing ones, by their names; without names the first column."""
-        later = self._nanoseconds_of.values()
-        increasing = [i for i in range(len(self._values)) if self._increases(i) and i not in later]
-        called = {i for i in increasing if TIME_NAME.search(bare_name(self._form.names[i]))}
-        times = sorted(called | self._nanoseconds_of.keys())
-        times += [i for i in increasing if self._stated(i) in TIME_UNITS and i not in times]
-        if not times and self._form.names[0] == "column 1" and increasing[:1] == [0]:
-            return [0]
-        if not times:
-            still = [name for name in self._form.names if TIME_NAME.search(bare_name(name))]
-            self.doubts += [f"{self._where}{name} is no time: it does not increase from row to row" for name in still]
-        return times
-
-    def _time_of(self, columns: Sequence[int], times: Sequence[int]) -> dict[str, Any]:
-        """Return column and unit of a sensor's time, or its rate.
-
-        The stamp of its message if there is one; else the last time before its columns, if that is another clock than
-        the table's first time, as of devices side by side.
-        """
-        names = [bare_name(name) for name in self._form.names]
-        stamps = {i: found[1] for i in times if (found := _STAMP.match(names[i]))}
-        own = [i for i, prefix in stamps.items() if names[columns[0]].startswith(prefix)]
-        if own or not times:
-            return self._described_time(next(iter(own), None))
-        last = max((i for i in times if i < min(columns)), default=times[0])
-        if not self._is_another_clock(times[0], last):
-            return self._described_time(times[0])
-        return self._described_time(next(i for i in times if i == last or not self._is_another_clock(i, last)))
-
-    def _is_another_clock(self, i: int, other: int) -> bool:
-        """Whether two times differ by more than a constant, and have more than half of the longer one in common."""
-        if i == other or np.isfinite(self._values[i] + self._values[other]).sum() < _FEWEST_TIMES:
-            return False  # nor are dates compared
-        a, b = self._seconds(i), self._seconds(other)
-        if np.nanstd(b - a) < 0.5 * _median_step(a):
-            return False
-        (first, last), (begin, end) = ((np.nanmin(x), np.nanmax(x)) for x in (a, b))
-        return bool(min(last, end) - max(first, begin) > 0.5 * max(last - first, end - begin))
-
-    def _seconds(self, i: int) -> Array:
-        """Times of a column, s."""
-        if i in self._nanoseconds_of:
-            return np.asarray(self._values[i] + 1e-9 * self._values[self._nanoseconds_of[i]])
-        return np.asarray(self._values[i] * (1e-9 * TIME_UNITS[self._unit_of_time(i)[0]]))
-
-    @cached_property
-    def _nanoseconds_of(self) -> dict[int, int]:
-        """Columns of whole seconds, as of a message's stamp, and the columns of the nanoseconds to be added."""
-        names, found = [bare_name(name) for name in self._form.names], {}
-        for i, name in enumerate(names):
-            parts = {f"{name.removesuffix(end)}{ns}" for end in _SECONDS if name.endswith(end) for ns in _NANOSECONDS}
-            near = sorted((abs(j - i), j) for j, other in enumerate(names) if other in parts)
-            if not near:
-                continue
-            _, j = near[0]
-            both = np.stack([self._values[i], self._values[j]])
-            seconds, ns = both[:, np.isfinite(both).all(axis=0)]
-            if (seconds == np.rint(seconds)).all() and ((ns >= 0.0) & (ns < 1e9)).all() and _rises(seconds + 1e-9 * ns):
-                found[i] = j
-        return found
-
-    def _described_time(self, chosen: int | None) -> dict[str, Any]:
-        """Return column and unit of a time, or the rate where there is none; its reason or doubt is given once."""
-        if chosen not in self._clocks:
-            self._clocks[chosen] = self._timed(chosen)
-        return self._clocks[chosen]
-
-    def _unit_of_time(self, i: int) -> tuple[str, str]:
-        """Return the unit of a time, and by what: its header, or its steps."""
-        stated = self._stated(i) or _unit_word(bare_name(self._form.names[i]))
-        unit = stated if stated in TIME_UNITS else _time_unit(self._values[i])
-        return unit, "header" if stated == unit else "steps"
-
-    def _timed(self, chosen: int | None) -> dict[str, Any]:
-        """Return column and unit of a time, or the rate where there is none, with its reason or doubt."""
-        if chosen is None:
-            if self._rate:
-                self.reasons.append(f"{self._where}no column of time; {self._rate:g} Hz by its preamble")
-            else:
-                self.doubts.append(f"{self._where}no column of time: 100 Hz is assumed; correct `rate`")
-            return {"rate": self._rate or 100.0}
-        if chosen in self._nanoseconds_of:
-            both = self._names([chosen, self._nanoseconds_of[chosen]])
-            self.reasons.append(f"{self._where}{both[0]} and {both[1]} are the time, in s and ns")
-            return {"time": both}
-        name = self._names([chosen])[0]
-        if ":" in str(self._texts[chosen][0]):
-            self.reasons.append(f"{self._where}{name} is the time, as a date or clock time")
-            return {"time": name}
-        unit, by = self._unit_of_time(chosen)
-        # Another unit than these, as the 0.1 ms of Xsens's SampleTimeFine: other numbers are of something else.
-        steps = 1e-9 * TIME_UNITS[unit] * _median_step(self._values[chosen]) * self._rate
-        power = float(np.log10(steps)) if steps > 0.0 and by == "steps" else 0.0
-        if round(power) != 0 and abs(power - round(power)) < _ALIKE:
-            self.doubts.append(f"{self._where}{name} is in no known unit by the preamble's {self._rate:g} Hz: not used")
-            return self._timed(None)
-        self.reasons.append(f"{self._where}{name} is the time, in {unit} by its {by}")
-        return {"time": name} if unit == "s" else {"time": name, "unit": unit}
-
-    def _stated(self, i: int) -> str:
-        """Return the unit of column `i` by its header; empty where there is none."""
-        return self._form.units[i] or unit_hinted(self._form.names[i])
-
     def _common_unit(self, columns: Sequence[int], kind: str = "") -> str:
         """Return the unit that all columns have by their header, as a kind of sensor's; empty where they differ."""
-        stated = {unit_of(kind, self._stated(i)) for i in columns}
+        stated = {unit_of(kind, self._form.stated_unit(i)) for i in columns}
         return stated.pop() if len(stated) == 1 else ""
-
-    def _increases(self, i: int) -> bool:
-        return ":" in str(self._texts[i][0] if len(self._texts[i]) else "") or _rises(self._values[i])
 
     def _triads(self) -> dict[str, tuple[int, ...]]:
         """Return kind -> columns along x, y, z: by names, as a file's only three, or, without a header, by numbers."""
         out: dict[str, tuple[int, ...]] = {}
         along = _along_axes(self._form.names)
-        first = 1 if self._increases(0) else 0
+        first = 1 if self._times.increases(0) else 0
         if self._form.names[0] == "column 1" and len(self._values) == first + 3 and _kind(self.path.stem.lower()):
             along = [("", (first, first + 1, first + 2))]
             self.doubts.append(f"{self._where}no header: the sensor is that of the file's name")
@@ -405,7 +270,7 @@ class _Table:
             elif kind and kind not in out:
                 out[kind] = columns
             elif kind:
-                more = ", ".join(self._names(columns))
+                more = ", ".join(self._form.called(columns))
                 self.doubts.append(f"{self._where}{more} are another {kind}, not used: name them instead if meant")
         return out
 
@@ -479,10 +344,10 @@ class _Table:
                 if not each.size or abs(float(np.median(np.linalg.norm(each, axis=0))) - 1.0) >= 0.01:
                     continue
                 if each.shape[1] > 1 and not np.ptp(each, axis=1).any():
-                    self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are constant: not used")
+                    self.doubts.append(f"{self._where}{', '.join(self._form.called(columns))} are constant: not used")
                     continue
                 if axes != "wxyz":
-                    self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are taken as w, x, y, z")
+                    self.doubts.append(f"{self._where}{', '.join(self._form.called(columns))} are taken as w, x, y, z")
                 return columns
         return []
 
@@ -496,43 +361,13 @@ class _Table:
             key, how = "rotation_vector", "axis times angle"
         if not columns:
             return {}
-        self.doubts.append(f"{self._where}{', '.join(self._names(columns))} are {how}")
+        self.doubts.append(f"{self._where}{', '.join(self._form.called(columns))} are {how}")
         return {key: columns}
-
-
-def _rises(values: Array) -> bool:
-    """Whether numbers increase as times do: a counter may run over, a logger start again, two sensors share a stamp."""
-    steps = np.diff(values[np.isfinite(values)])
-    return len(steps) > 2 and bool(np.mean(steps >= 0.0) > 0.99) and bool(np.mean(steps > 0.0) > 0.4)
 
 
 def _kind(name: str) -> str:
     """Return the kind of sensor that a lower-case name mentions; empty for none."""
     return next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
-
-
-def _unit_word(name: str) -> str:
-    """Return the unit of time that is a word of a name (millis, seconds_elapsed); empty for none."""
-    words = (unit_named(word) for word in re.split(r"[_ ]", name))
-    return next((unit for unit in words if unit in TIME_UNITS), "")
-
-
-def _time_unit(values: Array) -> str:
-    """Return the unit of times: by their size where they are Unix times, else by their median step."""
-    step, values = _median_step(values), values[np.isfinite(values)]
-    for unit, size in TIME_UNITS.items():
-        second = 1e9 / size
-        if _UNIX_S[0] * second < float(np.median(values)) < _UNIX_S[1] * second and step < SLOWEST_S * second:
-            return unit
-    if step < 0.9:
-        return "s"
-    return "ms" if step < 500.0 else "us" if step < 5e5 else "ns"
-
-
-def _median_step(values: Array) -> float:
-    """Return the median step of times; 0 without any."""
-    steps = np.diff(values[np.isfinite(values)])
-    return float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
 
 
 def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:

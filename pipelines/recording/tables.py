@@ -23,7 +23,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
-from alidade.pipelines.recording.table_values import TIME_NAME, bare_name, nanoseconds, unit_in, unit_named
+from alidade.pipelines.recording.table_values import TIME_NAME, bare_name, nanoseconds, unit_hinted, unit_in, unit_named
 
 # Texts of a table's cells by the names of their columns.
 Columns = dict[str, NDArray[np.str_]]
@@ -77,6 +77,14 @@ class TableHead:
             places = " and ".join(f"`column {i + 1}`" for i in found)
             raise InputError(f"{self.path}: {len(found)} columns are called {name}; name one of them as {places}")
         return found[0]
+
+    def called(self, columns: Sequence[int]) -> list[str]:
+        """Return what `index` finds columns by: names, and numbers in place of names that occur twice."""
+        return [self.names[i] if self.names.count(self.names[i]) == 1 else f"column {i + 1}" for i in columns]
+
+    def stated_unit(self, i: int) -> str:
+        """Return the unit of a column by the header; empty where there is none."""
+        return self.units[i] or unit_hinted(self.names[i])
 
 
 @dataclass(frozen=True)

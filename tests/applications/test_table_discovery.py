@@ -372,6 +372,19 @@ def test_units_in_a_header_say_what_columns_are(tmp_path: Path) -> None:
     assert found.columns["/imu"].time == "epoch_ms"
 
 
+def test_rows_of_two_devices_by_turns_have_the_time_of_their_own(tmp_path: Path) -> None:
+    lines = ["imu_time,gx,gy,gz,mocap_time,qw,qx,qy,qz"]
+    for t, rates, wxyz in zip(SECONDS, RATES, ATTITUDES, strict=True):
+        lines += [f"{t},{','.join(map(str, rates))},,,,,", f",,,,{t + 0.003},{','.join(map(str, wxyz))}"]
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    found = propose_columns(open_recording(tmp_path / "a.csv"))
+    assert found is not None
+    assert {topic: table.time for topic, table in found.columns.items()} == {
+        "/imu": "imu_time",
+        "/attitude": "mocap_time",
+    }
+
+
 def test_an_attitude_that_never_moves_is_not_used_and_that_is_written(tmp_path: Path) -> None:
     still = np.tile([0.0, 0.0, 0.0, 1.0], (N, 1))
     found = propose_columns(open_recording(write(tmp_path / "a.csv", "t,gx,gy,gz,qx,qy,qz,qw", SECONDS, RATES, still)))
