@@ -545,8 +545,8 @@ class StepEstimate:
         fall: of -2 log L with the step and noise levels found anew, less what a wide prior of it pays.
         by_motion: chi-square of the step by motion alone: the attitude is free to jump with it.
         apart: chi-square of the difference of both steps.
-        ratio: of sandwich to nominal sigmas, the largest of any direction of both, and of the parameter with the step
-            held fixed, at least 1.
+        ratio: of sandwich to nominal sigmas, the largest of any direction of both, near an end also of the parameter
+            with the step held fixed, at least 1.
         ratio_by_motion: of the step by motion alone.
         jumped: whether vision jumps by three sigmas, and does not come back soon.
     """

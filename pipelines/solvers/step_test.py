@@ -35,6 +35,7 @@ from alidade.pipelines.solvers.levenberg import Solution
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import (
     NO_SAY,
+    SANDWICH_BLOCK_S,
     LikelihoodMaximum,
     LinearChain,
     Rows,
@@ -401,7 +402,11 @@ def _solved_again(
     C, moved = joined.covariance(D), alone.covariance(D)
     step, by_motion = turn + D @ joined.shared, turn + D @ alone.shared
     ratio_moved, _ = sandwich_ratios(fit.chain, apart, D, first, alone.shared)
-    ratio = max(*sandwich_ratios(fit.chain, fit.variances, D, first, joined.shared), ratio_moved)
+    of_step, of_mount = sandwich_ratios(fit.chain, fit.variances, D, first, joined.shared)
+    times = np.concatenate([rows.time for rows in fit.chain.rows if rows.is_measurement])
+    short = min(found.time[i] - times.min(), times.max() - found.time[i]) < SANDWICH_BLOCK_S
+    # A side shorter than a block has no scores of its own: its errors are correlated as everywhere.
+    ratio = max(of_step, ratio_moved, of_mount if short else 1.0)
     fall = without.minus_two_log_likelihood - fit.minus_two_log_likelihood
     # Log det of the step's information is what a prior of its width would pay: no evidence for a step.
     fall -= float(np.linalg.slogdet(C)[1])
@@ -455,8 +460,8 @@ def sandwich_ratios(
 ) -> tuple[float, float]:
     """Return the largest ratios of sandwich to nominal sigma of a step, and of the mount with the step held fixed.
 
-    Near an end few blocks determine the step; errors there are correlated as in all of them, which determine the mount
-    where the step is known. Of all directions of each; at least 1.
+    The latter is that of the errors of all blocks, also where one side of the step has none of its own. Of all
+    directions of each; at least 1.
 
     Args:
         chain: about the solution without `at`.

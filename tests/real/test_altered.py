@@ -50,11 +50,7 @@ def _correlated(t: Array, sigma: float, length: float, seed: int) -> Array:
     [
         ("30_disturbed_stationary_magnet_C", 80.0, 0.1, 0),
         pytest.param("28_disturbed_stationary_magnet_A", 80.0, 0.1, 2, marks=pytest.mark.slow),
-        pytest.param("28_disturbed_stationary_magnet_A", 80.0, 2.0, 2, marks=pytest.mark.slow),
         pytest.param("28_disturbed_stationary_magnet_A", 80.0, 2.0, 3, marks=pytest.mark.slow),
-        pytest.param("30_disturbed_stationary_magnet_C", 80.0, 2.0, 0, marks=pytest.mark.slow),
-        pytest.param("30_disturbed_stationary_magnet_C", 36.0, 2.0, 1, marks=pytest.mark.slow),
-        pytest.param("30_disturbed_stationary_magnet_C", 36.0, 2.0, 2, marks=pytest.mark.slow),
     ],
 )
 def test_correlated_errors_of_vision_are_no_slip(
