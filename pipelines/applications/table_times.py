@@ -1,4 +1,4 @@
-"""Times of a table's rows: which columns are times, in which unit, and which of them a sensor's are."""
+"""Times of a table's rows: which columns hold times, in which unit, and which one dates a sensor's readings."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Times:
     _given: dict[int | None, dict[str, Any]] = field(default_factory=dict)
 
     def increases(self, i: int) -> bool:
-        """Whether a column increases as times do; dates and times of the day are taken for such."""
+        """Whether a column's numbers increase from row to row as times do, or are dates or times of day."""
         return ":" in str(self.texts[i][0] if len(self.texts[i]) else "") or _rises(self.values[i])
 
     @cached_property
@@ -132,7 +132,7 @@ class Times:
         return self._given[chosen]
 
     def _unit_of_time(self, i: int) -> tuple[str, str]:
-        """Return the unit of a time, and by what: its header, or its steps."""
+        """Return the time unit of a column (s, ms, us, ns), and whether its header or its steps tell it."""
         stated = self.form.stated_unit(i) or _unit_word(bare_name(self.form.names[i]))
         unit = stated if stated in TIME_UNITS else _time_unit(self.values[i])
         return unit, "header" if stated == unit else "steps"
@@ -173,7 +173,7 @@ def _rises(values: Array) -> bool:
 
 
 def _unit_word(name: str) -> str:
-    """Return the unit of time that is a word of a name (millis, seconds_elapsed); empty for none."""
+    """Return the time unit (s, ms, us, ns) that a column's name spells as a word, as `millis`; empty for none."""
     words = (unit_named(word) for word in re.split(r"[_ ]", name))
     return next((unit for unit in words if unit in TIME_UNITS), "")
 

@@ -218,7 +218,7 @@ class TableTopic(BaseModel):
 
     @property
     def _stamps(self) -> list[str]:
-        """Columns of the stamps; none of rows at a rate."""
+        """Names of the columns that hold the rows' stamps; empty for rows at a constant rate."""
         return [self.time] if isinstance(self.time, str) else [*(self.time or ())]
 
     @property

@@ -382,7 +382,7 @@ def _length(step: Array, covariance: Array) -> tuple[float, float]:
 def _solved_again(
     without: _Fit, base: _Fit, outliers: Widening, transient: Widening, parameter: Parameter, found: Scan, i: int
 ) -> StepEstimate:
-    """Re-estimate with a step at candidate i, noise levels and widening included.
+    """Estimate a rotation's step at candidate i of a scan anew, noise levels and widening included.
 
     Raises:
         IndeterminateStateError, numpy.linalg.LinAlgError: undetermined with the step.
@@ -458,7 +458,7 @@ def _leads_to(rows: Rows, keyframe: int) -> Mask:
 def sandwich_ratios(
     chain: LinearChain, variances: Sequence[Array], D: Array, mount: Array, at: Array
 ) -> tuple[float, float]:
-    """Return the largest ratios of sandwich to nominal sigma of a step, and of the mount with the step held fixed.
+    """Return the largest ratio of sandwich to nominal sigma of a mount's step, and of the mount, the step held fixed.
 
     The latter is that of the errors of all blocks, also where one side of the step has none of its own. Of all
     directions of each; at least 1.
