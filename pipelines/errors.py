@@ -34,6 +34,7 @@ EXIT_OF_VALIDATION = {
 _LONGEST = 2000
 # What people call a noise density.
 _DENSITY = ("noise", "sigma")
+_PACKED = {".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip", ".zst"}
 
 
 class InputError(Exception):
@@ -54,6 +55,8 @@ class NotARecordingError(InputError):
     @classmethod
     def of(cls, path: Path, why: str = "") -> Self:
         """Make the error for a file of no known format."""
+        if path.suffix.lower() in _PACKED:
+            return cls(f"{path}: an archive or a compressed file; unpack it first")
         return cls(
             f"{path}: not an MCAP file, ROS bag, PX4 or ArduPilot log, or table{why}; numbers of other files go in as "
             "arrays: alidade.open in Python"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
@@ -287,6 +288,15 @@ def test_what_is_no_recording_is_one_clear_line(content: bytes, message: str, tm
         open_recording(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["session.csv.gz", "session.zip", "session.tar.gz"])
+def test_a_compressed_file_is_to_be_unpacked(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("session.csv", "t,gx\n0.0,1.0\n")
+    with pytest.raises(InputError, match="unpack it first"):
+        open_recording(path)
 
 
 def test_missing_file_and_folder(tmp_path: Path) -> None:
