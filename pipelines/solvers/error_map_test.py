@@ -6,9 +6,9 @@ than the prior does, singular values of R above 1 / p, the squares of d, over th
 widen sigmas by, sum to chi-square under the model (Rao, Proc. Camb. Phil. Soc. 1948).
 
 Where the sum is significant, c is freed. What it trades with is then known as well as its prior says, which must not
-be smaller than the map: p is at least the rms of the map that makes d most likely. What was solved for moves as it does
-with c, where no other error can be mistaken for a map, and its covariance grows by what c adds. Noise levels, rejected
-measurements and residuals stay those without the map.
+be smaller than the map: p is at least the rms of the map that makes d most likely, and that rms where the map moves
+nothing. What was solved for moves as it does with c, where no other error can be mistaken for a map, and its covariance
+grows by what c adds. Noise levels, rejected measurements and residuals stay those without the map.
 """
 
 from __future__ import annotations
@@ -68,14 +68,16 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
 
 
 def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float) -> Estimate:
-    """Re-estimate with the error map as free parameters, its prior at least as wide as the map's rms.
+    """Re-estimate with the error map as free parameters, its prior at least as wide as the map's rms, or that rms.
 
     Directions that are weak `without` the map keep their values. A map that moves a required number by more than its
     prior's sigma takes that number's place, as where a device hardly turns, and is no error: the estimate stays.
     """
     compiled, solution, information = _solved(problem, error_map, estimate)
     chi_square, dof, rms = _tested(_rows(information, error_map)[1], error_map, ratio)
-    if rms > error_map.prior:
+    if rms == 0.0 and not error_map.moves:
+        return estimate
+    if rms > error_map.prior or not error_map.moves:
         error_map = replace(error_map, prior=rms)
         near = replace(estimate, names=information.names, values=information.at)
         compiled, solution, information = _solved(problem, error_map, near)

@@ -98,6 +98,17 @@ def test_vision_errors_by_attitude_widen_sigmas_and_move_nothing() -> None:
     assert (found.sigmas[mounts] > 1.2 * plain.sigmas[mounts]).any()
 
 
+def test_a_map_that_moves_nothing_widens_by_its_own_size() -> None:
+    """An eighth of the data sheet's, seen by good vision: sigmas are wider, and errors within them."""
+    noise = {"vision_attitude": 3e-4}
+    for seed in (2, 3):
+        found = _session("head", 3e-4, seed, 20.0, **FEW["head"], noise=noise).calibrate("batch", report=False)
+        mapped = found.estimate.error_map
+        assert mapped is not None
+        assert mapped.map.prior < 0.3 * mapped.map.stated
+        assert np.abs(_errors(found)).max() < 3.5
+
+
 def test_map_is_drawn_over_where_measurements_were_made() -> None:
     from alidade.pipelines.reports.plots import common_plots
 
