@@ -55,6 +55,8 @@ class VisionAttitudeFactor(Model):
             halfway between it and the anchor.
         elapsed, first: (n,) s since the recording's first stamp, (n, 4) cRh of its first picture; with both, skew,
             angle scale and filter are variables.
+        correlated: whether vision has an error u that lasts from picture to picture, the marker frame's: vRh Exp(u) in
+            place of vRh. Its block (3), rad, is the last one.
     """
 
     time: Array
@@ -68,6 +70,7 @@ class VisionAttitudeFactor(Model):
     expected: Array | None = None
     elapsed: Array | None = None
     first: Array | None = None
+    correlated: bool = False
     shapes: ClassVar = {"measured": (4,), "sqrt_information": (3, 3)}
     rows: int = 3
     stacked: ClassVar = ("time", "measured", "sqrt_information", "anchor", "expected", "elapsed", "first")
@@ -76,11 +79,14 @@ class VisionAttitudeFactor(Model):
     def blocks(self) -> tuple[Block, ...]:
         """Blocks of the variables: attitudes, bias, mounts, picture errors, gyro errors."""
         picture = 1 if self.elapsed is None else len(PICTURE_ERRORS)
-        return ROT3, 3, ROT3, ROT3, picture, *error_blocks(self.errors, self.platform_errors)
+        errors = error_blocks(self.errors, self.platform_errors)
+        return ROT3, 3, ROT3, ROT3, picture, *errors, *((3,) if self.correlated else ())
 
-    def __call__(self, bRv: Array, bias: Array, cRb: Array, vRh: Array, picture: Array, *of_gyros: Array) -> Residuals:
+    def __call__(self, bRv: Array, bias: Array, cRb: Array, vRh: Array, picture: Array, *others: Array) -> Residuals:
         """Residual sqrt_information * Log(predicted^T measured), (n, 3)."""
+        of_gyros, wandered = (others[:-1], others[-1]) if self.correlated else (others, None)
         errors, platform = parted(of_gyros, self.errors > 0)
+        vRh = vRh if wandered is None else so3.multiply(vRh, so3.exp(wandered))
         at, by_at = self.exposed(picture)
         anchor = self.time if self.anchor is None else self.anchor
         middle = 0.5 * (anchor + (self.time if self.expected is None else self.expected))
@@ -110,15 +116,17 @@ class VisionAttitudeFactor(Model):
             by_bRv = unfiltered + by_filtered @ filtered_by_turn
             by_platform = by_bRv @ so3.matrix(so3.inverse(bRv))
             by_bias, *by_errors = (by_bRv @ each for each in by_gyro())
+            by_wandered = () if wandered is None else (weight @ so3.right_jacobian(wandered),)
             # The columns of the pictures' errors stand as in PICTURE_ERRORS.
             return (
                 by_bRv @ so3.matrix(so3.inverse(dV)),
                 by_bias,
                 by_cRb,
-                weight,
+                weight if wandered is None else weight @ so3.matrix(so3.exp(-wandered)),
                 np.concatenate([by_times, by_picture, *by_filter], axis=2),
                 *by_errors,
                 *(-by_platform @ each for each in by_platform_errors(by_dB, platform)),
+                *by_wandered,
             )
 
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
