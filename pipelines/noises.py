@@ -43,6 +43,7 @@ _SPECS = (
     NoiseSpec(
         "vision_rate_noise", "s", "Vision attitude noise proportional to the rate, per picture and axis.", 1.0e-4
     ),
+    NoiseSpec("vision_correlated", "rad", "Vision attitude error that is correlated in time, per axis."),
     NoiseSpec("corner_px", "px", "Tag corner in a picture, per axis.", 0.3, 1.5),
     NoiseSpec("gyro_repeatability", "rad/s", "Gyro mean at rest, beyond white noise.", 2.0e-5),
     NoiseSpec("turn_repeatability", "", "Angle turned between rests, beyond white noise.", 1.0e-3),

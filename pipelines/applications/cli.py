@@ -184,7 +184,7 @@ def calibrate(
     no_check: _NoCheck = False,
     engine: Annotated[
         Literal["auto", "chain", "gtsam"],
-        typer.Option(help="Linear algebra of batch: chain elimination, or the library gtsam."),
+        typer.Option(help="Linear algebra of batch: chain elimination, or gtsam, with white noise alone."),
     ] = "auto",
     attitude_rate: Annotated[
         Literal["vision", "gyro"],

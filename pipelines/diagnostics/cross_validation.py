@@ -293,7 +293,7 @@ def _in_both(first: Mapping[str, _Number], second: Mapping[str, _Number]) -> dic
 
 def _at_levels(build: Build, levels: Mapping[str, Level], data: Any, config: Config) -> Problem:
     """Build the problem with the noise levels of a previous solution fixed."""
-    problem = build(data, config)
+    problem = build(data, config).at_levels(tuple(levels.values()))
     known = (levels.get(level.noise.name, level) for level in problem.noises)
     noises = tuple(
         replace(level, noise=replace(level.noise, known=0.0), least=None) if level.noise.name in levels else level

@@ -189,7 +189,7 @@ def rejections(estimate: Estimate) -> list[Finding]:
 
 
 def _noise(estimate: Estimate) -> Iterator[Finding]:
-    """Findings of stated or default noise levels that the recording contradicts."""
+    """Findings of noise levels that the recording contradicts, and of errors that are correlated in time."""
     for level in estimate.levels:
         known, own = level.together, set(level.noise.families)
         least = -np.inf if level.sigma is None else (level.found or 0.0) - LIMITS.noise_sigmas * level.sigma
@@ -198,7 +198,11 @@ def _noise(estimate: Estimate) -> Iterator[Finding]:
         is_default = level.noise.source == "default"
         alike = [_share(other) for other in estimate.levels if other is level or own & set(other.noise.families)]
         share = float(np.linalg.norm(alike)) if _share(level) == max(alike) else 0.0
-        if share > 0.5 or (not is_default and (no_noise or (differs and known.scale != 1.0))):
+        time = level.noise.correlation_time
+        if time is not None and share <= 1.0:
+            of = {"noise": level.noise.name, "unit": level.noise.unit}
+            yield Finding("correlated_error", NOTE, of | {"used": level.used, "correlation_time": time})
+        elif share > 0.5 or (not is_default and (no_noise or (differs and known.scale != 1.0))):
             numbers = {"used": known.used, "factor": known.scale, "estimated_factor": level.found}
             evidence = {"noise": level.noise.name, "unit": level.noise.unit, "source": level.noise.source, **numbers}
             yield Finding("noise", INCONSISTENT if share > 1.0 or (no_noise and not is_default) else NOTE, evidence)

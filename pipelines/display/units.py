@@ -66,6 +66,7 @@ _NOISE: dict[str, tuple[str, float]] = {
     "encoder": ("arcsec", math.degrees(3600.0)),
     "vision_attitude": ("deg", math.degrees(1.0)),
     "vision_rate_noise": ("ms", 1e3),
+    "vision_correlated": ("deg", math.degrees(1.0)),
     "vision_map": ("deg", math.degrees(1.0)),
     "turn_rate": ("deg/h", math.degrees(3600.0)),
     "move_rate": ("deg/h", math.degrees(3600.0)),

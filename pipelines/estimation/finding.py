@@ -36,6 +36,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
         "estimated_factor",
     ),  # used, and estimated alone, over stated
     "correlation": ("family", "share"),
+    "correlated_error": ("noise", "unit", "used", "correlation_time"),  # a Gauss-Markov error, s
     # Errors of measurements by where they are made: rms, and of which prior; effect: parameter -> shift by them.
     "error_map": ("name", "unit", "rms", "prior", "chi_square", "dof", "effect"),
     "slow_error": ("parameter", "ratio"),  # sandwich over nominal sigma, the largest of a required parameter

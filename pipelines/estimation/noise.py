@@ -15,6 +15,8 @@ Source = Literal["config", "message", "default"]
 # How well a noise is known, one sigma in its logarithm, that a message states or nobody. What the config states counts
 # as known no better once the recording contradicts it by so many sigmas.
 ROUGHLY, _APART = 1.0, 3.0
+# Family of the transitions of an error that is correlated in time.
+CORRELATED_ERROR = "correlated error"
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Noise:
             of it they have: what means of many samples repeat to is more than white noise over their duration.
         own: declaration of a noise that only one method has.
         no_noise: beyond this it is no noise, in its unit; None: as declared.
+        correlation_time: s, of a first-order Gauss-Markov process; None: it is white, or a walk.
     """
 
     name: str
@@ -46,6 +49,7 @@ class Noise:
     beside: bool = False
     own: NoiseSpec | None = None
     no_noise: float | None = None
+    correlation_time: float | None = None
 
     @property
     def spec(self) -> NoiseSpec:
@@ -85,6 +89,10 @@ class Level:
     sigma: float | None = None
     least: float | None = None
     effective: tuple[float, float] | None = None
+
+    def over(self, correlation_time: float) -> Level:
+        """Return the level with another correlation time, s."""
+        return replace(self, noise=replace(self.noise, correlation_time=correlation_time))
 
     @property
     def contradicted(self) -> bool:

@@ -306,6 +306,21 @@ class Attitudes:
 
 
 @dataclass(frozen=True)
+class CorrelatedError:
+    """Gauss-Markov error that measurements may have: of a rotation R that they share, R Exp(u).
+
+    Attributes:
+        key: of the rotation.
+        level: of its noise, rad, as far as it is known beforehand.
+        least: sigma, rad, of errors that matter; smaller ones are assumed of any sensor.
+    """
+
+    key: int
+    level: Level
+    least: float
+
+
+@dataclass(frozen=True)
 class Problem:
     """The graph of one recording.
 
@@ -336,7 +351,9 @@ class Problem:
         layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
         step_candidates: keys of rotations that are tested for a step at one moment, as of a mount that slips.
-        denser_graph: noise levels -> the graph with denser keyframes that they need; None where this one serves.
+        correlated_error: that measurements may have, and that is looked for; None: the method has none.
+        denser_graph: noise levels -> the graph that they need, with denser keyframes or with an error that is
+            correlated in time; None where this one serves.
         error_map: errors that measurements may have at the places that an estimate finds; None: the method has none.
         gaussian_priors: joint priors from elsewhere than data sheets; the last one about a number is in force.
     """
@@ -360,6 +377,7 @@ class Problem:
     layout: ChainLayout | None = None
     marginal_likelihood: bool = False
     step_candidates: tuple[int, ...] = ()
+    correlated_error: CorrelatedError | None = None
     denser_graph: Callable[[Sequence[Level]], Problem | None] | None = None
     error_map: Callable[[Estimate], ErrorMap | None] | None = None
     gaussian_priors: tuple[GaussianPrior, ...] = ()
@@ -372,6 +390,10 @@ class Problem:
             continuation=changed(self.continuation, lambda more: more.near(numbers)),
             denser_graph=changed(self.denser_graph, lambda more: more.near(numbers)),
         )
+
+    def at_levels(self, levels: Sequence[Level]) -> Problem:
+        """Return the graph that some noise levels need: this one, or one with denser keyframes or more states."""
+        return (self.denser_graph and self.denser_graph(levels)) or self
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
         """Inputs of formulas by name: an estimate's values, and the constants."""

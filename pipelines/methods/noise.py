@@ -32,7 +32,7 @@ _STEP, _FEWEST_MEANS, _SURE = 0.25, 12, 4.0
 # s over which samples at rest are averaged: one sample shows a slow motion least, longer ones what is rounded off.
 _REST_MEANS = (0.0, 0.1, 0.4)
 # How well repeatability is known, in the logarithm, where nobody states it.
-_HARDLY = 2.0
+HARDLY = 2.0
 # A walk that nobody states is no smaller than this, over the default.
 _SMALLEST_WALK = 1e-3
 # A process is not made smaller than this without its residuals being asked.
@@ -91,7 +91,7 @@ def estimated(
     if noise.source != "default":
         return Level(noise)
     if noise.known:
-        return Level(replace(noise, known=_HARDLY))
+        return Level(replace(noise, known=HARDLY))
     return Level(replace(noise, stated=0.0) if beside else noise)
 
 

@@ -188,7 +188,11 @@ def _badges(c: Calibration) -> Iterator[Badge]:
         if share > _NOTABLE_REJECTION:
             yield Badge(f"{100.0 * share:.0f} % of {family} rejected", "warn", "measurements that fit no solution")
     for n in c.noises:
-        if n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE:
+        if n.correlation_time is not None:
+            unit, factor = noise_unit(n.name, n.unit)
+            size = f"{rounded(factor * n.used)} {unit}, correlation time {rounded(n.correlation_time)} s"
+            yield Badge(f"{n.name} {size}", "warn", "errors correlated in time, included in all sigmas")
+        elif n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE:
             by = "the default" if n.source == "default" else "stated"
             yield Badge(f"{n.name} {rounded(n.used / n.stated)} × {by}", "warn", f"noise, by {n.source}")
     alone = [name for name, each in c.verdicts.items() if each == "prior"]
@@ -491,8 +495,11 @@ def _noise(c: Calibration) -> Table | None:
         sigma = "" if n.sigma is None else f" ± {rounded(factor * n.sigma)}"
         what = specs[n.name].description if n.name in specs else n.name
         name = Cell(n.name, hint=f"{what} Stated by {n.source}; {n.used:.3g} {n.unit} used.")
+        stated = rounded(factor * n.stated, 3)
+        if n.correlation_time is not None:
+            name, stated = Cell(f"{n.name}, {rounded(n.correlation_time)} s", hint=what), ""
         inflation = (f"{n.inflation:.2f}" if n.inflation > 1.0 else "",) if inflated else ()
-        numbers = (rounded(factor * n.stated, 3), estimated + sigma, rounded(factor * n.used, 3))
+        numbers = (stated, estimated + sigma, rounded(factor * n.used, 3))
         rows.append((name, unit, *numbers, *inflation))
     caption = "Estimated from residuals or samples; used: weighted mean of both, weights from `noise_known`."
     if inflated:

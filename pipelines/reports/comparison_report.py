@@ -130,6 +130,8 @@ def comparison_summary(comparison: Comparison) -> Summary:
             "Ask what happened between the halves: a knock, a cable, warming up; a gyro's bias walks, and may differ "
             "for that."
             if comparison.far
+            else "Go by batch: it models that vision's errors are correlated in time, incremental does not."
+            if any(noise.correlation_time is not None for each in comparison.calibrations for noise in each.noises)
             else "Go by batch; give incremental a longer `--window`.",
         ),
     }[comparison.answer]

@@ -206,6 +206,7 @@ class Calibration(SensorValues):
                 sigma=None if level.sigma is None else level.sigma * level.noise.stated,
                 used=level.used,
                 inflation=max((colours.get(family, 1.0) ** 0.5 for family in level.noise.families), default=1.0),
+                correlation_time=level.noise.correlation_time,
             )
             for level in (each.together for each in self.estimate.levels or stated)
         ]

@@ -84,6 +84,7 @@ class NoiseResult(_Record):
     sigma: float | None  # of estimated
     used: float  # used in the solution and all sigmas
     inflation: float  # by what a mean of such measurements is less certain than of independent ones
+    correlation_time: float | None = None  # s, of a Gauss-Markov error; null: white noise, or a walk
 
 
 class CovarianceResult(_Record):

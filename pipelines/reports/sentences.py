@@ -50,6 +50,7 @@ _CHECK = {
     "gyro_rate_noise": _OF_GYRO,
     "vision_attitude": _OF_VISION,
     "vision_rate_noise": _OF_VISION,
+    "vision_correlated": _OF_VISION,
 }
 _PRIOR = "prior of "
 # Smaller shares are summed, and so are those after so many.
@@ -309,6 +310,12 @@ def _noise(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     return f"Noise {e['noise']}: {used} used, {e['factor']:.2g} times the {e['source']}'s value."
 
 
+def _correlated_error(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    unit, factor = noise_unit(e["noise"], e["unit"])
+    size = f"{rounded(factor * e['used'])} {unit}, correlation time {rounded(e['correlation_time'])} s"
+    return f"{e['noise']}: errors are correlated in time, {size}. Sigmas include them."
+
+
 def _error_map(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
     of = "the gimbal angles" if e["name"] == "los_map" else "the attitude"
     unit, factor = noise_unit(e["name"], e["unit"])
@@ -390,6 +397,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
         f"Residuals of {e['family']} are correlated over {100.0 * e['share']:.0f} % of the recording."
     ),
     "slow_error": _slow_error,
+    "correlated_error": _correlated_error,
     "error_map": _error_map,
     "misfit": _misfit,
     "dominant_prior": _dominant_prior,

@@ -302,7 +302,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     Noise levels, and which measurements are rejected, are those of the solution.
     """
     own, values = solved.engine, solved.values
-    other = Compiled.of(changed, "gtsam" if solved.compiled.problem.layout is None else "auto")
+    other = Compiled.of(changed.at_levels(solved.levels), "gtsam" if solved.compiled.problem.layout is None else "auto")
     engine = apply_levels(other.engine, solved.levels)
     shapes = [[(g.family, g.target, len(g.model.time), g.model.rows) for g in e.groups] for e in (own, engine)]
     if not np.array_equal(other.layout.key, solved.compiled.layout.key) or shapes[0] != shapes[1]:

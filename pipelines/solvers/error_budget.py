@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
+from alidade.pipelines.estimation.noise import CORRELATED_ERROR
 from alidade.pipelines.estimation.problem import InfluentialMeasurement
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Point
@@ -203,7 +204,7 @@ def most_influential(
     scale = np.array([sigmas[name] for name in names])
     found: list[tuple[float, str, float, str]] = []
     for group in influence.at.engine.divided():
-        if group.target == "shared" and group.family == "prior":
+        if (group.target == "shared" and group.family == "prior") or group.family == CORRELATED_ERROR:
             continue
         L, right = influence.rows(group)
         moves = np.einsum("nrm,nr->nm", L[..., columns], right) / scale

@@ -11,8 +11,9 @@ from alidade.pipelines.estimation.problem import Estimate, Problem, SqrtInformat
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Values
+from alidade.pipelines.solvers.linear_chain import LinearChain
 from alidade.pipelines.solvers.linearization import Group, Linearization
-from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels, unwidened
+from alidade.pipelines.solvers.marginal_likelihood import estimate_levels, unwidened
 from alidade.pipelines.solvers.noise_estimation import apply_levels
 from alidade.pipelines.solvers.posterior import moved_to, sqrt_information
 
@@ -45,7 +46,7 @@ def at_solution(freed: Problem, estimate: Estimate) -> tuple[Compiled, Lineariza
         IndeterminateStateError, LinAlgError: the graph does not determine its states.
     """
     levels = estimate.levels
-    compiled = Compiled.of((freed.denser_graph and freed.denser_graph(levels)) or freed)
+    compiled = Compiled.of(freed.at_levels(levels))
     used, values = _used(compiled.engine.groups, estimate), compiled.initial
     numbers = {q.name: q.prior_mean for q in compiled.problem.quantities}
     numbers |= zip(estimate.names, estimate.values.tolist(), strict=True)

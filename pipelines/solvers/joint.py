@@ -217,7 +217,7 @@ def information_at_levels(problem: Problem, levels: Sequence[Level], device: Col
     Raises:
         IndeterminateError: a state is not determined.
     """
-    compiled = Compiled.of(problem)
+    compiled = Compiled.of(problem.at_levels(levels))
     solution = minimum(compiled, tuple(levels) or problem.noises)
     return sqrt_information(compiled, solution.engine, solution.values, device)
 

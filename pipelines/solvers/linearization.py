@@ -117,17 +117,16 @@ class Group:
 
     def evaluate(self, values: Values) -> Residuals:
         """Whitened residuals (n, m), unweighted, and their Jacobians on demand."""
-        return self.model(*self._gathered(values))
+        return self.model(*self.gathered(values))
 
     def without_noise(self, values: Values) -> Group:
         """Return the group at measurements whose residuals are zero, where its Jacobians have noise of these."""
-        return replace(self, model=self.model.without_noise(*self._gathered(values)))
+        return replace(self, model=self.model.without_noise(*self.gathered(values)))
 
-    def _gathered(self, values: Values) -> Iterator[Array]:
-        """Yield the blocks of variables (n, width) that the model is called with."""
-        for block, rows in self.gather:
-            array = values.arrays[block][rows]
-            yield np.broadcast_to(array, (len(self.model.time), array.shape[1]))
+    def gathered(self, values: Values) -> list[Array]:
+        """Blocks of variables (n, width) that the model is called with."""
+        arrays = [values.arrays[block][rows] for block, rows in self.gather]
+        return [np.broadcast_to(each, (len(self.model.time), each.shape[1])) for each in arrays]
 
     @property
     def all_weights(self) -> Array:

@@ -9,10 +9,6 @@ with H the information of states and parameters, priors included (Harville, J. A
 Yoon, IEEE RA-L 2020). Its gradient is zero where restricted maximum likelihood's equations hold. It is maximised over
 log h at a fixed linearisation; the caller then solves with the levels found, and linearises again.
 
-The levels are tried by the normal equations of the states, banded, whose products J'J are made once: 10 ms a trial of
-1,200 keyframes and 37 parameters, where QR (`chain.py`) takes 31. A level needs no digit that squaring loses; the
-solution at the levels found is QR's.
-
 Measurements whose innovation lies beyond the gate are widened until it does not, never left out for that: leaving them
 out lowers the level, and the lower level leaves out more. The nodes of a bias that walks stay where the solution has
 them, relative to the first.
@@ -22,34 +18,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from alidade.factors.array import Array, Mask
-from alidade.factors.chi_square import gate
 from alidade.pipelines import deadline
-from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise
-from alidade.pipelines.estimation.problem import Residuals
-from alidade.pipelines.solvers.chain import UNDETERMINED, IndeterminateStateError, Index
+from alidade.pipelines.estimation.noise import ROUGHLY, Level
+from alidade.pipelines.estimation.problem import Problem, Residuals
+from alidade.pipelines.solvers.chain import UNDETERMINED, IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import certain_ratio, sigma_ratio
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize, states_first
+from alidade.pipelines.solvers.linear_chain import LinearChain, LinearSolution, Widening
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.noise_estimation import apply_levels
 from alidade.pipelines.solvers.posterior import Reported
-
-# Of each group of a linearisation, (n,) by which the sigmas of its measurements are multiplied; infinite: rejected.
-Widening = Sequence[Array]
 
 # A measurement is widened to the 99.9 % gate of its innovation, and an outlier beyond so many times that.
 OUTLIER_GATES = 3.0
 # By which the variance of a measurement without a say is multiplied, where it cannot be infinite.
 NO_SAY = 1e12
-# Keyframes that determine levels well enough: of a longer recording half of them are the liveliest.
-ENOUGH_KEYFRAMES = 6000
+# Keyframes that determine a correlation time.
+ENOUGH_FOR_TIME = 2000
 # Newton steps, none longer than this in the logarithm of a level; one that lowers -2 log L by less is the last: levels
 # are then within .2 of their sigmas, as random signs have them.
 _MOST_STEPS, _LONGEST_STEP, _SETTLED = 12, 1.5, 0.05
@@ -67,417 +58,11 @@ _ABOVE = 2.0
 _SAME = 1.2
 # By which another maximum has to lower -2 log L: what one more noise does by chance once in a thousand.
 _CLEARLY = 10.8
+# s, correlation times at which an error is looked for, and between which its time is found; how finely, in the
+# logarithm. With longer ones a slip passes for an error: 3 deg in 30 s of two pictures a second.
+CORRELATION_TIMES, SHORTEST, LONGEST, _FINELY = (0.15, 0.5, 1.5), 0.05, SANDWICH_BLOCK_S / 3.0, 0.2
 # Random right sides that estimate traces: a quarter of a level's own sigma.
 _SIGNS = 24
-# Innovations are predicted from so many keyframes before at least, in pieces of so many.
-_WARM_UP, _PIECE = 50, 100
-# Information of a state before anything is known, over that of its neighbour's rows.
-_DIFFUSE = 1e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Linearised rows of the measurements of one kind, whitened by the stated noise.
-
-    Attributes:
-        family: of all of them.
-        group: number of theirs among the linearisation's.
-        time: (n,) s.
-        residuals: (n, m).
-        states: the states (n,) that they are about, none, one or two, and Jacobians (n, m, d).
-        shared: (n, m, p).
-        beside: (n,) what a unit of the noise beside their own adds, or None.
-        fixed: (n,) part of the stated variance that no level scales, or None.
-        is_measurement: whether they may be outliers.
-    """
-
-    family: str
-    group: int
-    time: Array
-    residuals: Array
-    states: tuple[tuple[Index, Array], ...]
-    shared: Array
-    beside: Array | None
-    fixed: Array | None
-    is_measurement: bool
-
-    def of(self, kept: Mask, renumbered: Index) -> Rows:
-        """Select some rows and renumber their states."""
-        states = tuple((renumbered[i[kept]], J[kept]) for i, J in self.states)
-        beside, fixed = (None if each is None else each[kept] for each in (self.beside, self.fixed))
-        parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside, fixed)
-        return Rows(self.family, self.group, *parts, self.is_measurement)
-
-    def right(self, some: Any = ..., by_shared: bool = True) -> Array:
-        """Residuals of selected rows, with the Jacobian by the shared parameters beside: (n, m, 1 + p or 1)."""
-        residuals = self.residuals[some][..., None]
-        return np.concatenate([residuals, self.shared[some]], axis=2) if by_shared else residuals
-
-    def has(self, noise: Noise) -> bool:
-        """Whether a noise contributes to the variance of these rows."""
-        return self.family in noise.families and (self.beside is not None or not noise.beside)
-
-    def variance(self, levels: Sequence[Level]) -> Array:
-        """Variance (n,) of the rows at some noise levels, relative to the stated variance."""
-        out = self._white(levels) + (0.0 if self.fixed is None else self.fixed)
-        for level in levels:
-            if level.noise.beside and self.has(level.noise):
-                out += self._added(level)
-        return out
-
-    def share(self, level: Level, levels: Sequence[Level]) -> Array:
-        """Share (n,) of the rows' variance at some noise levels that one of the levels contributes."""
-        if not self.has(level.noise):
-            return np.zeros(len(self.time))
-        return (self._added(level) if level.noise.beside else self._white(levels)) / self.variance(levels)
-
-    def _white(self, levels: Sequence[Level]) -> Array:
-        """Contribution (n,) of the rows' own noise to their variance, relative to the stated one."""
-        out = np.ones(len(self.time)) if self.fixed is None else 1.0 - self.fixed
-        for level in levels:
-            if self.has(level.noise) and not level.noise.beside:
-                out *= level.scale**2
-        return out
-
-    def _added(self, level: Level) -> Array:
-        """Contribution (n,) of an additional noise to the rows' variance, relative to the stated one."""
-        assert self.beside is not None
-        return np.asarray((level.used * self.beside) ** 2)
-
-
-@dataclass(frozen=True, eq=False)
-class Innovations:
-    """Innovations of n measurements of one kind: normalised squares, and whitened with derivatives.
-
-    Attributes:
-        squares: (n,) of their norms over their own covariance.
-        whitened: (n, m, 1 + p) by the covariance they are used with, and their derivatives by the shared parameters,
-            none where these were not asked for.
-    """
-
-    squares: Array
-    whitened: Array
-
-
-@dataclass(frozen=True, eq=False)
-class LinearChain:
-    """A problem linearised about a solution: a chain of states, and shared parameters.
-
-    Attributes:
-        size: N states of d numbers.
-        rows: by kind.
-        prior: (r, p + 1) rows of the shared parameters alone, residuals last.
-    """
-
-    size: tuple[int, int]
-    rows: tuple[Rows, ...]
-    prior: Array
-
-    @classmethod
-    def of(cls, linearization: Linearization, values: Values) -> LinearChain:
-        """Linearise a problem's factors at their stated noise about given values."""
-        (n, d, _, c, p), drafts = linearization.layout.sizes, list[Rows]()
-        prior = [np.zeros((0, p + 1))]
-        for number, group in enumerate(linearization.under(None).groups):
-            if group.target == "walk":
-                continue
-            begin = {"state": d + c, "pair": 2 * d + c, "shared": 0}[group.target]
-            whole, _ = group.rows(values, begin + p + 1)
-            whole[..., -1] *= -1.0
-            if group.target == "shared" and not group.is_measurement:
-                prior.append(whole.reshape(-1, p + 1))
-                continue
-            states: tuple[tuple[Index, Array], ...] = ()
-            if group.target != "shared":
-                states = ((group.place, whole[..., :d]),)
-            if group.target == "pair":
-                states = ((group.place - 1, whole[..., d : 2 * d]), *states)
-            drafts.append(
-                Rows(
-                    group.family,
-                    number,
-                    np.asarray(group.model.time),
-                    whole[..., -1],
-                    states,
-                    whole[..., begin:-1],
-                    group.beside,
-                    group.fixed,
-                    group.is_measurement,
-                )
-            )
-        return cls((n, d), tuple(drafts), np.concatenate(prior))
-
-    def liveliest(self, factors: list[Array], most: int = ENOUGH_KEYFRAMES) -> tuple[LinearChain, list[Array]]:
-        """Keep about `most` keyframes, half of them in the pieces with most motion; select `factors` alike.
-
-        What grows with motion shows there; what is white everywhere.
-        """
-        n = self.size[0]
-        if n <= most:
-            return self, factors
-        drive = np.zeros(n)
-        for rows in self.rows:
-            if rows.beside is not None and rows.states:
-                np.maximum.at(drive, rows.states[-1][0], rows.beside)
-        pieces, wanted = np.arange(n) // (2 * _PIECE), most // (2 * _PIECE)
-        size = np.bincount(pieces, drive) / np.bincount(pieces)
-        chosen = np.zeros(len(size), dtype=bool)
-        chosen[np.argsort(-size)[: wanted // 2]] = True
-        rest = np.flatnonzero(~chosen)
-        chosen[rest[np.linspace(0, len(rest) - 1, wanted - wanted // 2).astype(int)]] = True
-        kept = chosen[pieces]
-        renumbered = np.cumsum(kept) - 1
-        inside = [np.all([np.ones(len(r.time), bool), *(kept[i] for i, _ in r.states)], axis=0) for r in self.rows]
-        some = tuple(rows.of(own, renumbered) for rows, own in zip(self.rows, inside, strict=True))
-        part = replace(self, size=(int(kept.sum()), self.size[1]), rows=some)
-        return part, [each[own] for each, own in zip(factors, inside, strict=True)]
-
-    def reversed(self) -> LinearChain:
-        """Return the same chain with its states in the opposite order."""
-        last = self.size[0] - 1
-        rows = tuple(replace(r, states=tuple((last - i, J) for i, J in r.states[::-1])) for r in self.rows)
-        return replace(self, rows=rows)
-
-    @property
-    def limits(self) -> list[float]:
-        """Gate of the squared normalised innovations of each kind of rows."""
-        return [gate(rows.residuals.shape[1]) ** 2 for rows in self.rows]
-
-    def factors(self, widening: Widening | None, of_rejected: float = np.inf) -> list[Array]:
-        """Variance factors (n,) of each kind of rows by a widening; `of_rejected` is that of rejected measurements."""
-        each = [np.ones(len(rows.time)) if widening is None else widening[rows.group] for rows in self.rows]
-        return [np.where(np.isinf(wide), of_rejected, wide**2) for wide in each]
-
-    def variances(
-        self, levels: Sequence[Level], widening: Widening | None = None, of_rejected: float = np.inf
-    ) -> list[Array]:
-        """Variances (n,) of each kind of rows at some noise levels, relative to the stated ones, and widened."""
-        factors = self.factors(widening, of_rejected)
-        return [rows.variance(levels) * factor for rows, factor in zip(self.rows, factors, strict=True)]
-
-    def solved(self, variances: Sequence[Array]) -> _Solution | None:
-        """Solve for states and parameters given the rows' relative variances (n,); None where undetermined.
-
-        Rows of infinite variance have no say.
-        """
-        from scipy.linalg import cho_solve_banded, cholesky_banded
-
-        (n, d), p = self.size, self.prior.shape[1] - 1
-        Hd, Ho, Hs, g = np.zeros((n, d, d)), np.zeros((n, d, d)), np.zeros((n, d, p)), np.zeros((n, d))
-        Hss, gs = self.prior[:, :p].T @ self.prior[:, :p], self.prior[:, :p].T @ self.prior[:, p]
-        total, weights = float((self.prior[:, p] ** 2).sum()), []
-        for rows, variance, (square, own, crossed, projected, mixed) in zip(
-            self.rows, variances, self._products, strict=True
-        ):
-            counted = np.isfinite(variance)
-            w = np.where(counted, 1.0 / variance, 0.0)
-            weights.append(np.sqrt(w))
-            total += float((w * square).sum()) + rows.residuals.shape[1] * float(np.log(variance[counted]).sum())
-            for (i, _), JJ, Jr, JS in zip(rows.states, own, projected, mixed, strict=True):
-                add_blocks(Hd, i, w[:, None, None] * JJ)
-                add_blocks(g, i, w[:, None] * Jr)
-                add_blocks(Hs, i, w[:, None, None] * JS)
-            if crossed is not None:
-                add_blocks(Ho, rows.states[0][0], w[:, None, None] * crossed)
-            flat = (weights[-1][:, None, None] * rows.shared).reshape(-1, p)
-            Hss += flat.T @ flat
-            gs += flat.T @ (weights[-1][:, None] * rows.residuals).ravel()
-        try:
-            root = cholesky_banded(_banded(Hd, Ho), check_finite=False)
-            border = Hs.reshape(n * d, p)
-            X = cho_solve_banded((root, False), border, check_finite=False)
-            small = np.linalg.cholesky(Hss - border.T @ X)
-        except np.linalg.LinAlgError:
-            return None
-        found = _Solution(self, weights, root, X, small, np.zeros(n * d), np.zeros(p), 0.0)
-        states, shared = found.solve(-g.reshape(-1, 1), -gs[:, None])
-        chi_square = total + float(g.ravel() @ states[:, 0] + gs @ shared[:, 0])
-        value = chi_square + 2.0 * float(np.log(root[-1]).sum() + np.log(np.diag(small)).sum())
-        return replace(found, states=states[:, 0], shared=shared[:, 0], value=value)
-
-    @cached_property
-    def _products(self) -> list[tuple[Array, list[Array], Array | None, list[Array], list[Array]]]:
-        """Products of each kind of rows that no level changes: squares, J'J, J_i'J_j, J'r and J'J_shared."""
-        found = []
-        for rows in self.rows:
-            r, transposed = rows.residuals, [np.swapaxes(J, 1, 2) for _, J in rows.states]
-            own = [Jt @ J for Jt, (_, J) in zip(transposed, rows.states, strict=True)]
-            crossed = transposed[0] @ rows.states[1][1] if len(rows.states) == 2 else None
-            projected = [(Jt @ r[..., None])[..., 0] for Jt in transposed]
-            found.append((np.square(r).sum(axis=1), own, crossed, projected, [Jt @ rows.shared for Jt in transposed]))
-        return found
-
-    def moves(self, states: Array, shared: Array) -> list[Array]:
-        """Product A x, (n, m, k) for each kind of rows, with states (N d, k) and shared parameters (p, k)."""
-        n, d = self.size
-        each, out = states.reshape(n, d, -1), []
-        for rows in self.rows:
-            y = rows.shared @ shared
-            for i, J in rows.states:
-                y += J @ each[i]
-            out.append(y)
-        return out
-
-    def innovations(
-        self, variances: Sequence[Array], limits: Sequence[float], by_shared: bool = False
-    ) -> dict[int, Innovations]:
-        """Innovations of the measurements by index of their kind, from Kalman filters over overlapping pieces.
-
-        Predicted from the keyframes before, parameters as they are, by a filter that uses what lies beyond a limit with
-        a variance that takes it there. In pieces that begin with nothing known `_WARM_UP` keyframes before, all at the
-        same time.
-
-        Args:
-            variances: of each kind of rows (n,).
-            limits: of their squares, of each kind.
-            by_shared: also how they go with the shared parameters.
-        """
-        n, d = self.size
-        q = 1 + (self.prior.shape[1] - 1 if by_shared else 0)
-        F, c, Q = self.transitions(variances, by_shared)
-        seen = [k for k, rows in enumerate(self.rows) if rows.is_measurement and len(rows.states) == 1]
-        queues = {k: _queue(self.rows[k].states[0][0], n) for k in seen}
-        squares = {k: np.zeros(len(self.rows[k].time)) for k in seen}
-        right = {k: self.rows[k].right(by_shared=by_shared) for k in seen}
-        whitened = {k: np.zeros_like(each) for k, each in right.items()}
-        starts = np.arange(0, n, _PIECE)
-        begin = np.maximum(starts - _WARM_UP, 0)
-        x, P = np.zeros((len(begin), d, q)), np.tile(np.eye(d) / _DIFFUSE, (len(begin), 1, 1))
-        for step_ in range(_PIECE + _WARM_UP):
-            live = np.flatnonzero(begin + step_ < np.minimum(starts + _PIECE, n))
-            k = begin[live] + step_
-            if step_ and len(live):
-                x[live] = F[k] @ x[live] + c[k]
-                P[live] = F[k] @ P[live] @ np.swapaxes(F[k], 1, 2) + Q[k]
-            for kind in seen:
-                order, begins, counts = queues[kind]
-                for again in range(int(counts[k].max(initial=0))):
-                    some = np.flatnonzero(counts[k] > again)
-                    own, row = live[some], order[begins[k[some]] + again]
-                    J, y = self.rows[kind].states[0][1][row], right[kind][row]
-                    JP = J @ P[own]
-                    S, v = JP @ np.swapaxes(J, 1, 2), variances[kind][row][:, None, None] * np.eye(y.shape[1])
-                    both = y + J @ x[own]
-                    z = np.linalg.solve(np.linalg.cholesky(S + v), both)
-                    square = np.square(z[..., 0]).sum(axis=1)
-                    wide = square > limits[kind]
-                    if wide.any():
-                        v[wide] *= (square[wide] / limits[kind])[:, None, None]
-                        z[wide] = np.linalg.solve(np.linalg.cholesky(S[wide] + v[wide]), both[wide])
-                    squares[kind][row], whitened[kind][row] = square, z
-                    gain = np.swapaxes(np.linalg.solve(S + v, JP), 1, 2)
-                    x[own] -= gain @ both
-                    # Joseph's form stays positive where a measurement is better by 1e8 than the prediction.
-                    rest = np.eye(d) - gain @ J
-                    P[own] = rest @ P[own] @ np.swapaxes(rest, 1, 2) + gain @ v @ np.swapaxes(gain, 1, 2)
-        return {kind: Innovations(squares[kind], whitened[kind]) for kind in seen}
-
-    def transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
-        """Transitions x_k = F_k x_k-1 + c_k with covariance Q_k; diffuse where no factor joins two states.
-
-        `c` has the derivatives by the shared parameters beside it where they are asked for.
-        """
-        n, d = self.size
-        q = self.prior.shape[1] if by_shared else 1
-        F, c, Q = np.zeros((n, d, d)), np.zeros((n, d, q)), np.tile(np.eye(d) / _DIFFUSE, (n, 1, 1))
-        for rows, variance in zip(self.rows, variances, strict=True):
-            if len(rows.states) != 2 or rows.residuals.shape[1] != d:
-                continue
-            (_, before), (now, after) = rows.states
-            joined = np.isfinite(variance)
-            inverse, now = np.linalg.inv(after[joined]), now[joined]
-            right = rows.right(joined, by_shared)
-            F[now], c[now] = -inverse @ before[joined], -inverse @ right
-            Q[now] = variance[joined, None, None] * inverse @ np.swapaxes(inverse, 1, 2)
-        return F, c, Q
-
-
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """Most likely states and parameters of a linear chain, with the factorized information.
-
-    Attributes:
-        chain: the problem.
-        weights: of each kind of rows, (n,) their inverse sigmas, 0 for those without a say.
-        root: Cholesky factor of the states' information, banded.
-        border: (N d, p) that information's inverse times the part it has in common with the shared parameters.
-        small: Cholesky factor of the shared parameters' information, states integrated out.
-        states, shared: (N d,), (p,).
-        value: -2 log L but for the levels' prior.
-    """
-
-    chain: LinearChain
-    weights: list[Array]
-    root: Array
-    border: Array
-    small: Array
-    states: Array
-    shared: Array
-    value: float
-
-    def solve(self, states: Array, shared: Array) -> tuple[Array, Array]:
-        """Solve the normal equations for right sides (N d, k) of the states and (p, k) of the shared parameters."""
-        from scipy.linalg import cho_solve_banded
-
-        right = shared - self.border.T @ states
-        x = np.linalg.solve(self.small.T, np.linalg.solve(self.small, right))
-        return cho_solve_banded((self.root, False), states, check_finite=False) - self.border @ x, x
-
-    def covariance(self, by_shared: Array) -> Array:
-        """Covariance (r, r) of r functions with Jacobian (r, p) by the shared parameters."""
-        half = np.linalg.solve(self.small, by_shared.T)
-        return np.asarray(half.T @ half)
-
-    def gathered(self, of_rows: Sequence[Array]) -> tuple[Array, Array]:
-        """Product A'y for whitened rows y (n, m, k) of each kind: states (N d, k), shared parameters (p, k)."""
-        (n, d), p, k = self.chain.size, self.chain.prior.shape[1] - 1, of_rows[0].shape[2]
-        states, shared = np.zeros((n, d, k)), np.zeros((p, k))
-        for rows, w, y in zip(self.chain.rows, self.weights, of_rows, strict=True):
-            weighed = w[:, None, None] * y
-            for i, J in rows.states:
-                add_blocks(states, i, np.swapaxes(J, 1, 2) @ weighed)
-            shared += rows.shared.reshape(-1, p).T @ weighed.reshape(-1, k)
-        return states.reshape(n * d, k), shared
-
-    def spread(self, states: Array, shared: Array) -> list[Array]:
-        """Product A x with whitened rows, (n, m, k) by kind, from states (N d, k) and shared parameters (p, k)."""
-        moves = self.chain.moves(states, shared)
-        return [w[:, None, None] * move for w, move in zip(self.weights, moves, strict=True)]
-
-    def residuals(self) -> list[Array]:
-        """Residuals (n, m) of each kind of rows at the solution, whitened by the stated noise."""
-        moves = self.chain.moves(self.states[:, None], self.shared[:, None])
-        return [rows.residuals + move[..., 0] for rows, move in zip(self.chain.rows, moves, strict=True)]
-
-    def score(self, parts: Sequence[Sequence[Array]], signs: Sequence[Array]) -> tuple[Array, Array]:
-        """Half the gradient (q,) of -2 log L by the logarithms of levels, and the average information (q, q).
-
-        With v a row's variance, f the part of it that is a level's, e its whitened residual and l its leverage, the
-        gradient is sum f (1 - l - e^2), traces by random signs (Hutchinson 1989), and the information 2 (f e)' P (f e)
-        with P = I - A H^-1 A' (Gilmour, Thompson, Cullis, Biometrics 1995).
-
-        Args:
-            parts: f of each level, (n,) for each kind of rows.
-            signs: (n, m, k) for each kind of rows.
-        """
-        moved, q = self.spread(self.states[:, None], self.shared[:, None]), len(parts)
-        whitened = zip(self.weights, self.chain.rows, moved, strict=True)
-        e = [w[:, None] * rows.residuals + move[..., 0] for w, rows, move in whitened]
-        scaled = [
-            np.stack([part[i][:, None] * e[i] for part in parts], axis=2) if q else np.zeros((*e[i].shape, 0))
-            for i in range(len(e))
-        ]
-        drawn = [(w > 0.0)[:, None, None] * sign for w, sign in zip(self.weights, signs, strict=True)]
-        both = [np.concatenate([y, sign], axis=2) for y, sign in zip(scaled, drawn, strict=True)]
-        projected = self.spread(*self.solve(*self.gathered(both)))
-        gradient, information = np.zeros(q), np.zeros((q, q))
-        for i, (y, hat) in enumerate(zip(scaled, projected, strict=True)):
-            information += 2.0 * np.einsum("nmc,nmd->cd", y, y - hat[..., :q])
-            counted = self.weights[i] > 0.0
-            leverage = (drawn[i] * hat[..., q:]).sum(axis=1).mean(axis=1)
-            left = np.where(counted, e[i].shape[1] - leverage - (e[i] ** 2).sum(axis=1), 0.0)
-            gradient += [float((part[i] * left).sum()) for part in parts]
-        return gradient, 0.5 * (information + information.T)
 
 
 def estimate_levels(
@@ -498,27 +83,25 @@ def estimate_levels(
         IndeterminateStateError: states or parameters are not determined at the levels to begin with.
     """
     some, factors = chain.liveliest(chain.factors(widening))
-    free = [
-        i for i, level in enumerate(levels) if level.noise.estimated and any(r.has(level.noise) for r in chain.rows)
-    ]
-    if not free:
-        return tuple(levels)
-    roughly = np.array([max(levels[i].noise.known, ROUGHLY) for i in free])
-    found, value = _maximum(some, factors, levels, free, roughly)
+    found, value = _maximum(some, factors, levels)
     above = _from_above(some, levels) if from_above else None
     if above is not None:
-        other, least = _maximum(some, factors, above, free, roughly)
+        other, least = _maximum(some, factors, above)
         if least < value - _CLEARLY:
             found = other
-    closely = np.array([found[i].known for i in free])
-    if (closely >= roughly).all():
+    if all(found[i].known >= ROUGHLY for i in _free(some, found)):
         return found
-    used, _ = _maximum(some, factors, found, free, closely)
+    used, _ = _maximum(some, factors, found, closely=True)
     return tuple(replace(now, found=then.found, sigma=then.sigma) for now, then in zip(used, found, strict=True))
 
 
+def _free(chain: LinearChain, levels: Sequence[Level]) -> list[int]:
+    """Indices of the levels that are estimated and of which a chain has rows."""
+    return [i for i, each in enumerate(levels) if each.noise.estimated and any(r.has(each.noise) for r in chain.rows)]
+
+
 def _maximum(
-    chain: LinearChain, factors: Sequence[Array], levels: Sequence[Level], free: Sequence[int], known: Array
+    chain: LinearChain, factors: Sequence[Array], levels: Sequence[Level], closely: bool = False
 ) -> tuple[tuple[Level, ...], float]:
     """Maximise the marginal likelihood over the free levels; return all levels and -2 log L with their prior.
 
@@ -527,18 +110,24 @@ def _maximum(
     Args:
         chain, levels: as above.
         factors: (n,) of the variances of each kind of rows.
-        free: which levels.
-        known: (k,) how well they are, sigmas of their logarithms.
+        closely: whether levels count as known as well as they are, and not roughly.
+
+    Raises:
+        IndeterminateStateError: states or parameters are not determined at these levels.
     """
+    free = _free(chain, levels)
+    known = np.array([levels[i].known if closely else max(levels[i].noise.known, ROUGHLY) for i in free])
     generator = np.random.default_rng(0)
     signs = [generator.choice([-1.0, 1.0], (*rows.residuals.shape, _SIGNS)) for rows in chain.rows]
 
-    def at(u: Array) -> tuple[float, tuple[Level, ...], _Solution | None]:
+    def at(u: Array) -> tuple[float, tuple[Level, ...], LinearSolution | None]:
         scales = dict(zip(free, np.exp(u).tolist(), strict=True))
         tried = tuple(replace(level, scale=scales.get(i, level.scale)) for i, level in enumerate(levels))
         found = chain.solved([v * f for v, f in zip(chain.variances(tried), factors, strict=True)])
         return np.inf if found is None else found.value + float(((u / known) ** 2).sum()), tried, found
 
+    if not free:
+        return tuple(levels), at(np.zeros(0))[0]
     lowest = np.log([max(levels[i].noise.least, 1e-300) for i in free])
     u = np.maximum(np.log([levels[i].scale for i in free]), lowest)
     value, tried, solution = at(u)
@@ -576,7 +165,8 @@ def _maximum(
         for i, level in enumerate(tried)
     )
     missed = chain.prior[:, :-1] @ solution.shared + chain.prior[:, -1]
-    return _effective(chain, found, free, covariance), value - float(missed @ missed)
+    value += chain.log_det_of_process - float(missed @ missed)
+    return _effective(chain, found, free, covariance), value
 
 
 def unwidened(used: Sequence[Mask]) -> Widening:
@@ -596,7 +186,7 @@ def widened(chain: LinearChain, levels: Sequence[Level], widening: Widening) -> 
     rejected = [np.isinf(each) for each in widening]
     stated, kept = chain.variances(levels), chain.variances(levels, unwidened([~each for each in rejected]), NO_SAY)
     residuals = [rows.residuals for rows in chain.rows]
-    if any(rejected[rows.group].any() for rows in chain.rows):
+    if any(rejected[rows.group].any() for rows in chain.rows if rows.is_measurement):
         # Only what was rejected is judged by the residuals that the solution leaves.
         solution = chain.solved(kept)
         if solution is None:
@@ -672,36 +262,6 @@ def _effective(
         size = float(np.sqrt(variance.mean()))
         out[i] = replace(level, effective=(size, size * float(shares @ covariance @ shares) ** 0.5))
     return tuple(out)
-
-
-def add_blocks(to: Array, at: Index, blocks: Array) -> None:
-    """Add blocks (n, ...) to an array at positions that may repeat, as `np.add.at` to the last digit, but faster."""
-    if len(at) and (np.diff(at) > 0).all():
-        to[at] += blocks
-        return
-    order, begins, counts = _queue(at, len(to))
-    for again in range(int(counts.max(initial=0))):
-        some = np.flatnonzero(counts > again)
-        to[some] += blocks[order[begins[some] + again]]
-
-
-def _banded(diagonal: Array, ahead: Array) -> Array:
-    """Upper band of a block-tridiagonal matrix from its diagonal blocks (n, d, d) and those to the next state."""
-    n, d, _ = diagonal.shape
-    u = 2 * d - 1
-    band = np.zeros((u + 1, n * d))
-    for a in range(d):
-        for b in range(d):
-            if b >= a:
-                band[u + a - b, b::d] = diagonal[:, a, b]
-            band[u + a - b - d, d + b :: d] = ahead[:-1, a, b]
-    return band
-
-
-def _queue(state: Index, n: int) -> tuple[Index, Index, Index]:
-    """Order of measurements by state, and the first one (n,) and the number (n,) of each state's."""
-    counts = np.bincount(state, minlength=n)
-    return np.argsort(state, kind="stable"), np.cumsum(counts) - counts, counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -796,21 +356,16 @@ def solve_likelihood(
         levels: to begin with.
         config: of the last minimisation.
     """
-    problem, engine = compiled.problem, compiled.engine
-    used = solution.engine.inliers(solution.values)
-    found = LikelihoodMaximum(solution.values, tuple(levels), unwidened(used))
+    problem = compiled.problem
+    found = LikelihoodMaximum(solution.values, tuple(levels), unwidened(solution.engine.inliers(solution.values)))
     if problem.denser_graph is not None:
-        found = maximise_likelihood(engine, found, rounds=1, from_above=True)
-        denser = problem.denser_graph(found.levels)
-        if denser is not None:
-            known, compiled = compiled, Compiled.of(denser, "chain")
-            engine = compiled.engine
-            late = [g.model.time[np.isinf(w)] for g, w in zip(known.engine.groups, found.widening, strict=True)]
-            times = np.concatenate(late)
-            used = [~(np.isin(g.model.time, times) & g.is_measurement) for g in engine.groups]
-            found = LikelihoodMaximum(_with_parameters(compiled, known, found.values), found.levels, unwidened(used))
-            # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
-            found = replace(found, values=states_first(_engine_at(engine, found), found.values))
+        found = maximise_likelihood(compiled.engine, found, rounds=1, from_above=True)
+        found = replace(found, levels=_with_correlated_error(compiled, found))
+        compiled, found = _for_levels(problem, compiled, found)
+        over_time = _over_best_time(compiled, found)
+        if over_time is not found.levels:
+            compiled, found = _for_levels(problem, compiled, replace(found, levels=over_time))
+    engine = compiled.engine
     for number in range(_MOST_SOLUTIONS):
         before = found.levels
         found = maximise_likelihood(engine, found, 1 if number else _ROUNDS, from_above=not number)
@@ -819,6 +374,87 @@ def solve_likelihood(
         if deadline.passed() or (number and _settled(found.levels, before)):
             break
     return compiled, solution, found.levels
+
+
+def _for_levels(problem: Problem, known: Compiled, found: LikelihoodMaximum) -> tuple[Compiled, LikelihoodMaximum]:
+    """Compile the graph that noise levels need, with the parameters found; the known one where it serves."""
+    graph = problem.at_levels(found.levels)
+    if graph is problem:
+        return known, found
+    compiled = Compiled.of(graph, "chain")
+    late = [g.model.time[np.isinf(w)] for g, w in zip(known.engine.groups, found.widening, strict=True)]
+    times = np.concatenate(late)
+    used = [~(np.isin(g.model.time, times) & g.is_measurement) for g in compiled.engine.groups]
+    found = LikelihoodMaximum(_with_parameters(compiled, known, found.values), found.levels, unwidened(used))
+    # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
+    found = replace(found, values=states_first(_engine_at(compiled.engine, found), found.values))
+    chain = LinearChain.of(compiled.engine, found.values)
+    if chain.process is not None:
+        # Unwidened outliers would pass for noise, and once its level is small what is correlated stays so.
+        found = replace(found, widening=widened(chain, found.levels, found.widening))
+    return compiled, found
+
+
+def _with_correlated_error(compiled: Compiled, found: LikelihoodMaximum) -> tuple[Level, ...]:
+    """Return the noise levels, with that of a correlated error if the recording shows one that matters.
+
+    It shows one if at one of `CORRELATION_TIMES` -2 log L falls by more than one more noise lowers it by chance.
+
+    Args:
+        compiled: the problem, in which such an error is looked for.
+        found: the maximum without it.
+    """
+    error, layout = compiled.problem.correlated_error, compiled.layout
+    if error is None or not error.level.noise.estimated:
+        return found.levels
+    columns = np.flatnonzero(layout.root_columns(error.key)[:, layout.sizes[3] :].any(axis=0))
+    chain = LinearChain.of(compiled.engine, found.values)
+    some, factors = chain.liveliest(chain.factors(found.widening))
+    measured = {rows.family for rows in chain.rows if rows.is_measurement}
+    # What is correlated passes for white noise, however little of that is stated.
+    white = max(each.scale for each in found.levels if measured & {*each.noise.families} and not each.noise.beside)
+    tried = []
+    try:
+        _, without = _maximum(some, factors, found.levels)
+        for time in CORRELATION_TIMES:
+            wider = some.with_error(columns, error.level.noise.stated, time)
+            both = [*factors, *(np.ones(len(rows.time)) for rows in wider.rows[len(factors) :])]
+            tried.append(_maximum(wider, both, (*found.levels, replace(error.level.over(time), scale=white))))
+    except IndeterminateStateError:
+        # All pictures of a part of the chain are rejected.
+        return found.levels
+    levels, value = min(tried, key=lambda each: each[1])
+    return levels if value < without - _CLEARLY and levels[-1].used > error.least else found.levels
+
+
+def _over_best_time(compiled: Compiled, found: LikelihoodMaximum) -> tuple[Level, ...]:
+    """Return the noise levels with the correlation time of largest marginal likelihood; the same if it is near.
+
+    Args:
+        compiled: the problem with a correlated error, or without.
+        found: near the maximum with the correlation time as it is.
+    """
+    from scipy.optimize import minimize_scalar
+
+    known = next((each.noise.correlation_time for each in found.levels if each.noise.correlation_time), None)
+    if known is None:
+        return found.levels
+    chain = LinearChain.of(compiled.engine, found.values)
+    some, factors = chain.liveliest(chain.factors(found.widening), ENOUGH_FOR_TIME)
+    tried: dict[float, tuple[Level, ...]] = {}
+
+    def value(log_time: float) -> float:
+        time, near = float(np.exp(log_time)), [found.levels, *tried.values()][-1]
+        levels = [each.over(time) if each.noise.correlation_time else each for each in near]
+        tried[log_time], least = _maximum(some.with_correlation_time(time), factors, levels)
+        return least
+
+    bounds = np.log([SHORTEST, LONGEST])
+    try:
+        best = float(minimize_scalar(value, bounds=bounds, method="bounded", options={"xatol": _FINELY}).x)
+    except IndeterminateStateError:
+        return found.levels
+    return tried[best] if abs(best - np.log(known)) > _FINELY else found.levels
 
 
 def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Values:

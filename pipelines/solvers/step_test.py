@@ -26,21 +26,18 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.array import Array, Mask
 from alidade.factors.model import ROT3
-from alidade.pipelines.estimation.noise import ROUGHLY, Level
+from alidade.pipelines.estimation.noise import CORRELATED_ERROR, ROUGHLY, Level
 from alidade.pipelines.estimation.problem import APART, Factor, Parameter, StepEstimate
 from alidade.pipelines.solvers.chain import UNDETERMINED, IndeterminateStateError, Index
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import Solution
+from alidade.pipelines.solvers.linear_chain import LinearChain, Rows, Widening, add_blocks
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import (
     NO_SAY,
     SANDWICH_BLOCK_S,
     LikelihoodMaximum,
-    LinearChain,
-    Rows,
-    Widening,
-    add_blocks,
     maximise_likelihood,
     sandwich,
     scores,
@@ -114,7 +111,8 @@ def scan(chain: LinearChain, variances: Sequence[Array], columns: Index) -> Scan
     candidates, time, since = _candidates(chain)
     if not len(candidates):
         return None
-    parts = [_tests(*each, columns) for each in _two_sides(chain, variances, candidates)]
+    process_size = 0 if chain.process is None else chain.process.values.shape[1]
+    parts = [_tests(*each, columns, process_size) for each in _two_sides(chain, variances, candidates)]
     return Scan(candidates, time, since, *(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
@@ -227,8 +225,11 @@ def _alone(chain: LinearChain, variances: Sequence[Array]) -> Array:
     return out
 
 
-def _tests(A: Array, B: Array, X: Array, Y: Array, V: Array, columns: Index) -> tuple[Array, ...]:
-    """Test statistics of candidates: fall of chi-square, fall by motion alone, their distance, step, information."""
+def _tests(A: Array, B: Array, X: Array, Y: Array, V: Array, columns: Index, process_size: int) -> tuple[Array, ...]:
+    """Test statistics of candidates: fall of chi-square, fall by motion alone, their distance, step, information.
+
+    With motion alone the attitude is free to jump, and not the last `process_size` numbers of a state, a process.
+    """
     q, d = A.shape[1], len(columns)
     at = np.append(np.arange(q), 1 + columns)
     alone = B[:, at[:, None], at]
@@ -237,6 +238,9 @@ def _tests(A: Array, B: Array, X: Array, Y: Array, V: Array, columns: Index) -> 
     link = Y[..., at]
     link[..., :q] -= X
     joined = alone + np.swapaxes(link, 1, 2) @ np.linalg.solve(V, link)
+    if process_size:
+        link, V = link[:, -process_size:], V[:, -process_size:, -process_size:]
+        alone = alone + np.swapaxes(link, 1, 2) @ np.linalg.solve(V, link)
     fall, step, information = _step_of(joined, q)
     by_motion, moved, of_motion = _step_of(alone, q)
     return fall, by_motion, _square(of_motion, moved - step), step, information
@@ -449,8 +453,8 @@ def _returns(fit: _Fit, columns: Index, time: float, turn: Array) -> bool:
 
 
 def _leads_to(rows: Rows, keyframe: int) -> Mask:
-    """Mask (n,) of rows that join a keyframe to its predecessor."""
-    if len(rows.states) != 2:
+    """Mask (n,) of rows that join a keyframe's attitude to its predecessor."""
+    if len(rows.states) != 2 or rows.family == CORRELATED_ERROR:
         return np.zeros(len(rows.time), dtype=bool)
     return np.asarray(rows.states[1][0] == keyframe)
 

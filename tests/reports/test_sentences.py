@@ -161,6 +161,12 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "include their uncertainty.",
     ),
     (
+        "correlated_error",
+        NOTE,
+        {"noise": "vision_correlated", "unit": "rad", "used": 8.7e-3, "correlation_time": 0.34},
+        "vision_correlated: errors are correlated in time, 0.50 deg, correlation time 0.34 s. Sigmas include them.",
+    ),
+    (
         "slow_error",
         NOTE,
         {"parameter": "helmet_mount_z", "ratio": 2.46},

@@ -18,8 +18,9 @@ from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.linear_chain import LinearChain
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels, widened
+from alidade.pipelines.solvers.marginal_likelihood import estimate_levels, widened
 from alidade.pipelines.solvers.robust import solve_robust
 
 SCENARIO = HeadScenario.model_validate(

@@ -19,8 +19,9 @@ from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.linear_chain import LinearChain
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.marginal_likelihood import LinearChain, sandwich, scores
+from alidade.pipelines.solvers.marginal_likelihood import sandwich, scores
 from alidade.pipelines.solvers.robust import solve_robust
 from alidade.pipelines.solvers.step_test import STEP_PRIOR, sandwich_ratios, scan, split
 
@@ -65,9 +66,17 @@ def found(data: HeadData) -> tuple[Estimate, Finding | None]:
     return estimate, step_finding(estimate.steps, DURATION_S, of.quantities)
 
 
-def test_the_scan_is_exact() -> None:
+@pytest.mark.parametrize("lasting", [False, True], ids=["white noise", "an error that lasts"])
+def test_the_scan_is_exact(lasting: bool) -> None:
     """Falls of chi-square by two filters are those of the chain with the step in it."""
-    compiled = Compiled.of(problem(slipped(recorded(1), 0.5, 12.0)), "chain")
+    of = problem(slipped(recorded(1), 0.5, 12.0))
+    if lasting:
+        assert of.correlated_error is not None
+        assert of.denser_graph is not None
+        found = of.denser_graph((*of.noises, replace(of.correlated_error.level.over(0.3), scale=0.5)))
+        assert found is not None
+        of = found
+    compiled = Compiled.of(of, "chain")
     engine = compiled.engine
     assert isinstance(engine, Linearization)
     values = solve_robust(engine, compiled.initial, compiled.problem.loss).values
@@ -83,7 +92,7 @@ def test_the_scan_is_exact() -> None:
         joined = with_step.solved(variances)
         alone = with_step.solved(
             [
-                np.where(rows.states[-1][0] == tested.keyframe[i], np.inf, v) if len(rows.states) == 2 else v
+                np.where(rows.states[-1][0] == tested.keyframe[i], np.inf, v) if rows.family == "gyro" else v
                 for rows, v in zip(with_step.rows, variances, strict=True)
             ]
         )

@@ -17,6 +17,7 @@ from alidade.factors import so3
 from alidade.factors.array import Array, Index, Mask
 from alidade.factors.attitude import FADE, OFFSET_COLUMN, SKEW_COLUMN, VisionAttitudeFactor
 from alidade.factors.chi_square import gate
+from alidade.factors.gauss_markov import GaussMarkovFactor
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.display.drawing import swaying
@@ -25,18 +26,18 @@ from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
 from alidade.pipelines.estimation.error_map import ErrorMap
 from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, shared_keyframes
-from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.noise import CORRELATED_ERROR, Level, Noise
 from alidade.pipelines.estimation.parameters import DEAD_BAND, acting
 from alidade.pipelines.estimation.parameters import stated as stated_figure
 from alidade.pipelines.estimation.priors import prior_of
-from alidade.pipelines.estimation.problem import Attitudes, Estimate, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Attitudes, CorrelatedError, Estimate, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.formula import clock_constants
 from alidade.pipelines.methods.head.initial_values import guess, guess_camera, guess_picture_clock
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, VISION_MAP, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.report import at_gyro_rate, between
-from alidade.pipelines.methods.noise import at_least_at_rest, estimated, mean_at_rest, sampled, stated, typical
+from alidade.pipelines.methods.noise import HARDLY, at_least_at_rest, estimated, mean_at_rest, sampled, stated, typical
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.recording.plausibility import DEAD_BAND as HAS_DEAD_BAND
 from alidade.pipelines.recording.plausibility import dead_band, hidden
@@ -55,7 +56,7 @@ _NEAR = 0.1
 _FEWEST_FRAMES = 10
 # Attitudes of which a larger share is turned by half a turn are no outliers.
 _FEW_OUTLIERS = 0.02
-_FAMILY = "vision"
+_FAMILY, _CORRELATED = "vision", "vision_correlated"
 
 # Stated in the report where it is assumed.
 _AT_REST = "No platform IMU: the platform counts as at rest."
@@ -114,9 +115,10 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference) | clock_constants(model.parameters.picture, model.clock.begun),
         keyframes=Keyframes(model.clock, _NEAR),
-        layout=LAYOUT,
+        layout=replace(LAYOUT, states="xu"),
         marginal_likelihood=True,
         step_candidates=(model.parameters.helmet.key,),
+        correlated_error=_correlated_error(config, model),
         denser_graph=partial(_denser_graph, config, data, model),
         error_map=partial(_error_map, config, model),
     )
@@ -145,18 +147,21 @@ def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | 
 
 
 def _denser_graph(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
-    """Build the graph with finer keyframes where the noise levels require it; see Problem.denser_graph."""
+    """Build the graph that the noise levels require; see Problem.denser_graph."""
     noises = model.noises | {level.noise.name: level for level in levels}
-    if _shared(data, noises) > 0.5 * model.origins[2]:
+    if _CORRELATED not in noises and _shared(data, noises) > 0.5 * model.origins[2]:
         return None
     return replace(_problem(config, data, _prepare(data, config, clock=model.clock, noises=noises)), denser_graph=None)
 
 
 def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
-    """Time, s, within which pictures share a keyframe, since gyro noise adds little to vision's."""
+    """Time, s, within which pictures share a keyframe, since gyro noise and vision's correlated error change little."""
     density = [noises["gyro_density"].used, noises["gyro_rate_noise"].used * _rate(data)]
     if "platform_gyro_density" in noises:
         density.append(noises["platform_gyro_density"].used)
+    if (error := noises.get(_CORRELATED)) is not None:
+        assert error.noise.correlation_time is not None
+        density.append(error.used * float(np.sqrt(2.0 / error.noise.correlation_time)))
     vision = noises["vision_attitude"].used, noises["vision_rate_noise"].used * _rate(data)
     return min(_SHARED, _NEGLIGIBLE**2 * float(np.square(vision).sum()) / max(float(np.square(density).sum()), 1e-300))
 
@@ -189,6 +194,14 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
         platform = stated("platform_gyro_density", config, data.platform_gyro_density)
         found.append(sampled(platform, data.platform_t, data.platform_gyro))
     return {level.noise.name: level for level in found}
+
+
+def _correlated_error(config: Config, model: _Model) -> CorrelatedError:
+    """Vision's correlated error: as large as its noise, within a factor 7, and larger than the data sheet's map."""
+    vision = model.noises["vision_attitude"].noise
+    noise = Noise(_CORRELATED, vision.stated, "default", vision.known and HARDLY, (CORRELATED_ERROR,))
+    level = _bounded(Level(noise), vision.spec.no_noise)
+    return CorrelatedError(model.parameters.helmet.key, level, stated_figure(config, VISION_MAP))
 
 
 def _continuation(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
@@ -353,14 +366,47 @@ def _step(model: _Model, keyframes: range) -> Step:
     chain = model.chain
     step = Step(
         time=float(chain.time[keyframes[-1]]),
-        predict=partial(chain.predict, keyframes, lambda k, _: chain.initial[k]),
+        predict=partial(_predicted, model, keyframes),
         keyframes=chain.numbers(keyframes),
     )
     if chain.first + keyframes.start == 0:
         _begin(model, step)
     chain.add(step, keyframes)
+    if _CORRELATED in model.noises:
+        _add_correlated_error(model, step, keyframes)
     step.factors.extend(_vision_factor(model, keyframes))
     return step
+
+
+def _add_correlated_error(model: _Model, step: Step, keyframes: range) -> None:
+    """Add vision's correlated error at keyframes, and its transitions to these."""
+    time, noise = model.chain.time, model.noises[_CORRELATED].noise
+    assert noise.correlation_time is not None
+    error = partial(GaussMarkovFactor, sigma=noise.stated, correlation_time=noise.correlation_time)
+    for k in keyframes:
+        step.initial.insert(_error_key(model, k), np.zeros(3))
+        step.timestamps[_error_key(model, k)] = float(time[k])
+    if keyframes.start == 0:
+        step.factors.append(Factor.process_of(CORRELATED_ERROR, error(time[:1]).on(_error_key(model, 0))))
+    after = np.arange(max(keyframes.start, 1), keyframes.stop)
+    if len(after):
+        keys = [[_error_key(model, int(k)) for k in each] for each in (after - 1, after)]
+        moved = error(time[after], interval=time[after] - time[after - 1])
+        step.factors.append(Factor.process_of(CORRELATED_ERROR, moved.on(*keys)))
+
+
+def _error_key(model: _Model, keyframe: int) -> int:
+    """Key of vision's correlated error at a keyframe, (3,) rad."""
+    return int(gtsam.symbol("u", model.chain.first + keyframe))
+
+
+def _predicted(model: _Model, keyframes: range, current: gtsam.Values) -> gtsam.Values:
+    """Initial values of a step's variables, from the current estimate."""
+    out = model.chain.predict(keyframes, lambda k, _: model.chain.initial[k], current)
+    if _CORRELATED in model.noises:
+        for k in keyframes:
+            out.insert(_error_key(model, k), np.zeros(3))
+    return out
 
 
 def _begin(model: _Model, step: Step) -> None:
@@ -404,10 +450,12 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
         expected=model.taken[rows],
         elapsed=model.elapsed[rows] if p.has_picture_errors else None,
         first=np.broadcast_to(model.first, (len(rows), 4)) if p.has_picture_errors else None,
+        correlated=_CORRELATED in model.noises,
     )
     states = [chain.state(k) for k in of]
-    keys = p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys
-    bound = seen.on(states, chain.bias_keys(of), *keys, loss=model.loss)
+    keys = [p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys]
+    errors = [[_error_key(model, k) for k in of]] if seen.correlated else []
+    bound = seen.on(states, chain.bias_keys(of), *keys, *errors, loss=model.loss)
     return [Factor.of(_FAMILY, bound, np.linalg.norm(_rate_in_pictures(model, rows), axis=1) * less / sigma)]
 
 
