@@ -412,14 +412,15 @@ def _with_correlated_error(compiled: Compiled, found: LikelihoodMaximum) -> tupl
     some, factors = chain.liveliest(chain.factors(found.widening))
     measured = {rows.family for rows in chain.rows if rows.is_measurement}
     # What is correlated passes for white noise, however little of that is stated.
-    white = max(each.scale for each in found.levels if measured & {*each.noise.families} and not each.noise.beside)
+    white = max(each.used for each in found.levels if measured & {*each.noise.families} and not each.noise.beside)
+    start = replace(error.level, scale=white / error.level.noise.stated)
     tried = []
     try:
         _, without = _maximum(some, factors, found.levels)
         for time in CORRELATION_TIMES:
             wider = some.with_error(columns, error.level.noise.stated, time)
             both = [*factors, *(np.ones(len(rows.time)) for rows in wider.rows[len(factors) :])]
-            tried.append(_maximum(wider, both, (*found.levels, replace(error.level.over(time), scale=white))))
+            tried.append(_maximum(wider, both, (*found.levels, start.over(time))))
     except IndeterminateStateError:
         # All pictures of a part of the chain are rejected.
         return found.levels

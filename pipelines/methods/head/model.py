@@ -197,9 +197,10 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
 
 
 def _correlated_error(config: Config, model: _Model) -> CorrelatedError:
-    """Vision's correlated error: as large as its noise, within a factor 7, and larger than the data sheet's map."""
+    """Vision's correlated error: as its default noise, within a factor 7, and larger than the data sheet's map."""
     vision = model.noises["vision_attitude"].noise
-    noise = Noise(_CORRELATED, vision.stated, "default", vision.known and HARDLY, (CORRELATED_ERROR,))
+    assert vision.spec.default is not None
+    noise = Noise(_CORRELATED, vision.spec.default, "default", vision.known and HARDLY, (CORRELATED_ERROR,))
     level = _bounded(Level(noise), vision.spec.no_noise)
     return CorrelatedError(model.parameters.helmet.key, level, stated_figure(config, VISION_MAP))
 
