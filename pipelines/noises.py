@@ -26,8 +26,8 @@ class NoiseSpec:
     no_noise: float = np.inf
 
 
-# Blurred and distant tags scatter by two or three times the default; attitudes that scatter by 3.5 deg serve nobody; no
-# gyro at rest has more than 3e-3 rad/s/sqrt(Hz).
+# Blurred and distant tags scatter by two or three times the default; attitudes that scatter by 3.5 deg serve nobody;
+# half as much, over a second, is a platform that sways; no gyro at rest has more than 3e-3 rad/s/sqrt(Hz).
 _SPECS = (
     NoiseSpec("gyro_density", "rad/s/√Hz", "Gyro white noise.", 5.0e-5, 3.0e-3),
     NoiseSpec("gyro_rate_noise", "1/√Hz", "Gyro white noise that grows with the rate.", 5.0e-5),
@@ -43,7 +43,7 @@ _SPECS = (
     NoiseSpec(
         "vision_rate_noise", "s", "Vision attitude noise proportional to the rate, per picture and axis.", 1.0e-4
     ),
-    NoiseSpec("vision_correlated", "rad", "Vision attitude error that is correlated in time, per axis."),
+    NoiseSpec("vision_correlated", "rad", "Vision attitude error that is correlated in time, per axis.", None, 3.05e-2),
     NoiseSpec("corner_px", "px", "Tag corner in a picture, per axis.", 0.3, 1.5),
     NoiseSpec("gyro_repeatability", "rad/s", "Gyro mean at rest, beyond white noise.", 2.0e-5),
     NoiseSpec("turn_repeatability", "", "Angle turned between rests, beyond white noise.", 1.0e-3),

@@ -312,7 +312,7 @@ class CorrelatedError:
     Attributes:
         key: of the rotation.
         level: of its noise, rad, as far as it is known beforehand.
-        least: sigma, rad, of errors that matter; smaller ones are assumed of any sensor.
+        least: sigma, rad, of errors that are material; smaller ones stay noise.
     """
 
     key: int

@@ -57,6 +57,8 @@ _FEWEST_FRAMES = 10
 # Attitudes of which a larger share is turned by half a turn are no outliers.
 _FEW_OUTLIERS = 0.02
 _FAMILY, _CORRELATED = "vision", "vision_correlated"
+# Share of what is required of a mount from which on an error of vision is material.
+_MATERIAL = 0.5
 
 # Stated in the report where it is assumed.
 _AT_REST = "No platform IMU: the platform counts as at rest."
@@ -118,7 +120,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         layout=replace(LAYOUT, states="xu"),
         marginal_likelihood=True,
         step_candidates=(model.parameters.helmet.key,),
-        correlated_error=_correlated_error(config, model),
+        correlated_error=_correlated_error(model),
         denser_graph=partial(_denser_graph, config, data, model),
         error_map=partial(_error_map, config, model),
     )
@@ -196,13 +198,13 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     return {level.noise.name: level for level in found}
 
 
-def _correlated_error(config: Config, model: _Model) -> CorrelatedError:
-    """Vision's correlated error: as its default noise, within a factor 7, and larger than the data sheet's map."""
+def _correlated_error(model: _Model) -> CorrelatedError:
+    """Vision's correlated error: as its default noise, within a factor 7, if it is material for the mount."""
     vision = model.noises["vision_attitude"].noise
     assert vision.spec.default is not None
     noise = Noise(_CORRELATED, vision.spec.default, "default", vision.known and HARDLY, (CORRELATED_ERROR,))
-    level = _bounded(Level(noise), vision.spec.no_noise)
-    return CorrelatedError(model.parameters.helmet.key, level, stated_figure(config, VISION_MAP))
+    helmet = model.parameters.helmet
+    return CorrelatedError(helmet.key, Level(noise), _MATERIAL * min(q.require for q in helmet.quantities))
 
 
 def _continuation(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
