@@ -412,8 +412,10 @@ def _with_correlated_error(compiled: Compiled, found: LikelihoodMaximum) -> tupl
     some, factors = chain.liveliest(chain.factors(found.widening))
     measured = {rows.family for rows in chain.rows if rows.is_measurement}
     # What is correlated passes for white noise, however little of that is stated.
-    white = max(each.used for each in found.levels if measured & {*each.noise.families} and not each.noise.beside)
-    start = replace(error.level, scale=white / error.level.noise.stated)
+    white = [each.used for each in found.levels if measured & {*each.noise.families} and not each.noise.beside]
+    if not white:
+        return found.levels
+    start = replace(error.level, scale=max(white) / error.level.noise.stated)
     tried = []
     try:
         _, without = _maximum(some, factors, found.levels)
