@@ -34,6 +34,7 @@ EXIT_OF_VALIDATION = {
 _LONGEST = 2000
 # What people call a noise density.
 _DENSITY = ("noise", "sigma")
+# Endings of archives and of compressed files.
 _PACKED = {".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".xz", ".zip", ".zst"}
 
 

@@ -104,7 +104,7 @@ class Times:
         return bool(min(last, end) - max(first, begin) > 0.5 * max(last - first, end - begin))
 
     def _seconds(self, i: int) -> Array:
-        """Times of a column, s."""
+        """Times in a column of the table, with the nanoseconds beside it if there are such, converted to s."""
         if i in self._nanoseconds_of:
             return np.asarray(self.values[i] + 1e-9 * self.values[self._nanoseconds_of[i]])
         return np.asarray(self.values[i] * (1e-9 * TIME_UNITS[self._unit_of_time(i)[0]]))
@@ -132,7 +132,7 @@ class Times:
         return self._given[chosen]
 
     def _unit_of_time(self, i: int) -> tuple[str, str]:
-        """Return the time unit of a column (s, ms, us, ns), and whether its header or its steps tell it."""
+        """Return the time unit of a column (s, ms, us, ns), and by what: its header, or its steps."""
         stated = self.form.stated_unit(i) or _unit_word(bare_name(self.form.names[i]))
         unit = stated if stated in TIME_UNITS else _time_unit(self.values[i])
         return unit, "header" if stated == unit else "steps"
