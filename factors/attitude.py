@@ -84,9 +84,9 @@ class VisionAttitudeFactor(Model):
 
     def __call__(self, bRv: Array, bias: Array, cRb: Array, vRh: Array, picture: Array, *others: Array) -> Residuals:
         """Residual sqrt_information * Log(predicted^T measured), (n, 3)."""
-        of_gyros, wandered = (others[:-1], others[-1]) if self.correlated else (others, None)
+        of_gyros, u = (others[:-1], others[-1]) if self.correlated else (others, None)
         errors, platform = parted(of_gyros, self.errors > 0)
-        vRh = vRh if wandered is None else so3.multiply(vRh, so3.exp(wandered))
+        vRh = vRh if u is None else so3.multiply(vRh, so3.exp(u))
         at, by_at = self.exposed(picture)
         anchor = self.time if self.anchor is None else self.anchor
         middle = 0.5 * (anchor + (self.time if self.expected is None else self.expected))
@@ -116,17 +116,17 @@ class VisionAttitudeFactor(Model):
             by_bRv = unfiltered + by_filtered @ filtered_by_turn
             by_platform = by_bRv @ so3.matrix(so3.inverse(bRv))
             by_bias, *by_errors = (by_bRv @ each for each in by_gyro())
-            by_wandered = () if wandered is None else (weight @ so3.right_jacobian(wandered),)
+            by_u = () if u is None else (weight @ so3.right_jacobian(u),)
             # The columns of the pictures' errors stand as in PICTURE_ERRORS.
             return (
                 by_bRv @ so3.matrix(so3.inverse(dV)),
                 by_bias,
                 by_cRb,
-                weight if wandered is None else weight @ so3.matrix(so3.exp(-wandered)),
+                weight if u is None else weight @ so3.matrix(so3.exp(-u)),
                 np.concatenate([by_times, by_picture, *by_filter], axis=2),
                 *by_errors,
                 *(-by_platform @ each for each in by_platform_errors(by_dB, platform)),
-                *by_wandered,
+                *by_u,
             )
 
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians

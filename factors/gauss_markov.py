@@ -50,18 +50,15 @@ class GaussMarkovFactor(Model):
 
     def __call__(self, *processes: Array) -> Residuals:
         """Residual (u_k - phi u_k-1) / (sigma sqrt(1 - phi^2)), (n, 3); of the start u / sigma."""
-        scales = transition_scales(self.sigma, self.correlation_time, self.interval)
-        parts = [scale[:, None] * u for scale, u in zip(scales, processes, strict=True)]
-        n = len(self.time)
-        return sum(parts, np.zeros((n, 3))), lambda: tuple(
-            np.broadcast_to(scale[:, None, None] * np.eye(3), (n, 3, 3)) for scale in scales
-        )
+        n, scales = len(self.time), self._scales
+        residuals = sum((scale[:, None] * u for scale, u in zip(scales, processes, strict=True)), np.zeros((n, 3)))
+        return residuals, lambda: tuple(scale[:, None, None] * np.eye(3) for scale in scales)
 
-
-def transition_scales(sigma: float, correlation_time: float, interval: Array | None) -> tuple[Array, ...]:
-    """Factors (n or 1,) of the process before and after a transition in its whitened residual; of a start one."""
-    if interval is None:
-        return (np.array([1.0 / sigma]),)
-    phi = remaining(interval, correlation_time)
-    unit = 1.0 / (sigma * np.sqrt(1.0 - phi**2))
-    return -phi * unit, unit
+    @property
+    def _scales(self) -> tuple[Array, ...]:
+        """Factors (n,) of the process before and after in the whitened residual; of the start one."""
+        if self.interval is None:
+            return (np.full(len(self.time), 1.0 / self.sigma),)
+        phi = remaining(self.interval, self.correlation_time)
+        unit = 1.0 / (self.sigma * np.sqrt(1.0 - phi**2))
+        return -phi * unit, unit

@@ -189,8 +189,7 @@ def _badges(c: Calibration) -> Iterator[Badge]:
             yield Badge(f"{100.0 * share:.0f} % of {family} rejected", "warn", "measurements that fit no solution")
     for n in c.noises:
         if n.correlation_time is not None:
-            unit, factor = noise_unit(n.name, n.unit)
-            size = f"{rounded(factor * n.used)} {unit}, correlation time {rounded(n.correlation_time)} s"
+            size = sentences.correlated_size(n.name, n.unit, n.used, n.correlation_time)
             yield Badge(f"{n.name} {size}", "warn", "errors correlated in time, included in all sigmas")
         elif n.stated and not 1.0 / _NOTABLE_NOISE < n.used / n.stated < _NOTABLE_NOISE:
             by = "the default" if n.source == "default" else "stated"
@@ -494,9 +493,10 @@ def _noise(c: Calibration) -> Table | None:
         estimated = "" if n.estimated is None else to_digits_of(factor * n.estimated, factor * (n.sigma or 0.0))
         sigma = "" if n.sigma is None else f" ± {rounded(factor * n.sigma)}"
         what = specs[n.name].description if n.name in specs else n.name
-        name = Cell(n.name, hint=f"{what} Stated by {n.source}; {n.used:.3g} {n.unit} used.")
-        stated = rounded(factor * n.stated, 3)
-        if n.correlation_time is not None:
+        if n.correlation_time is None:
+            name = Cell(n.name, hint=f"{what} Stated by {n.source}; {n.used:.3g} {n.unit} used.")
+            stated = rounded(factor * n.stated, 3)
+        else:
             name, stated = Cell(f"{n.name}, {rounded(n.correlation_time)} s", hint=what), ""
         inflation = (f"{n.inflation:.2f}" if n.inflation > 1.0 else "",) if inflated else ()
         numbers = (stated, estimated + sigma, rounded(factor * n.used, 3))

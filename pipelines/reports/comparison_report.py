@@ -126,19 +126,24 @@ def comparison_summary(comparison: Comparison) -> Summary:
     steps = {
         "yes": ("Go by the batch solver's result, and apply it.",),
         "cannot say": ("Record about twice as long.",) if comparison.tested and not comparison.stopped else (),
-        "no": (
-            "Ask what happened between the halves: a knock, a cable, warming up; a gyro's bias walks, and may differ "
-            "for that."
-            if comparison.far
-            else "Go by batch: it models that vision's errors are correlated in time, incremental does not."
-            if any(noise.correlation_time is not None for each in comparison.calibrations for noise in each.noises)
-            else "Go by batch; give incremental a longer `--window`.",
-        ),
+        "no": (_after_disagreement(comparison),),
     }[comparison.answer]
     stopped = (comparison.stopped.removesuffix("."),) if comparison.stopped else ()
     notes = (*comparison.calibrations[0].facts.notes, *stopped)
     question = f"Do the solvers{' and both halves' if comparison.tested else ''} agree?"
     return Summary(question, comparison.answer, tone, text, notes, steps)
+
+
+def _after_disagreement(comparison: Comparison) -> str:
+    """What to do where halves or solvers disagree, a sentence."""
+    if comparison.far:
+        return (
+            "Ask what happened between the halves: a knock, a cable, warming up; a gyro's bias walks, and may differ "
+            "for that."
+        )
+    if any(noise.correlation_time is not None for each in comparison.calibrations for noise in each.noises):
+        return "Go by batch: it models that vision's errors are correlated in time, incremental does not."
+    return "Go by batch; give incremental a longer `--window`."
 
 
 def _solvers_agree(comparison: Comparison) -> str:

@@ -310,10 +310,14 @@ def _noise(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     return f"Noise {e['noise']}: {used} used, {e['factor']:.2g} times the {e['source']}'s value."
 
 
+def correlated_size(noise: str, unit: str, used: float, correlation_time: float) -> str:
+    """Describe a correlated error by its size, SI, in the unit that people use, and its correlation time, s."""
+    shown, factor = noise_unit(noise, unit)
+    return f"{rounded(factor * used)} {shown}, correlation time {rounded(correlation_time)} s"
+
+
 def _correlated_error(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
-    unit, factor = noise_unit(e["noise"], e["unit"])
-    size = f"{rounded(factor * e['used'])} {unit}, correlation time {rounded(e['correlation_time'])} s"
-    return f"{e['noise']}: errors are correlated in time, {size}. Sigmas include them."
+    return f"{e['noise']}: errors are correlated in time, {correlated_size(**e)}. Sigmas include them."
 
 
 def _error_map(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from alidade.factors.array import Array, Mask
 from alidade.factors.chi_square import gate
-from alidade.factors.gauss_markov import GaussMarkovFactor, transition_scales
+from alidade.factors.gauss_markov import GaussMarkovFactor
 from alidade.pipelines.estimation.noise import CORRELATED_ERROR, Level, Noise
 from alidade.pipelines.solvers.chain import Index
 from alidade.pipelines.solvers.layout import Values
@@ -60,16 +60,20 @@ class Rows:
     is_measurement: bool
 
     def of(self, kept: Mask, renumbered: Index) -> Rows:
-        """Select some rows and renumber their states."""
+        """Select some of the linearised rows, and renumber the states that they are about."""
         states = tuple((renumbered[i[kept]], J[kept]) for i, J in self.states)
         beside, fixed = (None if each is None else each[kept] for each in (self.beside, self.fixed))
         parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside, fixed)
         return Rows(self.family, self.group, *parts, self.is_measurement)
 
-    @property
-    def starts_process(self) -> bool:
-        """Whether these are the rows with which a Gauss-Markov process begins."""
-        return self.family == CORRELATED_ERROR and len(self.states) == 1
+    @cached_property
+    def products(self) -> tuple[Array, list[Array], Array | None, list[Array], list[Array]]:
+        """Products of the rows that no noise level changes: squares, J'J, J_i'J_j, J'r and J'J_shared."""
+        r, transposed = self.residuals, [np.swapaxes(J, 1, 2) for _, J in self.states]
+        own = [Jt @ J for Jt, (_, J) in zip(transposed, self.states, strict=True)]
+        crossed = transposed[0] @ self.states[1][1] if len(self.states) == 2 else None
+        projected = [(Jt @ r[..., None])[..., 0] for Jt in transposed]
+        return np.square(r).sum(axis=1), own, crossed, projected, [Jt @ self.shared for Jt in transposed]
 
     def right(self, some: Any = ..., by_shared: bool = True) -> Array:
         """Residuals of selected rows, with the Jacobian by the shared parameters beside: (n, m, 1 + p or 1)."""
@@ -95,7 +99,7 @@ class Rows:
         return (self._added(level) if level.noise.beside else self._white(levels)) / self.variance(levels)
 
     def _white(self, levels: Sequence[Level]) -> Array:
-        """Contribution (n,) of the rows' own noise to their variance, relative to the stated one."""
+        """Variance (n,) that the rows have by their own noise, relative to the stated variance."""
         out = np.ones(len(self.time)) if self.fixed is None else 1.0 - self.fixed
         for level in levels:
             if self.has(level.noise) and not level.noise.beside:
@@ -103,7 +107,7 @@ class Rows:
         return out
 
     def _added(self, level: Level) -> Array:
-        """Contribution (n,) of an additional noise to the rows' variance, relative to the stated one."""
+        """Variance (n,) that a noise beside the rows' own adds to them, relative to the stated variance."""
         assert self.beside is not None
         return np.asarray((level.used * self.beside) ** 2)
 
@@ -129,10 +133,6 @@ class Process:
     sigma: float
     correlation_time: float
     values: Array
-
-    def scales(self, interval: Array | None) -> tuple[Array, ...]:
-        """Factors of the process before and after some intervals, or at its start, see `transition_scales`."""
-        return transition_scales(self.sigma, self.correlation_time, interval)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,24 +216,19 @@ class LinearChain:
         """Return the chain with the rows of a Gauss-Markov process, in place of those that it has."""
         if process is None:
             return self
-        (n, d), p, u = self.size, self.prior.shape[1] - 1, process.values
-        drafts, transitions = list(self._measured), ((np.arange(1), None), (np.arange(1, n), np.diff(self.times)))
-        for now, interval in transitions:
-            scales = process.scales(interval)
-            of = [now - len(scales) + 1 + i for i in range(len(scales))]
-            by_state = np.zeros((len(scales), len(now), 3, d))
-            for J, scale in zip(by_state, scales, strict=True):
-                J[..., d - 3 :] = scale[:, None, None] * np.eye(3)
-            residuals = sum(
-                (scale[:, None] * u[i] for i, scale in zip(of, scales, strict=True)), np.zeros((len(now), 3))
-            )
-            states, shared = tuple(zip(of, by_state, strict=True)), np.zeros((len(now), 3, p))
-            drafts.append(Rows(CORRELATED_ERROR, -1, self.times[now], residuals, states, shared, None, None, False))
+        (n, d), p, drafts = self.size, self.prior.shape[1] - 1, list(self._without_process)
+        for now, interval in ((np.arange(1), None), (np.arange(1, n), np.diff(self.times))):
+            model = GaussMarkovFactor(self.times[now], process.sigma, process.correlation_time, interval)
+            of = [now] if interval is None else [now - 1, now]
+            residuals, jacobians = model(*(process.values[i] for i in of))
+            states = [(i, np.pad(J, ((0, 0), (0, 0), (d - 3, 0)))) for i, J in zip(of, jacobians(), strict=True)]
+            shared = np.zeros((len(now), 3, p))
+            drafts.append(Rows(CORRELATED_ERROR, -1, model.time, residuals, tuple(states), shared, None, None, False))
         return replace(self, rows=tuple(drafts), process=process)
 
     @property
-    def _measured(self) -> tuple[Rows, ...]:
-        """Rows but for those of the process."""
+    def _without_process(self) -> tuple[Rows, ...]:
+        """Rows but for those of the process, which are the last ones."""
         return tuple(rows for rows in self.rows if rows.family != CORRELATED_ERROR)
 
     def with_correlation_time(self, correlation_time: float) -> LinearChain:
@@ -244,10 +239,12 @@ class LinearChain:
     @property
     def log_det_of_process(self) -> float:
         """Log det of the covariance that the process's rows are whitened by; 0 without one."""
-        if self.process is None:
-            return 0.0
-        scales = [self.process.scales(each)[-1] for each in (None, np.diff(self.times))]
-        return -6.0 * float(np.log(np.concatenate(scales)).sum())
+        own = [rows.states[-1][1][..., -3:] for rows in self.rows if rows.family == CORRELATED_ERROR]
+        return -2.0 * float(sum(np.linalg.slogdet(J)[1].sum() for J in own))
+
+    def with_process_factors(self, factors: Sequence[Array]) -> list[Array]:
+        """Variance factors (n,) of each kind of rows from those without the process, whose own are 1."""
+        return [*factors, *(np.ones(len(rows.time)) for rows in self.rows[len(factors) :])]
 
     def liveliest(self, factors: list[Array], most: int = ENOUGH_KEYFRAMES) -> tuple[LinearChain, list[Array]]:
         """Keep about `most` keyframes, half of them in the pieces with most motion; select `factors` alike.
@@ -269,13 +266,12 @@ class LinearChain:
         chosen[rest[np.linspace(0, len(rest) - 1, wanted - wanted // 2).astype(int)]] = True
         kept = chosen[pieces]
         renumbered = np.cumsum(kept) - 1
-        measured, process = self._measured, self.process
-        inside = [np.all([np.ones(len(r.time), bool), *(kept[i] for i, _ in r.states)], axis=0) for r in measured]
-        some = tuple(rows.of(own, renumbered) for rows, own in zip(measured, inside, strict=True))
+        process, each = self.process, self._without_process
+        inside = [np.all([np.ones(len(r.time), bool), *(kept[i] for i, _ in r.states)], axis=0) for r in each]
+        some = tuple(rows.of(own, renumbered) for rows, own in zip(each, inside, strict=True))
         part = replace(self, size=(int(kept.sum()), self.size[1]), rows=some, times=self.times[kept])
         part = part._with_process(process and replace(process, values=process.values[kept]))
-        selected = [each[own] for each, own in zip(factors, inside, strict=False)]
-        return part, [*selected, *(np.ones(len(rows.time)) for rows in part.rows[len(measured) :])]
+        return part, part.with_process_factors([factor[own] for factor, own in zip(factors, inside, strict=False)])
 
     def reversed(self) -> LinearChain:
         """Return the same chain with its states in the opposite order."""
@@ -311,9 +307,8 @@ class LinearChain:
         Hd, Ho, Hs, g = np.zeros((n, d, d)), np.zeros((n, d, d)), np.zeros((n, d, p)), np.zeros((n, d))
         Hss, gs = self.prior[:, :p].T @ self.prior[:, :p], self.prior[:, :p].T @ self.prior[:, p]
         total, weights = float((self.prior[:, p] ** 2).sum()), []
-        for rows, variance, (square, own, crossed, projected, mixed) in zip(
-            self.rows, variances, self._products, strict=True
-        ):
+        for rows, variance in zip(self.rows, variances, strict=True):
+            square, own, crossed, projected, mixed = rows.products
             counted = np.isfinite(variance)
             w = np.where(counted, 1.0 / variance, 0.0)
             weights.append(np.sqrt(w))
@@ -340,20 +335,8 @@ class LinearChain:
         value = chi_square + 2.0 * float(np.log(root[-1]).sum() + np.log(np.diag(small)).sum())
         return replace(found, states=states[:, 0], shared=shared[:, 0], value=value)
 
-    @cached_property
-    def _products(self) -> list[tuple[Array, list[Array], Array | None, list[Array], list[Array]]]:
-        """Products of each kind of rows that no level changes: squares, J'J, J_i'J_j, J'r and J'J_shared."""
-        found = []
-        for rows in self.rows:
-            r, transposed = rows.residuals, [np.swapaxes(J, 1, 2) for _, J in rows.states]
-            own = [Jt @ J for Jt, (_, J) in zip(transposed, rows.states, strict=True)]
-            crossed = transposed[0] @ rows.states[1][1] if len(rows.states) == 2 else None
-            projected = [(Jt @ r[..., None])[..., 0] for Jt in transposed]
-            found.append((np.square(r).sum(axis=1), own, crossed, projected, [Jt @ rows.shared for Jt in transposed]))
-        return found
-
     def moves(self, states: Array, shared: Array) -> list[Array]:
-        """Product A x, (n, m, k) for each kind of rows, with states (N d, k) and shared parameters (p, k)."""
+        """Multiply states (N d, k) and shared parameters (p, k) by the rows' Jacobians: (n, m, k) for each kind."""
         n, d = self.size
         each, out = states.reshape(n, d, -1), []
         for rows in self.rows:
@@ -448,8 +431,8 @@ class LinearChain:
         """Covariance (d, d) of a state before anything is measured: of a process its own, of the rest diffuse."""
         covariance = np.eye(self.size[1]) / _DIFFUSE
         if self.process is not None:
-            (start,) = (v for rows, v in zip(self.rows, variances, strict=True) if rows.starts_process)
-            covariance[-3:, -3:] = start[0] * self.process.sigma**2 * np.eye(3)
+            (start,) = variances[len(self._without_process)]
+            covariance[-3:, -3:] = start * self.process.sigma**2 * np.eye(3)
         return covariance
 
 
@@ -501,7 +484,7 @@ class LinearSolution:
         return states.reshape(n * d, k), shared
 
     def spread(self, states: Array, shared: Array) -> list[Array]:
-        """Product A x with whitened rows, (n, m, k) by kind, from states (N d, k) and shared parameters (p, k)."""
+        """Multiply states (N d, k) and shared parameters (p, k) by the rows' whitened Jacobians: (n, m, k) by kind."""
         moves = self.chain.moves(states, shared)
         return [w[:, None, None] * move for w, move in zip(self.weights, moves, strict=True)]
 
@@ -566,6 +549,6 @@ def _banded(diagonal: Array, ahead: Array) -> Array:
 
 
 def _queue(state: Index, n: int) -> tuple[Index, Index, Index]:
-    """Order of measurements by state, and the first one (n,) and the number (n,) of each state's."""
+    """Sort measurements by their states: the order, where each state's begin in it (n,), and how many they are."""
     counts = np.bincount(state, minlength=n)
     return np.argsort(state, kind="stable"), np.cumsum(counts) - counts, counts

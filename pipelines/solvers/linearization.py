@@ -124,7 +124,7 @@ class Group:
         return replace(self, model=self.model.without_noise(*self.gathered(values)))
 
     def gathered(self, values: Values) -> list[Array]:
-        """Blocks of variables (n, width) that the model is called with."""
+        """Values of the variables that the group's model is evaluated at, (n, width) for each block."""
         arrays = [values.arrays[block][rows] for block, rows in self.gather]
         return [np.broadcast_to(each, (len(self.model.time), each.shape[1])) for each in arrays]
 

@@ -388,11 +388,16 @@ def _for_levels(problem: Problem, known: Compiled, found: LikelihoodMaximum) -> 
     found = LikelihoodMaximum(_with_parameters(compiled, known, found.values), found.levels, unwidened(used))
     # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
     found = replace(found, values=states_first(_engine_at(compiled.engine, found), found.values))
-    chain = LinearChain.of(compiled.engine, found.values)
-    if chain.process is not None:
+    if _correlation_time(found.levels) is not None:
         # Unwidened outliers would pass for noise, and once its level is small what is correlated stays so.
+        chain = LinearChain.of(compiled.engine, found.values)
         found = replace(found, widening=widened(chain, found.levels, found.widening))
     return compiled, found
+
+
+def _correlation_time(levels: Sequence[Level]) -> float | None:
+    """Correlation time, s, of the error that one of the noise levels is of; None: all are white, or walks."""
+    return next((each.noise.correlation_time for each in levels if each.noise.correlation_time is not None), None)
 
 
 def _with_correlated_error(compiled: Compiled, found: LikelihoodMaximum) -> tuple[Level, ...]:
@@ -416,13 +421,14 @@ def _with_correlated_error(compiled: Compiled, found: LikelihoodMaximum) -> tupl
     if not white:
         return found.levels
     start = replace(error.level, scale=max(white) / error.level.noise.stated)
-    tried = []
     try:
         _, without = _maximum(some, factors, found.levels)
-        for time in CORRELATION_TIMES:
-            wider = some.with_error(columns, error.level.noise.stated, time)
-            both = [*factors, *(np.ones(len(rows.time)) for rows in wider.rows[len(factors) :])]
-            tried.append(_maximum(wider, both, (*found.levels, start.over(time))))
+        wider = some.with_error(columns, error.level.noise.stated, CORRELATION_TIMES[0])
+        factors = wider.with_process_factors(factors)
+        tried = [
+            _maximum(wider.with_correlation_time(time), factors, (*found.levels, start.over(time)))
+            for time in CORRELATION_TIMES
+        ]
     except IndeterminateStateError:
         # All pictures of a part of the chain are rejected.
         return found.levels
@@ -439,7 +445,7 @@ def _over_best_time(compiled: Compiled, found: LikelihoodMaximum) -> tuple[Level
     """
     from scipy.optimize import minimize_scalar
 
-    known = next((each.noise.correlation_time for each in found.levels if each.noise.correlation_time), None)
+    known = _correlation_time(found.levels)
     if known is None:
         return found.levels
     chain = LinearChain.of(compiled.engine, found.values)
@@ -448,7 +454,7 @@ def _over_best_time(compiled: Compiled, found: LikelihoodMaximum) -> tuple[Level
 
     def value(log_time: float) -> float:
         time, near = float(np.exp(log_time)), [found.levels, *tried.values()][-1]
-        levels = [each.over(time) if each.noise.correlation_time else each for each in near]
+        levels = [each if each.noise.correlation_time is None else each.over(time) for each in near]
         tried[log_time], least = _maximum(some.with_correlation_time(time), factors, levels)
         return least
 

@@ -453,7 +453,7 @@ def _returns(fit: _Fit, columns: Index, time: float, turn: Array) -> bool:
 
 
 def _leads_to(rows: Rows, keyframe: int) -> Mask:
-    """Mask (n,) of rows that join a keyframe's attitude to its predecessor."""
+    """Mask (n,) of linearised rows that join the attitude at a keyframe to that at the keyframe before."""
     if len(rows.states) != 2 or rows.family == CORRELATED_ERROR:
         return np.zeros(len(rows.time), dtype=bool)
     return np.asarray(rows.states[1][0] == keyframe)

@@ -404,7 +404,7 @@ def _error_key(model: _Model, keyframe: int) -> int:
 
 
 def _predicted(model: _Model, keyframes: range, current: gtsam.Values) -> gtsam.Values:
-    """Initial values of a step's variables, from the current estimate."""
+    """Initial values of the variables that some keyframes add to the graph, predicted from the current estimate."""
     out = model.chain.predict(keyframes, lambda k, _: model.chain.initial[k], current)
     if _CORRELATED in model.noises:
         for k in keyframes:
