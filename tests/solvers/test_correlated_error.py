@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from alidade.factors import so3
 from alidade.factors.array import Array
@@ -23,6 +22,7 @@ from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.linear_chain import ENOUGH_KEYFRAMES, LinearChain
 from alidade.pipelines.solvers.marginal_likelihood import estimate_levels
 from alidade.pipelines.solvers.robust import solve_robust
+from tests.support.gauss_markov import gauss_markov
 
 RATE_HZ, DURATION_S = 20.0, 30.0
 SCENARIO = HeadScenario.model_validate(
@@ -34,8 +34,7 @@ def lasting(size: float, time: float, n: int, seed: int) -> Array:
     """A Gauss-Markov process (n, 3) at the rate of the pictures."""
     phi = np.exp(-1.0 / (RATE_HZ * time))
     white = np.random.default_rng([seed, 3]).standard_normal((n + 400, 3))
-    out: Array = size * np.sqrt(1.0 - phi**2) * lfilter([1.0], [1.0, -phi], white, axis=0)[400:]
-    return out
+    return size * gauss_markov(white, phi, 400)
 
 
 def recorded(seed: int, size: float = 0.0, time: float = 0.3, scenario: HeadScenario = SCENARIO) -> HeadData:

@@ -23,6 +23,7 @@ from alidade.pipelines.settings import DEFAULT_NOISE, Config
 from alidade.pipelines.settings import Noise as NoiseSettings
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
+from tests.support.gauss_markov import gauss_markov
 
 # Method -> scenario, and the noises that its recording is made of.
 CASES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
@@ -148,7 +149,7 @@ def coloured(seed: int, tau: float) -> tuple[Problem, Array]:
     data, truth = simulated.data, simulated.truth
     keep = np.exp(-1.0 / (rate * tau)) if tau > 0.0 else 0.0
     white = np.random.default_rng(seed).standard_normal((len(data.vision_t) + 200, 3))
-    error = sigma * np.sqrt(1.0 - keep**2) * lfilter([1.0], [1.0, -keep], white, axis=0)[200:]
+    error = sigma * gauss_markov(white, keep, 200)
     data = replace(data, vision_wxyz=so3.multiply(data.vision_wxyz, so3.exp(error)))
     problem = methods.method("head").problem(data, config)
     return problem, np.array([truth[q.name] for q in problem.quantities])
@@ -163,7 +164,7 @@ def coloured_tracker(seed: int, tau: float) -> tuple[Problem, Array]:
     keep = np.exp(-1.0 / (50.0 * tau))
     white = np.random.default_rng([seed, 7]).standard_normal((len(simulated.data.image_t) + 400, 2))
     error = simulated.data.error.copy()
-    error[:, :2] += sigma * np.sqrt(1.0 - keep**2) * lfilter([1.0], [1.0, -keep], white, axis=0)[400:]
+    error[:, :2] += sigma * gauss_markov(white, keep, 400)
     problem = methods.method("los").problem(replace(simulated.data, error=error, error_cov=None), config)
     return problem, np.array([simulated.truth[q.name] for q in problem.quantities])
 
@@ -308,8 +309,8 @@ def test_coloured_innovations_leave_what_goes_together_together() -> None:
     simulated = simulate("tumble", {}, seed=1)
     data = simulated.data
     keep = np.exp(-float(np.median(np.diff(data.mag_t))) / 0.3)
-    fresh = 3.5e-7 * np.sqrt(1.0 - keep**2) * np.random.default_rng(1).standard_normal(data.mag.shape)
-    data = replace(data, mag=data.mag + lfilter([1.0], [1.0, -keep], fresh, axis=0))
+    white = np.random.default_rng(1).standard_normal(data.mag.shape)
+    data = replace(data, mag=data.mag + 3.5e-7 * gauss_markov(white, keep, 0))
     problem = methods.method("tumble").problem(data, load_config(simulated.config.encode()))
     estimate = solve_incremental(problem)
     assert estimate.inflations.max() > 1.5
