@@ -62,8 +62,8 @@ _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_sta
 _QUATERNION = "q|quat|orientation|rot|attitude"
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
 _TURNED = 0.1
-# Rows looked at.
-_ROWS = 20_000
+# Rows looked at, and sensors that rows may be of by their names in a column.
+_ROWS, _MOST_SENSORS = 20_000, 30
 # Rates beyond a gyro's in rad/s are in deg/s up to what a gyro of 4000 deg/s may read on three axes; beyond, counts.
 _MOST_DEG_S = 7000.0
 
@@ -108,7 +108,7 @@ def propose_columns(recording: Recording) -> Columns | None:
     Messages of types that are not known count as tables where they have something that is.
     """
     files = tables_of(recording.container)
-    found = [_Table(table, len(files) > 1) for table in files.values()]
+    found = [one for table in files.values() for one in _sensors(table, len(files) > 1)]
     made = [one.topics() for one in found]
     for table in message_tables(recording.container).values():
         with suppress(InputError):  # what cannot be read is no proposal
@@ -119,6 +119,12 @@ def propose_columns(recording: Recording) -> Columns | None:
     columns: dict[str, TableTopic] = {}
     for one, topics in zip(found, made, strict=True):
         for topic, described in topics.items():
+            same = columns.get(topic)
+            if same is not None and same.file == described.file and described.where:
+                one.doubts.append(
+                    f"{', '.join(map(str, described.where.values()))} is not used: {topic} is of another sensor"
+                )
+                continue
             columns[_free(topic, one.path, {*columns, *recording.topics})] = described
     if not found:
         return None
@@ -148,10 +154,16 @@ def with_columns(recording: Recording, config: Config) -> tuple[Recording, Confi
     return recording, config
 
 
-class _Table:
-    """Sensors, units and time that are recognised in one table."""
+def _sensors(table: Table, is_named: bool) -> list[_Table]:
+    """Return a table as one, or, where a column names the sensor that a row is of, each sensor's rows."""
+    whole = _Table(table, is_named)
+    return [_Table(table, is_named, rows) for rows in whole.rows_of_sensors()] or [whole]
 
-    def __init__(self, table: Table, is_named: bool) -> None:
+
+class _Table:
+    """Sensors, units and time that are recognised in one table, or in its `rows` that have a text in a column."""
+
+    def __init__(self, table: Table, is_named: bool, rows: tuple[int, str] | None = None) -> None:
         self.path, self._form = table.form.path, table.form
         self._file = table.name if is_named else None
         self._where = f"{table.name}: " if is_named else ""
@@ -160,8 +172,25 @@ class _Table:
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
         texts, *_ = table.read(names, _ROWS)
         self._texts = list(texts.values())
+        self._rows: dict[str, str | float | int] = {}
+        if rows is not None:
+            column, text = rows
+            self._rows = {self._form.called([column])[0]: text}
+            meant = self._texts[column] == text
+            self._texts = [each[meant] for each in self._texts]
         self._values = [self._numbers(i) for i in range(len(names))]
         self._times = Times(self._form, self._texts, self._values, self._where, self.reasons, self.doubts)
+
+    def rows_of_sensors(self) -> list[tuple[int, str]]:
+        """Return the column that names the sensor of each row, with each of its texts that do; empty without one."""
+        if any(_kind(name) for name, _ in _along_axes(self._form.names)):
+            return []
+        for i, texts in enumerate(self._texts):
+            there = np.unique(texts).tolist() if np.isnan(self._values[i]).all() else []
+            named = [(i, text) for text in there if _kind(text.lower())]
+            if len(named) > 1 and len(there) <= _MOST_SENSORS:
+                return named
+        return []
 
     def topics(self) -> dict[str, TableTopic]:
         """Return topic -> its columns."""
@@ -172,7 +201,7 @@ class _Table:
         def add(topic: str, of: Sequence[int], **given: Any) -> None:
             chosen = {key: value for key, value in given.items() if value}
             try:
-                out[topic] = TableTopic(file=self._file, **self._times.of(of), **chosen)
+                out[topic] = TableTopic(file=self._file, where=self._rows, **self._times.of(of), **chosen)
             except ValueError as error:
                 self.doubts.append(f"{self._where}{topic}: {error}")
 
@@ -180,7 +209,7 @@ class _Table:
         units = {kind: self._unit(kind, columns) for kind, columns in named.items()}
         imu = {kind: columns for kind, columns in named.items() if kind != "field"}
         together = all(clocks[kind] == clocks[other] for kind, other in pairwise(imu))
-        alone = {"gyro": "/imu/gyro", "accel": "/imu/accel"} if self._file or not together else {}
+        alone = {"gyro": "/imu/gyro", "accel": "/imu/accel"} if self._file or self._rows or not together else {}
         for kinds in filter(None, [list(imu)] if together else [[kind] for kind in imu]):
             own = {kind: units[kind] for kind in kinds if units[kind] and UNITS[units[kind]] != 1.0}
             given = {kind: self._form.called(imu[kind]) for kind in kinds}
@@ -254,7 +283,8 @@ class _Table:
                     self.doubts.append(f"{where} are {kind} by their size")
             return out
         for name, columns in along:
-            name = name or self.path.stem.lower()  # x, y, z alone: the file is named after the sensor
+            # Rows are named after their sensor; of x, y, z alone the file is.
+            name = " ".join(map(str, [*self._rows.values(), *filter(None, [name])])).lower() or self.path.stem.lower()
             if "covariance" in name:
                 continue
             kind = _kind(name) or self._kind_of_units(columns)

@@ -171,7 +171,7 @@ class ErrorMap:
             steps=lambda chunk: self._steps(problem.steps(chunk), parameter),
             steps_after=None,
             continuation=None,
-            denser_graph=changed(problem.denser_graph, self.added_to),
+            refined_graph=changed(problem.refined_graph, self.added_to),
             error_map=None,
         )
 

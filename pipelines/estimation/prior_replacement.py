@@ -110,7 +110,7 @@ def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier
         steps=lambda chunk: factors.steps(steps(chunk), before),
         steps_after=None if after is None else lambda time: factors.steps(after(time), lambda: _until(steps, time)),
         continuation=None if continuation is None else continued,
-        denser_graph=changed(problem.denser_graph, partial(_with_prior, gaussian_prior=gaussian_prior)),
+        refined_graph=changed(problem.refined_graph, partial(_with_prior, gaussian_prior=gaussian_prior)),
         premises=(*problem.premises, *filter(None, [premise])),
     )
 

@@ -352,7 +352,7 @@ class Problem:
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
         step_candidates: keys of rotations that are tested for a step at one moment, as of a mount that slips.
         correlated_error: that measurements may have, and that is looked for; None: the method has none.
-        denser_graph: noise levels -> the graph that they need, with denser keyframes or with an error that is
+        refined_graph: noise levels -> the graph that they need, with more keyframes or with an error that is
             correlated in time; None where this one serves.
         error_map: errors that measurements may have at the places that an estimate finds; None: the method has none.
         gaussian_priors: joint priors from elsewhere than data sheets; the last one about a number is in force.
@@ -378,7 +378,7 @@ class Problem:
     marginal_likelihood: bool = False
     step_candidates: tuple[int, ...] = ()
     correlated_error: CorrelatedError | None = None
-    denser_graph: Callable[[Sequence[Level]], Problem | None] | None = None
+    refined_graph: Callable[[Sequence[Level]], Problem | None] | None = None
     error_map: Callable[[Estimate], ErrorMap | None] | None = None
     gaussian_priors: tuple[GaussianPrior, ...] = ()
 
@@ -388,12 +388,12 @@ class Problem:
             self,
             parameters=tuple(parameter.near(numbers) for parameter in self.parameters),
             continuation=changed(self.continuation, lambda more: more.near(numbers)),
-            denser_graph=changed(self.denser_graph, lambda more: more.near(numbers)),
+            refined_graph=changed(self.refined_graph, lambda more: more.near(numbers)),
         )
 
     def at_levels(self, levels: Sequence[Level]) -> Problem:
-        """Return the graph that some noise levels need: this one, or one with denser keyframes or more states."""
-        return (self.denser_graph and self.denser_graph(levels)) or self
+        """Return the graph that some noise levels need: this one, or one with more keyframes or states."""
+        return (self.refined_graph and self.refined_graph(levels)) or self
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
         """Inputs of formulas by name: an estimate's values, and the constants."""

@@ -473,7 +473,7 @@ class IncrementalSolver:
             InputError: a factor gives no finite numbers.
             IndeterminateError: something is not determined.
         """
-        problem = replace(self.problem, denser_graph=None, elsewhere=None)
+        problem = replace(self.problem, refined_graph=None, elsewhere=None)
         compiled = Compiled.of(problem, steps=steps)
         if not np.isfinite(compiled.engine.cost(compiled.initial)):
             compiled = Compiled.of(problem, steps=self._finite(steps, compiled.layout.to_gtsam(compiled.initial)))

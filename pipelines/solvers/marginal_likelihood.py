@@ -348,7 +348,7 @@ def _engine_at(linearization: Linearization, found: LikelihoodMaximum) -> Linear
 def solve_likelihood(
     compiled: Compiled, solution: Solution, levels: Sequence[Level], config: LevenbergConfig
 ) -> tuple[Compiled, Solution, tuple[Level, ...]]:
-    """Minimise at the noise levels of largest marginal likelihood, on a denser graph if the levels need one.
+    """Minimise at the noise levels of largest marginal likelihood, on a refined graph if the levels need one.
 
     Args:
         compiled: the problem, compiled for the chain.
@@ -358,7 +358,7 @@ def solve_likelihood(
     """
     problem = compiled.problem
     found = LikelihoodMaximum(solution.values, tuple(levels), unwidened(solution.engine.inliers(solution.values)))
-    if problem.denser_graph is not None:
+    if problem.refined_graph is not None:
         found = maximise_likelihood(compiled.engine, found, rounds=1, from_above=True)
         found = replace(found, levels=_with_correlated_error(compiled, found))
         compiled, found = _for_levels(problem, compiled, found)

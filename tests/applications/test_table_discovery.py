@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -454,6 +455,55 @@ def test_a_phones_files_of_one_sensor_each_are_one_imu(tmp_path: Path, alidade: 
     assert run.code == 2
     assert "topic /imu has no gyro, which is needed here" in run.err
     assert "name those of one by their folder, or by a pattern in quotes" in run.err
+
+
+def rows_of_sensors(path: Path, names: Mapping[str, object], header: str = "sensor,time,x,y,z") -> Path:
+    """Write a table with a row for each reading of each sensor, by turns."""
+    lines = [header]
+    for i, t in enumerate(SECONDS):
+        lines += [f"{name},{t:.3f},{','.join(map(str, np.asarray(xyz)[i]))}" for name, xyz in names.items()]
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_rows_named_after_their_sensor_are_a_topic_each(tmp_path: Path, alidade: Command) -> None:
+    sensors = {"GYROSCOPE": RATES, "accelerometer": 9.81 * DIRECTIONS, "magnetometer": 45.0 * DIRECTIONS}
+    path = rows_of_sensors(tmp_path / "imu_log.csv", {**sensors, "battery": 3.7 + 0.0 * RATES})
+    found = propose_columns(open_recording(path))
+    assert found is not None
+    assert {topic: table.where for topic, table in found.columns.items()} == {
+        "/imu/gyro": {"sensor": "GYROSCOPE"},
+        "/imu/accel": {"sensor": "accelerometer"},
+        "/mag": {"sensor": "magnetometer"},
+    }
+    assert found.columns["/mag"].units == {"field": "uT"}
+    assert found.topics["imu"].parts == ("/imu/gyro", "/imu/accel")
+    run = alidade("calibrate", str(path), "--auto-columns", "--method", "tumble", "--out", str(tmp_path / "out"))
+    assert run.code in (0, 3)
+    assert "Magnetometer" in run.out
+
+
+def test_of_rows_named_after_a_sensor_twice_the_first_count(tmp_path: Path) -> None:
+    sensors = {"accel": 9.81 * DIRECTIONS, "accel_uncalibrated": 9.9 * DIRECTIONS, "linear_acceleration": RATES}
+    path = rows_of_sensors(tmp_path / "a.csv", sensors, "type,t,value_x,value_y,value_z")
+    found = propose_columns(open_recording(path))
+    assert found is not None
+    assert [table.where for table in found.columns.values()] == [{"type": "accel"}]
+    assert found.topics["imu"].topic == "/imu/accel"
+    assert "accel_uncalibrated is not used: /imu/accel is of another sensor" in found.doubts
+    assert any("gravity" in doubt for doubt in found.doubts)
+
+
+def test_a_column_that_mentions_sensors_does_not_say_what_named_columns_are(tmp_path: Path) -> None:
+    lines = ["t,state,mx,my,mz"]
+    lines += [
+        f"{t},{'mag warm' if t < 1 else 'mag ready'},{','.join(map(str, xyz))}"
+        for t, xyz in zip(SECONDS, 45.0 * DIRECTIONS, strict=True)
+    ]
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    found = propose_columns(open_recording(tmp_path / "a.csv"))
+    assert found is not None
+    assert not found.columns["/mag"].where
 
 
 def test_the_parts_of_an_imu_are_no_gyros_beside_it(tmp_path: Path, alidade: Command) -> None:

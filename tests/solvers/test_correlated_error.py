@@ -51,9 +51,9 @@ def made(data: HeadData) -> Problem:
 def with_error(problem: Problem, time: float, scale: float) -> tuple[Problem, tuple[Level, ...]]:
     """The graph with the error as states, and its levels."""
     assert problem.correlated_error is not None
-    assert problem.denser_graph is not None
+    assert problem.refined_graph is not None
     levels = *problem.noises, replace(problem.correlated_error.level.over(time), scale=scale)
-    graph = problem.denser_graph(levels)
+    graph = problem.refined_graph(levels)
     assert graph is not None
     return graph, levels
 

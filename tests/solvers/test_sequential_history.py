@@ -21,7 +21,9 @@ from tests.support.short_problems import head_problem, los_problem
 
 def _until(problem: Problem, stop: float) -> Problem:
     """The steps of one measurement each until then; all of them would be one."""
-    return replace(problem, steps=lambda _: (step for step in problem.steps(1) if step.time <= stop), denser_graph=None)
+    return replace(
+        problem, steps=lambda _: (step for step in problem.steps(1) if step.time <= stop), refined_graph=None
+    )
 
 
 @pytest.mark.parametrize("make", [los_problem, pytest.param(head_problem, marks=pytest.mark.slow)])

@@ -72,8 +72,8 @@ def test_the_scan_is_exact(lasting: bool) -> None:
     of = problem(slipped(recorded(1), 0.5, 12.0))
     if lasting:
         assert of.correlated_error is not None
-        assert of.denser_graph is not None
-        found = of.denser_graph((*of.noises, replace(of.correlated_error.level.over(0.3), scale=0.5)))
+        assert of.refined_graph is not None
+        found = of.refined_graph((*of.noises, replace(of.correlated_error.level.over(0.3), scale=0.5)))
         assert found is not None
         of = found
     compiled = Compiled.of(of, "chain")

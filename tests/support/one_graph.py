@@ -45,7 +45,7 @@ def one_graph(problems: Sequence[Problem], shared: Collection[str]) -> Problem:
     # Noise as stated, that beside other noise included.
     noises = tuple(replace(n, noise=replace(n.noise, known=0.0), least=None) for n in problems[0].noises)
     return replace(
-        problems[0], parameters=tuple(kept.values()), steps=steps, attitudes=None, noises=noises, denser_graph=None
+        problems[0], parameters=tuple(kept.values()), steps=steps, attitudes=None, noises=noises, refined_graph=None
     )
 
 

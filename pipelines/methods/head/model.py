@@ -121,7 +121,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         marginal_likelihood=True,
         step_candidates=(model.parameters.helmet.key,),
         correlated_error=_correlated_error(model),
-        denser_graph=partial(_denser_graph, config, data, model),
+        refined_graph=partial(_refined_graph, config, data, model),
         error_map=partial(_error_map, config, model),
     )
 
@@ -148,12 +148,12 @@ def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | 
     )
 
 
-def _denser_graph(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
-    """Build the graph that the noise levels require; see Problem.denser_graph."""
+def _refined_graph(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
+    """Build the graph that the noise levels require; see Problem.refined_graph."""
     noises = model.noises | {level.noise.name: level for level in levels}
     if _CORRELATED not in noises and _shared(data, noises) > 0.5 * model.origins[2]:
         return None
-    return replace(_problem(config, data, _prepare(data, config, clock=model.clock, noises=noises)), denser_graph=None)
+    return replace(_problem(config, data, _prepare(data, config, clock=model.clock, noises=noises)), refined_graph=None)
 
 
 def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
