@@ -291,7 +291,7 @@ def residuals_by_family(engine: Linearization, values: Values) -> dict[str, Resi
     out = {}
     for family, groups in engine.measured.items():
         order = np.argsort(np.concatenate([g.factors for g in groups]), kind="stable")
-        each = [(g.model.time, g.weighted(g.evaluate(values)[0]), g.inliers(values)) for g in groups]
+        each = [(g.model.time, g.weighted(g.residuals(values)), g.inliers(values)) for g in groups]
         out[family] = Residuals(*(np.concatenate(column)[order] for column in zip(*each, strict=True)))
     return out
 

@@ -409,7 +409,7 @@ def added_covariance(influence: Influence, noises: Mapping[str, ColouredNoise]) 
 
 def _residuals(groups: Sequence[Group], values: Values) -> Array:
     """Weighted residuals (n, r) of the inliers of several groups, in time order."""
-    return np.concatenate([g.weighted(g.evaluate(values)[0]) for g in groups])[_used_in_time(groups, values)]
+    return np.concatenate([g.weighted(g.residuals(values)) for g in groups])[_used_in_time(groups, values)]
 
 
 def _influences(influence: Influence, family: str, noise: bool = True) -> tuple[Array, Array]:

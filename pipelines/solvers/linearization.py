@@ -119,6 +119,11 @@ class Group:
         """Whitened residuals (n, m), unweighted, and their Jacobians on demand."""
         return self.model(*self.gathered(values))
 
+    def residuals(self, values: Values) -> Array:
+        """Whitened residuals (n, m), unweighted, evaluated part by part."""
+        each = [part.evaluate(values)[0] for part in self.divided()]
+        return each[0] if len(each) == 1 else np.concatenate(each)
+
     def without_noise(self, values: Values) -> Group:
         """Return the group at measurements whose residuals are zero, where its Jacobians have noise of these."""
         return replace(self, model=self.model.without_noise(*self.gathered(values)))
@@ -157,7 +162,7 @@ class Group:
         """Mask (n,) of the measurements that the loss does not reject at some values and that are not excluded."""
         if self.loss is None:
             return np.ones(len(self.model.time), dtype=bool) if self.excluded is None else ~self.excluded
-        return np.asarray(self.used(self.evaluate(values)[0]) > 0.5)
+        return np.asarray(self.used(self.residuals(values)) > 0.5)
 
     def _included(self, each: Array) -> Array:
         """Set numbers (n,) of excluded measurements to zero."""
@@ -301,7 +306,7 @@ class Linearization:
             return system, cost + more
         for begin in range(0, N, PART_STATES):
             for part in self.within(begin, begin + PART_STATES):
-                residuals = part.evaluate(values)[0]
+                residuals = part.residuals(values)
                 cost += part.cost(residuals)
                 squares += float(part.used(residuals) @ np.square(part.weighted(residuals)).sum(axis=1))
         return replace(chain, squares=squares), cost
@@ -327,7 +332,7 @@ class Linearization:
 
     def unweighted(self, values: Values) -> list[Array]:
         """Whitened residuals (n, m) of each group, outliers included, without noise and robust weights."""
-        return [group.evaluate(values)[0] for group in self.groups]
+        return [group.residuals(values) for group in self.groups]
 
     def residuals(self, values: Values) -> list[Array]:
         """Weighted whitened residuals (n, m) of each group, outliers included."""

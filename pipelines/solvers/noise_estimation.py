@@ -205,7 +205,7 @@ def _found_beside(level: Level, groups: Sequence[Group], values: Values, redunda
     added = [_additional(g.beside, level.noise.stated) for g in groups]
     unit = np.concatenate([np.broadcast_to(a, w.shape).ravel() for a, w in zip(added, weights, strict=True)])
     variance = np.concatenate([w.ravel() for w in weights]) ** -2.0
-    square = np.concatenate([g.evaluate(values)[0].ravel() for g in groups]) ** 2
+    square = np.concatenate([g.residuals(values).ravel() for g in groups]) ** 2
     rest, share = variance - unit * level.scale**2, redundancy / variance.size
     rejecting = any(g.loss is not None for g in groups)
     most, expected = (_CLIPPED**2, _CLIPPED_SQUARE) if rejecting else (np.inf, 1.0)
@@ -259,7 +259,7 @@ def _rows(noise: Noise, rows: int) -> list[int]:
 
 def _used_square(group: Group, values: Values) -> Array:
     """Squares (n, m) of the weighted residuals, zero for rejected measurements."""
-    residuals = group.evaluate(values)[0]
+    residuals = group.residuals(values)
     return np.where((group.used(residuals) > 0.5)[:, None], group.weighted(residuals) ** 2, 0.0)
 
 
@@ -272,7 +272,7 @@ def _size(noise: Noise, groups: Sequence[Group], values: Values) -> tuple[float,
         return float(sum(_used_square(g, values).sum() for g in groups)), 0.0
     square, rows, every = 0.0, 0, [np.empty(0)]
     for g in groups:
-        residuals, own = g.evaluate(values)[0], _rows(noise, g.model.rows)
+        residuals, own = g.residuals(values), _rows(noise, g.model.rows)
         used = g.used(residuals) > 0.5
         whitened = g.weighted(residuals)[:, own]
         square += float((whitened[used] ** 2).sum())

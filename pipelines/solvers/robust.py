@@ -181,7 +181,7 @@ def without_onsets(engine: Linearization, solution: Solution) -> Linearization |
     found: dict[str, list[tuple[int, Array, Array, Mask]]] = {}
     for i, group in enumerate(solution.engine.groups):
         if group.loss is not None and group.model.rows > 1:
-            residuals = group.evaluate(solution.values)[0]
+            residuals = group.residuals(solution.values)
             each = group.model.time, _norms(group, residuals), group.used(residuals) <= 0.5
             found.setdefault(group.family, []).append((i, *each))
     groups = list(engine.groups)

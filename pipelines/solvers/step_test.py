@@ -299,7 +299,7 @@ def _with_wider_priors(engine: Linearization, values: Values, keys: Sequence[int
     groups, own = list(engine.groups), engine.layout.at(keys)
     for i, group in enumerate(groups):
         if group.target == "shared" and not group.is_measurement and len(group.at) == 1:
-            far = np.linalg.norm(group.weighted(group.evaluate(values)[0]), axis=1)
+            far = np.linalg.norm(group.weighted(group.residuals(values)), axis=1)
             wide = np.where(np.isin(group.at[0], own), np.maximum(far, 1.0), 1.0)
             groups[i] = replace(group, weights=group.all_weights / wide[:, None])
     return engine.with_groups(groups)
