@@ -185,12 +185,15 @@ def with_change(estimate: Estimate, change: Finding) -> Estimate:
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
-    """Test an estimate's stability over time; None without a posterior history or anything that could change.
+    """Test an estimate's stability over time; None without an offset step, a history or anything that could change.
 
     Quantities, in the estimate's order, are left out if they walk, since they may change, and if they are hardly better
     known than before.
     """
     posterior_history = estimate.posterior_history
+    if (step := estimate.offset_step) is not None:
+        size = float(_as_normal(np.array([step.statistic]), np.array([len(step.steps)]))[0])
+        return Stability(size, step.level, step.time_s, _by_size(step.steps))
     if posterior_history is None:
         return None
     # Information about other numbers is as much the noise of its states, which moves the estimate without being

@@ -351,6 +351,8 @@ class Problem:
         layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
         step_candidates: keys of rotations that are tested for a step at one moment, as of a mount that slips.
+        offsets: names of the quantities, each sensor's together, that are tested for a step at one moment in graphs of
+            shared unknowns alone.
         correlated_error: that measurements may have, and that is looked for; None: the method has none.
         refined_graph: noise levels -> the graph that they need, with more keyframes or with an error that is
             correlated in time; None where this one serves.
@@ -377,6 +379,7 @@ class Problem:
     layout: ChainLayout | None = None
     marginal_likelihood: bool = False
     step_candidates: tuple[int, ...] = ()
+    offsets: tuple[tuple[str, ...], ...] = ()
     correlated_error: CorrelatedError | None = None
     refined_graph: Callable[[Sequence[Level]], Problem | None] | None = None
     error_map: Callable[[Estimate], ErrorMap | None] | None = None
@@ -599,6 +602,23 @@ class StepEstimate:
         return min(self.fall, self.by_motion) / self.ratio**2 if self.agrees else 0.0
 
 
+@dataclass(frozen=True)
+class OffsetStep:
+    """Most significant step of a recording's offsets at one moment.
+
+    Attributes:
+        time_s: of the first measurement after it, s.
+        statistic: chi-square of the step.
+        level: p-value, anywhere in the recording.
+        steps: offset -> its step and the sigma of that, SI.
+    """
+
+    time_s: float
+    statistic: float
+    level: float
+    steps: Mapping[str, tuple[float, float]]
+
+
 # Ratio of sandwich to nominal sigmas from which on it counts: 1.3 over 25 blocks has p = .01.
 SLOW_ERROR = 1.3
 
@@ -632,6 +652,7 @@ class Estimate:
             errs slowly and is no noise of the model makes it large. Above SLOW_ERROR it is in the covariance. None: not
             looked for.
         steps: those that explain the recording best, the most significant first; None: not looked for.
+        offset_step: the most significant one of `Problem.offsets`; None: not looked for.
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
         sqrt_info: information without the device's priors; None: not asked for.
         error_map: errors by where measurements are made that were found, and are in it; None: none, or not looked for.
@@ -663,6 +684,7 @@ class Estimate:
     inflation: Array | None = None
     sandwich: Array | None = None
     steps: tuple[StepEstimate, ...] | None = None
+    offset_step: OffsetStep | None = None
     sqrt_info: SqrtInformation | None = None
     error_map: FoundMap | None = None
     second: Minimum | None = None

@@ -48,6 +48,7 @@ from alidade.pipelines.solvers.levenberg import DEFAULT, LevenbergConfig, Soluti
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
+from alidade.pipelines.solvers.offset_step import largest_offset_step
 from alidade.pipelines.solvers.posterior import Reported, chi_square, leverages, moved_to, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
 from alidade.pipelines.solvers.robust import solve_robust, solve_truncated, without_onsets
@@ -261,6 +262,7 @@ def whole_estimate(
         inflation=by,
         sandwich=sandwich,
         steps=largest,
+        offset_step=largest_offset_step(compiled, found) if steps else None,
         colours={family: noise.together for family, noise in noises.items()},
         converged=solved.converged,
         message=solved.message,

@@ -80,6 +80,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
         premises=model.premises,
         noises=tuple(noises),
         elsewhere=partial(_mirrored, model),
+        offsets=tuple(tuple(f"{sensor.name}_b{axis}" for axis in "123") for sensor in model.sensors),
         constants=_constants(data, model),
         layout=ChainLayout(),
     )

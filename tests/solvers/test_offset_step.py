@@ -1,0 +1,84 @@
+"""A step of a sensor's offset is found in a recording whose graph has no states, and none where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import alidade
+from alidade.factors.array import Array
+from alidade.pipelines.estimation.problem import OffsetStep
+from alidade.pipelines.solvers.batch import solve
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.offset_step import largest_offset_step
+
+TURN = np.array([0.6, -0.64, 0.48])
+
+
+def found(session: alidade.Session) -> OffsetStep:
+    """Most significant step, from the solution of a session's graph."""
+    compiled = Compiled.of(session.problem())
+    step = largest_offset_step(compiled, solve(compiled).posterior.at)
+    assert step is not None
+    return step
+
+
+def turned(
+    seed: int, size: float = 0.0, at: float = 0.5, correlation_time: float = 0.0
+) -> tuple[alidade.Session, Array]:
+    """A magnetometer whose offset steps by a share of the field; errors of 1 % may be correlated. Step of raw, T."""
+    simulated = alidade.simulate("tumble", {}, seed)
+    data, field = simulated.data, float(np.linalg.norm(simulated.data.mag, axis=1).mean())
+    mag, t = data.mag.copy(), data.mag_t
+    mag[t > t[0] + at * (t[-1] - t[0])] += size * field * TURN
+    if correlation_time:
+        rng, error = np.random.default_rng([seed, 9]), np.zeros(3)
+        for k, kept in enumerate(np.exp(-np.diff(t, prepend=t[0] - 1e6) / correlation_time)):
+            error = kept * error + np.sqrt(1.0 - kept**2) * rng.standard_normal(3)
+            mag[k] += 0.01 * field * error
+    return alidade.open(replace(simulated, data=replace(data, mag=mag))), size * field * TURN
+
+
+@pytest.mark.parametrize("correlation_time", [0.0, 1.0])
+def test_where_no_offset_steps_none_is_significant(correlation_time: float) -> None:
+    levels = [found(turned(seed, correlation_time=correlation_time)[0]).level for seed in range(12)]
+    assert min(levels) > 1e-3
+    # P-values over many moments are conservative, and not always 1.
+    assert np.mean(np.array(levels) < 0.05) <= 0.25
+
+
+@pytest.mark.parametrize("at", [0.3, 0.5, 0.7])
+def test_a_step_is_found_with_its_time_and_size(at: float) -> None:
+    session, raw = turned(3, 0.05, at, 0.3)
+    step, data = found(session), session.data
+    assert step.level < 1e-4
+    span = data.mag_t[-1] - data.mag_t[0]
+    assert step.time_s == pytest.approx(data.mag_t[0] + at * span, abs=0.03 * span)
+    values = session.calibrate(report=False).values
+    K = np.array([[values[f"mag_k{min(i, j)}{max(i, j)}"] for j in (1, 2, 3)] for i in (1, 2, 3)])
+    steps, sigmas = (np.array([step.steps[f"mag_b{i}"][k] for i in (1, 2, 3)]) for k in (0, 1))
+    assert (np.abs(steps + K @ raw) < 4.0 * sigmas + 0.1 * np.abs(K @ raw)).all()
+
+
+def test_hard_iron_that_moves_is_a_change_and_not_noise() -> None:
+    for size in (0.05, 0.3):
+        result = turned(5, size, 0.5, 0.3)[0].calibrate(report=False)
+        assert result.status == "inconsistent"
+        (change,) = (each for each in result.findings if each.kind == "change")
+        assert {name[:5] for name in change.evidence["steps"]} <= {"mag_b", "mag_k", "mag_s"}
+    assert "change" not in {each.kind for each in turned(5, 0.0, 0.5, 0.3)[0].calibrate(report=False).findings}
+
+
+def test_rests_before_a_step_are_no_outliers() -> None:
+    """Of a third of the rests, which the robust loss rejects: the others fit."""
+    scenario = {"attitudes": 40, "rest_s": 2.0, "magnetometer": None, "accelerometer": {}}
+    simulated = alidade.simulate("tumble", scenario, 1)
+    data = simulated.data
+    accel = data.accel.copy()
+    accel[data.accel_t > np.quantile(data.accel_t, 0.3)] += 0.3 * TURN
+    stepped = alidade.open(replace(simulated, data=replace(data, accel=accel))).calibrate(report=False)
+    assert stepped.status == "inconsistent"
+    assert "change" in {each.kind for each in stepped.findings}
+    assert alidade.open(simulated).calibrate(report=False).status == "calibrated"
