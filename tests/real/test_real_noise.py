@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import alidade
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.write import write_results
 from datasets.broad import read_trial, score_results
 from tests.support.broad_trials import TRIALS, converted
@@ -34,6 +36,19 @@ def test_a_cube_turned_by_hand_without_a_word_about_noise(shared_data: Path, tmp
     used = {noise.name: noise.used for noise in found.noises}
     # Poses repeat to millimetres a second squared, which white noise over their duration does not say.
     assert 1e-3 < used["accel_repeatability"] < 8e-3
+
+
+@pytest.mark.parametrize("at", [0.3, 0.7])
+def test_an_accelerometer_whose_offset_stepped(at: float, shared_data: Path) -> None:
+    """By .05 of gravity: the rests on one side are no outliers of a calibration by the others."""
+    imu = open_recording(shared_data / "openaxes_imu9" / "adxl.mcap").imu("/imu")
+    time, accel = 1e-9 * (imu.t_ns - imu.t_ns[0]), imu.accel.copy()
+    healthy = alidade.open({"accel_t": time, "accel": accel}, method="tumble").calibrate(report=False)
+    assert healthy.status == "calibrated", healthy.headline
+    accel[int(at * len(accel)) :] += 0.49 * np.array([0.6, -0.64, 0.48])
+    found = alidade.open({"accel_t": time, "accel": accel}, method="tumble").calibrate(report=False)
+    assert found.status == "inconsistent"
+    assert "change" in {finding.kind for finding in found.findings}
 
 
 @pytest.mark.slow
