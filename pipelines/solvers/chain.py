@@ -96,6 +96,10 @@ class Chain(ABC):
         """Factorize the system, with Marquardt `damping` where positive. Raises IndeterminateStateError."""
         return ChainFactorization.of(self.damped(damping) if damping > 0.0 else self)
 
+    def root(self) -> Array:
+        """`Factorization.root`, without R of the states, which exceeds the rows. Raises IndeterminateStateError."""
+        return ChainFactorization.of(self, keeps=False).root
+
     def damped(self, damping: float) -> Chain:
         """Return the system with each unknown's own information, `damping` times, added at zero (Marquardt)."""
         d, c, root = self.d, self.c, np.sqrt(damping)
@@ -214,13 +218,18 @@ class _Level:
     piece: Index | None
 
     @classmethod
-    def eliminate(cls, chain: Chain) -> tuple[_Level, ChainSystem, Index]:
-        """Eliminate each segment's inner states; return the level, the chain of last states, their indices."""
+    def eliminate(cls, chain: Chain, keeps: bool = True) -> tuple[_Level, ChainSystem, Index]:
+        """Eliminate each segment's inner states; return the level, the chain of last states, their indices.
+
+        The level has no rows unless it `keeps` them.
+        """
         lasts, d = chain.segments(), chain.d
-        rows, begin, left = np.zeros((len(chain), d, 3 * d + chain.border)), 0, list[tuple[Array, Array, Array]]()
+        shape, begin, left = (d, 3 * d + chain.border), 0, list[tuple[Array, Array, Array]]()
+        rows = np.zeros((len(chain) if keeps else 0, *shape))
         for some in _together(lasts):
             end = int(lasts[some][-1]) + 1
-            left.append(_inner(chain.part(begin, end), lasts[some] - begin, rows[begin:end]))
+            own = rows[begin:end] if keeps else np.zeros((end - begin, *shape))
+            left.append(_inner(chain.part(begin, end), lasts[some] - begin, own))
             begin = end
         measured, between, beside = (np.concatenate(each) for each in zip(*left, strict=True))
         piece = None if chain.piece is None else chain.piece[lasts]
@@ -335,15 +344,18 @@ class ChainFactorization(Factorization):
     _ends: _TimeOrder
 
     @classmethod
-    def of(cls, chain: Chain) -> ChainFactorization:
-        """Eliminate a chain down to the last node and the shared unknowns. Raises IndeterminateStateError."""
+    def of(cls, chain: Chain, keeps: bool = True) -> ChainFactorization:
+        """Eliminate a chain down to the last node and the shared unknowns. Raises IndeterminateStateError.
+
+        Unless it `keeps` the states' R there is `root` alone.
+        """
         own, tail, levels, keyframes = chain.d, chain.c, list[_Level | None](), np.arange(len(chain))
         while len(chain) > SEQUENTIAL_STATES or (own == 0 and chain.walk is not None):
             if chain.walk is not None and len(chain) == len(chain.walk):
                 chain = chain.part(0, len(chain)).with_nodes_as_states()
                 levels.append(None)
             else:
-                level, chain, lasts = _Level.eliminate(chain)
+                level, chain, lasts = _Level.eliminate(chain, keeps)
                 levels.append(level)
                 keyframes = keyframes[lasts]
         ends, root = _TimeOrder.eliminate(chain.part(0, len(chain)), keyframes, own)

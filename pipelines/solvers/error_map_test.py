@@ -56,7 +56,7 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
         return estimate
     mapped, at = _mapped(engine, values, error_map)
     k, ratio = len(error_map.names), estimate.widest(problem.quantities)
-    root = mapped.at(at)[0].eliminate().root
+    root = mapped.at(at)[0].root()
     chi_square, dof, _ = _tested(root[-k - 1 :, -k - 1 :], error_map, ratio)
     if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
         return estimate

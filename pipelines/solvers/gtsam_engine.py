@@ -76,6 +76,10 @@ class GtsamSystem:
                 graph.push_back(factor)
         return cls(layout, graph, squares)
 
+    def root(self) -> Array:
+        """`Factorization.root` alone. Raises IndeterminateStateError."""
+        return self.eliminate().root
+
     def eliminate(self, damping: float = 0.0) -> GtsamFactorization:
         """Eliminate the rows, with each unknown's information times `damping` added. Raises IndeterminateStateError."""
         graph, layout = self._damped(damping) if damping > 0.0 else self.graph, self.layout

@@ -7,8 +7,8 @@ general stationary observations", Annals of Statistics 17, 1989):
 
     covariance of d = (n - 1) / n sum over n blocks of (d_b - d) (d_b - d)',     at least that of white noise
 
-The moment is that of the largest fall of chi-square. Of few blocks the chi-square of d is Hotelling's T^2, tested at the
-level over the number of moments (Bonferroni).
+The moment is that of the largest fall of chi-square. Of few blocks the chi-square of d is Hotelling's T^2, tested at
+the level over the number of moments (Bonferroni).
 
 Limits: blocks have to be longer than residuals are correlated: of 1 % of the field over 3 s, in 46 s, one recording in
 thirty has a step at the level of .001. The first and the last fifth of a recording have no moments.
@@ -24,7 +24,7 @@ import numpy as np
 from alidade.factors.array import Array, Index
 from alidade.pipelines.estimation.problem import OffsetStep
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.levenberg import Solution
+from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import NOT_MEASURED
 from alidade.pipelines.solvers.posterior import Reported
 
@@ -34,7 +34,7 @@ _BLOCKS, _FEWEST, _MOMENTS, _LEAST = 25, 15, 4, 5
 _BOUND = 1.345
 
 
-def largest_offset_step(compiled: Compiled, solution: Solution) -> OffsetStep | None:
+def largest_offset_step(compiled: Compiled, solution: Point) -> OffsetStep | None:
     """Find the most significant step of one of `Problem.offsets`; None with states, or with too few measurements.
 
     Args:
@@ -77,7 +77,7 @@ class _Rows:
     count: int
 
     @classmethod
-    def of(cls, compiled: Compiled, solution: Solution) -> _Rows:
+    def of(cls, compiled: Compiled, solution: Point) -> _Rows:
         """Linearise all measurements, each with Huber's weight."""
         size = compiled.layout.sizes[4] + 1
         times, measured, prior = list[Array](), list[Array](), np.zeros((size, size))

@@ -396,7 +396,7 @@ def sqrt_information(
             groups.append(replace(group, weights=group.all_weights * ~of_device))
         else:
             groups.append(group)
-    found = reported.root(engine.with_groups(groups).at(values)[0].eliminate().root)
+    found = reported.root(engine.with_groups(groups).at(values)[0].root())
     rows, d = fewest(found.R / reported.scale, found.d, reported.scale)
     return SqrtInformation(
         names=tuple(reported.names[i] for i in reported.free),

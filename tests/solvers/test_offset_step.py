@@ -73,7 +73,7 @@ def test_hard_iron_that_moves_is_a_change_and_not_noise() -> None:
 
 def test_rests_before_a_step_are_no_outliers() -> None:
     """Of a third of the rests, which the robust loss rejects: the others fit."""
-    scenario = {"attitudes": 40, "rest_s": 2.0, "magnetometer": None, "accelerometer": {}}
+    scenario: dict[str, object] = {"attitudes": 40, "rest_s": 2.0, "magnetometer": None, "accelerometer": {}}
     simulated = alidade.simulate("tumble", scenario, 1)
     data = simulated.data
     accel = data.accel.copy()
