@@ -47,7 +47,7 @@ def largest_offset_step(compiled: Compiled, solution: Point) -> OffsetStep | Non
     if rows.block[-1] < _FEWEST - 1:
         return None
     reported = Reported.of(compiled, solution.values)
-    inverse: Array = np.linalg.pinv(reported.jacobian)
+    inverse = np.asarray(np.linalg.pinv(reported.jacobian), dtype=float)
     found = []
     for names in compiled.problem.offsets:
         with suppress(np.linalg.LinAlgError):
