@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -282,6 +283,43 @@ def test_a_quantised_sensor_at_rest_is_sound() -> None:
     moving = (np.maximum(-np.sin(0.05 * np.pi * t), 0.0) ** 2 * np.sin(3.0 * t))[:, None] * [1.0, -0.5, 2.0]
     counts = np.round((moving + 0.3e-3 * np.random.default_rng(0).standard_normal((len(t), 3))) / 1e-3) * 1e-3
     assert len(drop_faults("/imu", t, counts, {}, "rad/s")) == len(t)
+
+
+def test_a_coarse_accelerometer_at_rest_between_knocks_is_not_stuck() -> None:
+    """In steps of 31 mg it reads one value throughout a rest; it was refused as stuck for 25 % of the samples."""
+    t, rng = np.arange(6000) / 100.0, np.random.default_rng(1)
+    since = t % 6.0 - 4.0  # s from the end of each rest
+    knock = np.where((np.abs(since) < 0.05) | (np.abs(since - 1.95) < 0.05), 6.0, 0.02)
+    attitude = 9.8 * so3.rotate(so3.exp(0.4 * np.floor(t / 6.0)[:, None] * [1.0, 0.5, 0.2]), np.array([0.0, 0.6, 0.8]))
+    accel = attitude + np.where(since > 0.0, 5.0 * np.sin(3.0 * np.pi * since), 0.0)[:, None] * [1.0, -1.0, 0.7]
+    accel = 0.306 * np.round((accel + knock[:, None] * rng.standard_normal((len(t), 3))) / 0.306)
+    assert len(drop_faults("/imu", t, accel, {}, "m/s^2")) == len(t)
+    stuck = slice(2216, 2250)
+    accel[stuck] = accel[stuck.start]
+    dropped: dict[str, int] = {}
+    kept = drop_faults("/imu", t, accel, dropped, "m/s^2")
+    assert not np.isin(np.arange(stuck.start + 1, stuck.stop), kept).any()
+
+
+def test_the_top_of_coarse_readings_is_no_plateau() -> None:
+    t = np.arange(0.0, 20.0, 0.01)
+    rates = np.rint(8.0 * np.sin(2.0 * np.pi * 0.3 * t[:, None] + [0.0, 1.0, 2.0]))
+    assert len(drop_faults("/imu", t, rates, {}, "rad/s")) == len(t)
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "shown"),
+    [(6000.0, "T", ""), (5e-5, "T", " T"), (2048.0, "m/s^2", ""), (9.8, "m/s^2", " m/s^2"), (900.0, "rad/s", "")],
+)
+def test_the_unit_of_counts_is_not_named(size: float, unit: str, shown: str) -> None:
+    t = np.arange(2000) / 50.0
+    values = size * np.stack([np.cos(t), np.sin(t), 0.1 * np.cos(3.0 * t)], axis=1)
+    values += 1e-3 * size * np.random.default_rng(0).standard_normal(values.shape)
+    values[500:1300] = values[500]
+    with pytest.raises(
+        InputError, match=rf"stuck at one value \([-.\de+]+{re.escape(shown)} on axis x, the first at 10"
+    ):
+        drop_faults("/imu", t, values, {}, unit)
 
 
 @pytest.mark.parametrize(
