@@ -27,7 +27,16 @@ from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.pairing import pair
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.shapes import (
+    Covariances,
+    Fields,
+    Forces,
+    Numbers,
+    PlatformRates,
+    Quaternions,
+    Rates,
+    Vectors,
+)
 from alidade.pipelines.recording.streams import StreamReader, imu_series
 from alidade.pipelines.recording.topics import IMU, MAG, Setting, Topic, wanted
 from alidade.pipelines.settings import Config, MethodSection
@@ -38,12 +47,12 @@ from alidade.pipelines.simulation.sensors import EulerMotion, Swing, by_axis, re
 __all__ = [
     "AXES", "COLORS", "EPOCH_NS", "IMU", "MAG", "ROT3", "Array", "ChainLayout", "ChecklistItem", "Column",
     "Config", "Correction", "Covariances", "DataFault", "Estimate", "EulerMotion", "ExactInput", "Factor",
-    "FaultModel", "Figure", "Formula", "Guidance", "GyroPath", "Increments", "InputError", "Level", "Method",
-    "MethodSection", "Model", "Motion", "NoiseSpec", "Numbers", "Parameter", "ParameterSpec", "Plot", "Problem",
-    "Quaternions", "Recording", "Report", "Residuals", "ScaleFactor", "Scenario", "ScenarioPart", "Setting",
-    "Simulated", "Simulator", "Step", "StreamReader", "Swing", "Table", "Topic", "Use", "Validation", "Vectors",
-    "apply", "by_axis", "check_overlap", "deferred", "imu_series", "messages", "nanoseconds", "pair",
-    "parameter_problem", "recording_config", "rms", "sample_times", "scalar", "so3", "stated", "swayed",
-    "swaying", "sways", "turned", "wanted",
+    "FaultModel", "Fields", "Figure", "Forces", "Formula", "Guidance", "GyroPath", "Increments", "InputError",
+    "Level", "Method", "MethodSection", "Model", "Motion", "NoiseSpec", "Numbers", "Parameter", "ParameterSpec",
+    "PlatformRates", "Plot", "Problem", "Quaternions", "Rates", "Recording", "Report", "Residuals",
+    "ScaleFactor", "Scenario", "ScenarioPart", "Setting", "Simulated", "Simulator", "Step", "StreamReader",
+    "Swing", "Table", "Topic", "Use", "Validation", "Vectors", "apply", "by_axis", "check_overlap", "deferred",
+    "imu_series", "messages", "nanoseconds", "pair", "parameter_problem", "recording_config", "rms",
+    "sample_times", "scalar", "so3", "stated", "swayed", "swaying", "sways", "turned", "wanted",
 ]
 # fmt: on

@@ -30,9 +30,11 @@ from alidade.pipelines.recording.checks import (
     check_time_unit,
     clean,
     nanoseconds,
+    take_rows,
 )
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.shapes import Rows, as_dates, rows_by_name
+from alidade.pipelines.recording.streams import SensorReadings, screened
 from alidade.pipelines.settings import Config as _BaseConfig
 from alidade.pipelines.settings import first_error, validated
 from alidade.pipelines.simulation.scenario import Simulated
@@ -332,6 +334,14 @@ def _checked(method: Method, data: Any) -> Any:
         has_gyro = any("gyro" in name for name in names)
         t_ns = nanoseconds(arrays[stamps], 0)
         check_time_unit(f"arrays: {stamps}", t_ns, SLOWEST_GYRO_S if has_gyro else SLOWEST_S)
+        with _naming_arrays():
+            sensors = [
+                SensorReadings(name, arrays[name], rows[name].unit, rows[name].may_be_constant)
+                for name in names
+                if rows[name].unit
+            ]
+            sound = screened(stamps, arrays[stamps], sensors, dropped)
+        arrays |= {name: take_rows(arrays[name], sound) for name in (stamps, *names)}
         for name in names:
             # Those of a method that takes counts are looked at with their conversion.
             if "gyro" in name and "raw" not in getattr(method.config_section, "model_fields", {}):

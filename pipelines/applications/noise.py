@@ -17,9 +17,9 @@ from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import clean
-from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.plausibility import SI, implausible, is_there, measured_once
+from alidade.pipelines.recording.plausibility import SI, implausible, is_there
 from alidade.pipelines.recording.recording import Recording, open_recording
+from alidade.pipelines.recording.streams import SensorReadings, screened
 from alidade.pipelines.settings import Config
 
 # Pieces shorter than this many samples are left out.
@@ -159,9 +159,8 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
         )
     for kind, values in samples.items():
         part = f"{name} {kind}"
-        rows = measured_once(part, values, dropped)
         # At rest a coarse sensor may read one value, which is noted below.
-        sound = rows[drop_faults(part, t[rows], values[rows], dropped, SI[kind], may_stand=True)]
+        sound = screened(part, t, [SensorReadings(part, values, SI[kind], may_be_constant=True)], dropped)
         pieces, interval, filled = _pieces(t[sound], values[sound], rests)
         if not pieces:
             raise InputError(f"topic {part}: too many samples are missing in the {len(rests)} static intervals")

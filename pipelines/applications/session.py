@@ -148,9 +148,8 @@ class Session:
             if said.startswith("topic "):  # a fault of a topic matters less than others that are not there
                 said = f"{recording.path}: method {chosen.name} lacks {'; '.join(missing)}"
             raise InputError(f"{said}{f'; nearest is {nearest}' if nearest else ''}") from error
-        noted = (COPIED, OVERTAKEN, HELD, "not used (reading kept)")
-        many = [f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted)]
-        for sentence in (*many, *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
+        unused = *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)
+        for sentence in (*_counted(data), *unused):
             recording.remark(sentence)
         session = cls(chosen, data, config, recording)
         return session if prior is None else session.beginning_from(prior)
@@ -225,7 +224,7 @@ class Session:
         """Facts about the recording: topics, rates, gaps, losses; of arrays the length. The stamps are freed then."""
         if self.recording is None:
             start, stop = self.method.faults.span(self.data)
-            return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
+            return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()}, notes=_counted(self.data))
         facts = session_facts(self.recording, self.config)
         self.recording.forget_times()
         return facts
@@ -622,6 +621,12 @@ def _feed(digest: hashlib._Hash, data: Any) -> None:
             digest.update(np.ascontiguousarray(value).tobytes())
         elif isinstance(value, int | float | str):
             digest.update(repr(value).encode())
+
+
+def _counted(data: Any) -> tuple[str, ...]:
+    """Notes on what was done to many samples of the data."""
+    noted = (COPIED, OVERTAKEN, HELD, "not used (reading kept)")
+    return tuple(f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted))
 
 
 def _check_sheets(method: Method, config: Config) -> None:

@@ -1,7 +1,7 @@
 """Shapes of the arrays of a method's data, from the annotations of their class.
 
     gyro_t: Numbers
-    gyro: Vectors
+    gyro: Rates
     gyro_cov: Covariances | None = None
 
 A plain `Array` is one of any shape.
@@ -34,10 +34,14 @@ class Rows:
         shape: of a row; None: any.
         unmeasured: components of a row that may be NaN, where they were not measured; of a covariance its rows and
             columns.
+        unit: SI, of readings that are screened for faults, see `streams.screened`; empty: they are not.
+        may_be_constant: whether all axes may read the same throughout.
     """
 
     shape: tuple[int, ...] | None = None
     unmeasured: tuple[int, ...] = ()
+    unit: str = ""
+    may_be_constant: bool = False
 
     def read(self, name: str, value: Any) -> Array:
         """Convert user input for the array called `name` to floats; masked values become NaN.
@@ -80,6 +84,11 @@ Pairs = Annotated[Array, Rows((2,))]
 Vectors = Annotated[Array, Rows((3,))]
 Quaternions = Annotated[Array, Rows((4,))]
 Covariances = Annotated[Array, Rows((3, 3))]
+# Readings of gyros, those of a platform that may be parked, of accelerometers and of magnetometers.
+Rates = Annotated[Array, Rows((3,), unit="rad/s")]
+PlatformRates = Annotated[Array, Rows((3,), unit="rad/s", may_be_constant=True)]
+Forces = Annotated[Array, Rows((3,), unit="m/s^2")]
+Fields = Annotated[Array, Rows((3,), unit="T")]
 
 
 def as_dates(value: Any) -> NDArray[np.int64] | None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar, final
+from typing import Any, Generic, NamedTuple, TypeVar, final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,6 +73,33 @@ class Temperature:
         return np.asarray(np.interp(np.asarray(at, dtype=float), self.t, self.celsius) - reference)
 
 
+class SensorReadings(NamedTuple):
+    """Readings (N, k) of one sensor: its name in messages, its unit, and whether all axes may read one value."""
+
+    name: str
+    values: Array
+    unit: str
+    may_be_constant: bool = False
+
+
+def screened(stream: str, t: Array, sensors: Sequence[SensorReadings], dropped: dict[str, int]) -> NDArray[np.intp]:
+    """Return the rows of a stream at times t (N,), s, that are measured once and have no fault; count the others.
+
+    A driver may repeat a reading until there is a new one; it is used once, and is none at the end of the range.
+
+    Raises:
+        InputError: a sensor is dead, or loses more than a fifth of its samples (`faults.drop_faults`).
+    """
+    if not sensors:
+        return np.arange(len(t))
+    once = plausibility.measured_once(stream, np.hstack([sensor.values for sensor in sensors]), dropped)
+    sound = np.arange(len(once))
+    for name, values, unit, may_be_constant in sensors:
+        kept = drop_faults(name, t[once], values[once], dropped, unit, may_be_constant)
+        sound = np.intersect1d(sound, kept, assume_unique=True)
+    return once[sound]
+
+
 class StreamReader:
     """Reads the sensors of a recording and counts the samples that cannot be used.
 
@@ -108,18 +135,16 @@ class StreamReader:
         least: int = 2,
         slowest_s: float = SLOWEST_S,
         may_be_constant: bool = False,
-        may_be_held: bool = False,
     ) -> Samples[AnySeries]:
         """Return the samples of a series whose `quantities` (names of attributes) are finite and without faults.
 
         Args:
             topic: for messages.
             found: the series.
-            quantities: (N, k) each; faults are looked for in those of inertial sensors and magnetometers.
+            quantities: (N, k) each; those of inertial sensors and magnetometers are screened.
             least: samples needed.
             slowest_s: longest usual step that such a sensor may have, s.
             may_be_constant: whether all axes may read the same throughout.
-            may_be_held: whether a driver may repeat a reading until there is a new one; it is used once.
         """
         self.count(topic, "stamped by log time (kept)", found.stamped_by_log)
         for name in () if may_be_constant else quantities:
@@ -127,15 +152,12 @@ class StreamReader:
         values = np.concatenate([getattr(found, name).reshape(len(found), -1) for name in quantities], axis=1)
         t, rows = checks.clean(topic, found.t_ns, self.epoch_ns, values, self.dropped, least, slowest_s)
         samples = Samples(t, _rows(found, rows))
-        if may_be_held:  # a reading that is repeated is not one at the end of the range
-            values = np.concatenate([getattr(samples.series, name) for name in quantities], axis=1)
-            samples = samples.rows(plausibility.measured_once(topic, values, self.dropped))
-        sound = np.arange(len(samples.t))
-        for name in [each for each in quantities if each in _UNITS]:
-            own = getattr(samples.series, name)
-            kept = drop_faults(topic, samples.t, own, self.dropped, _UNITS[name], may_be_constant)
-            sound = np.intersect1d(sound, kept, assume_unique=True)
-        return samples.rows(sound)
+        sensors = [
+            SensorReadings(topic, getattr(samples.series, name), _UNITS[name], may_be_constant)
+            for name in quantities
+            if name in _UNITS
+        ]
+        return samples.rows(screened(topic, t, sensors, self.dropped))
 
     def gyro(self, topic: str, least: int = 2, may_be_constant: bool = False) -> Samples[ImuSeries]:
         """Read the samples of an Imu topic with usable rates, rad/s; a reading that the driver repeats is used once.
@@ -149,7 +171,6 @@ class StreamReader:
             least=least,
             slowest_s=SLOWEST_GYRO_S,
             may_be_constant=may_be_constant,
-            may_be_held=True,
         )
         checks.check_gyro(topic, samples.t, samples.series.gyro)
         return samples
@@ -169,7 +190,7 @@ class StreamReader:
 
     def magnetic_field(self, topic: str) -> Samples[MagneticSeries]:
         """Read the samples of a MagneticField topic, T; a reading that the driver repeats is used once."""
-        return self.samples(topic, self.recording.magnetic(topic), "field", may_be_held=True)
+        return self.samples(topic, self.recording.magnetic(topic), "field")
 
     def density(self, topic: str, kind: str, samples: Samples[AnySeries]) -> float | None:
         """Noise density, per sqrt(Hz), that the covariances of samples state; None if they state none.

@@ -17,9 +17,9 @@ from scipy.linalg import block_diag
 # isort: off
 from alidade.plugin import (
     AXES, COLORS, EPOCH_NS, ROT3, Array, Config, Estimate, EulerMotion, FaultModel, Figure, Formula, Guidance, GyroPath,
-    Increments, InputError, Level, Method, Model, Motion, NoiseSpec, Numbers, ParameterSpec, Plot, Problem, Recording,
-    Report, Residuals, ScenarioPart, Simulated, Simulator, StreamReader, Swing, Topic, Validation, Vectors, apply,
-    by_axis, check_overlap, imu_series, messages, nanoseconds, pair, parameter_problem, recording_config, rms,
+    Increments, InputError, Level, Method, Model, Motion, NoiseSpec, Numbers, ParameterSpec, PlatformRates, Plot,
+    Problem, Recording, Report, Residuals, ScenarioPart, Simulated, Simulator, StreamReader, Swing, Topic, Validation,
+    apply, by_axis, check_overlap, imu_series, messages, nanoseconds, pair, parameter_problem, recording_config, rms,
     sample_times, scalar, so3, stated, swaying, swayed, sways, turned,
 )  # fmt: skip
 
@@ -48,9 +48,9 @@ class GyroPairData:
 
     epoch_ns: int
     a_t: Numbers
-    a_gyro: Vectors
+    a_gyro: PlatformRates
     b_t: Numbers
-    b_gyro: Vectors
+    b_gyro: PlatformRates
     a_density: float | None = None
     b_density: float | None = None
     dropped: dict[str, int] = field(default_factory=dict)

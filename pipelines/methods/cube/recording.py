@@ -20,7 +20,7 @@ from alidade.pipelines.methods.place import field_at, known_field, place_topics,
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, check_overlap, nanoseconds
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.shapes import Covariances, Fields, Forces, Numbers, Quaternions, Rates
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series, white_covariance
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, TEMPERATURE, Need, Setting, Topic, wanted
 from alidade.pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
@@ -157,10 +157,10 @@ class CubeData:
 
     epoch_ns: int
     imu_t: Numbers
-    gyro: Vectors
-    accel: Vectors
+    gyro: Rates
+    accel: Forces
     mag_t: Numbers | None = None
-    mag: Vectors | None = None
+    mag: Fields | None = None
     reference_t: Numbers | None = None
     reference_wxyz: Quaternions | None = None
     reference_cov: Covariances | None = None
@@ -244,9 +244,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
 
     reader = StreamReader(recording, dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic(IMU)
-    imu = reader.samples(
-        name, recording.imu(name), "gyro", "accel", least=3, slowest_s=SLOWEST_GYRO_S, may_be_held=True
-    )
+    imu = reader.samples(name, recording.imu(name), "gyro", "accel", least=3, slowest_s=SLOWEST_GYRO_S)
     raw = config.section(CubeConfig).raw
     sensors = [
         Readings(name, imu.t, imu.series.accel, raw.accel),

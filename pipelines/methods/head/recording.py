@@ -17,7 +17,7 @@ from alidade.pipelines.methods.noise import typical
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.shapes import Covariances, Numbers, PlatformRates, Quaternions, Rates, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, TEMPERATURE, Need, Setting, Topic, wanted
 from alidade.pipelines.settings import Board, Config, MethodSection
@@ -63,9 +63,9 @@ class HeadData:
 
     epoch_ns: int
     head_t: Numbers
-    head_gyro: Vectors
+    head_gyro: Rates
     platform_t: Numbers | None
-    platform_gyro: Vectors | None
+    platform_gyro: PlatformRates | None
     vision_t: Numbers
     vision_wxyz: Quaternions
     vision_cov: Covariances | None

@@ -12,7 +12,7 @@ from alidade.pipelines.methods.place import median_fix
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds, unit_quaternions
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.shapes import Numbers, Quaternions, Rates
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
 from alidade.pipelines.recording.topics import FIX, IMU, TEMPERATURE, Need, Setting, Topic, wanted
 from alidade.pipelines.settings import Config, MethodSection, Quaternion
@@ -48,7 +48,7 @@ class IndexerData:
 
     epoch_ns: int
     gyro_t: Numbers
-    gyro: Vectors
+    gyro: Rates
     encoder_t: Numbers
     outer: Numbers
     inner: Numbers

@@ -16,7 +16,7 @@ from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.faults import drop_frozen
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
+from alidade.pipelines.recording.shapes import Numbers, Pairs, Rates, Rows, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, TEMPERATURE, Need, Topic, wanted
 from alidade.pipelines.settings import Config
@@ -86,7 +86,7 @@ class LosData:
 
     epoch_ns: int
     gyro_t: Numbers
-    gyro: Vectors
+    gyro: Rates
     gimbal_t: Numbers
     gimbal: Pairs
     image_t: Numbers

@@ -14,7 +14,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import check_overlap, clean, nanoseconds, too_fast
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, is_there, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.shapes import Numbers, Vectors
+from alidade.pipelines.recording.shapes import Fields, Forces, Numbers, PlatformRates
 from alidade.pipelines.recording.streams import Samples, StreamReader, Temperature, white_covariance
 from alidade.pipelines.recording.topics import FIX, IMU, MAG, TEMPERATURE, Need, Setting, wanted
 from alidade.pipelines.settings import Config
@@ -45,9 +45,9 @@ class TumbleData:
 
     epoch_ns: int
     mag_t: Numbers | None = None
-    mag: Vectors | None = None
+    mag: Fields | None = None
     accel_t: Numbers | None = None
-    accel: Vectors | None = None
+    accel: Forces | None = None
     mag_density: float | None = None
     accel_density: float | None = None
     latitude: float | None = None
@@ -55,7 +55,7 @@ class TumbleData:
     height: float = 0.0
     dropped: dict[str, int] = field(default_factory=dict)
     gyro_t: Numbers | None = None
-    gyro: Vectors | None = None
+    gyro: PlatformRates | None = None
     gyro_density: float | None = None
     temperature: Temperature | None = None
 
@@ -77,7 +77,7 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
     if wanted(recording, config, IMU):
         imu = recording.imu(name)
         if is_there("accel", imu.accel, imu.accel_cov):
-            accel = reader.samples(name, imu, "accel", may_be_held=True)
+            accel = reader.samples(name, imu, "accel")
             if lacks_gravity(np.linalg.norm(accel.series.accel, axis=1)):
                 raise InputError(f"topic {name}: {GRAVITY_REMOVED}")
             accel_density = reader.density(name, "accel", accel)
@@ -123,7 +123,7 @@ def _gyro(reader: StreamReader, topic: str, imu: series.ImuSeries) -> Samples[se
     if too_fast(topic, t, imu.gyro[keep]):
         reader.count(topic, NO_RATE, len(t))
         return None
-    return reader.samples(topic, imu, "gyro", may_be_constant=True, may_be_held=True)
+    return reader.samples(topic, imu, "gyro", may_be_constant=True)
 
 
 def tumble_topics(data: TumbleData, _pictures: None = None) -> dict[str, series.Topic]:
