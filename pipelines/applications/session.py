@@ -35,7 +35,7 @@ from alidade.pipelines.diagnostics.cross_validation import SplitHalf, held_out_r
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, prior_conflicts
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
-from alidade.pipelines.diagnostics.observability import finite_covariance
+from alidade.pipelines.diagnostics.observability import finite_covariance, prior_covariance
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config, with_conflicts
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
@@ -309,6 +309,8 @@ class Session:
             findings = [*self._findings(estimate, quantities, change, conflicts)]
             findings += [*_remarks(problem, estimate, difference), *carried]
             findings += map(remark, filter(None, [deadline.stopped()]))
+            if not estimate.converged and estimate.solver != "published":  # curvature where no minimum is
+                estimate = replace(estimate, covariance=prior_covariance(quantities))
             found.append(
                 Calibration(
                     method=self.method,

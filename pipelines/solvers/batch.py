@@ -44,7 +44,7 @@ from alidade.pipelines.solvers.error_budget import (
 )
 from alidade.pipelines.solvers.error_map_test import with_error_map
 from alidade.pipelines.solvers.layout import Values
-from alidade.pipelines.solvers.levenberg import DEFAULT, LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.levenberg import DEFAULT, LevenbergConfig, Point, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
@@ -148,9 +148,20 @@ def solve(compiled: Compiled, config: LevenbergConfig = DEFAULT, levels: tuple[L
             if levels is None:
                 solution, start = estimate_noise(rest, solution, start, problem.loss, config)
     solution, second = _best(compiled, solution, config)
-    posterior = unfinished if deadline.passed() and not solution.converged else constrained_solution
-    found = posterior(compiled, solution.at_inliers())
+    found = _posterior_of(compiled, solution)
     return Solved(compiled, solution, start, found, second, stopped=deadline.passed())
+
+
+def _posterior_of(compiled: Compiled, solution: Solution) -> Posterior:
+    """Compute the posterior near a solution; where that is no minimum and determines no state, where it started.
+
+    Raises:
+        IndeterminateStateError: states are not determined, of what has no minimum where it started.
+    """
+    posterior = unfinished if deadline.passed() and not solution.converged else constrained_solution
+    with suppress(*(() if solution.converged else (IndeterminateStateError,))):
+        return posterior(compiled, solution.at_inliers())
+    return unfinished(compiled, Point.of(solution.engine, compiled.initial))
 
 
 def solve_batch(

@@ -44,7 +44,10 @@ _ROWS = 256
 RANK_TOLERANCE = 1e-13
 
 
-UNDETERMINED = "a state is not determined: no measurement and no process constrains it"
+UNDETERMINED = (
+    "a state (an attitude or a bias at one moment) is not determined by any measurement: record longer and with more "
+    "motion, and check that every sensor measured throughout"
+)
 
 
 class IndeterminateError(Exception):

@@ -31,6 +31,7 @@ spoilt two. Where no constrained minimum is found all that is calibrated has its
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -345,8 +346,14 @@ def _contradicts(before: Posterior, after: Posterior) -> bool:
 
 
 def _unknown(compiled: Compiled, minimum: Point) -> Posterior:
-    """Posterior where no constrained minimum is found: all calibrated numbers at their priors."""
-    return replace(_constrained(compiled, minimum, unfinished(compiled, minimum).directions), converged=False)
+    """Posterior where no constrained minimum is found: all calibrated numbers at their priors.
+
+    Where these do not determine the states, the values stay, with the covariance of the priors.
+    """
+    found = unfinished(compiled, minimum)
+    with suppress(IndeterminateStateError):
+        found = _constrained(compiled, minimum, found.directions)
+    return replace(found, converged=False)
 
 
 def unfinished(compiled: Compiled, point: Point) -> Posterior:

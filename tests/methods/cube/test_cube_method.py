@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import alidade
 from alidade.factors import so3
 from alidade.factors.turns import GyroRotationFactor
 from alidade.pipelines.config import load_config
@@ -444,6 +445,18 @@ def test_real_counts_of_an_xsens_without_camera(shared_data: Path) -> None:
     noise = {row["sensor"]: row["density"] for row in findings(data, config, estimate)["noise"]}
     for name, density in (("accel", 8e-4), ("gyro", 5.7e-4)):
         np.testing.assert_allclose(np.array(noise[name]), density, rtol=0.2)
+
+
+def test_half_a_real_session_that_determines_next_to_nothing_is_a_result(shared_data: Path) -> None:
+    """Its parameters at their priors do not determine its states, which was an exception."""
+    path = shared_data / "imucal" / "annotated_session.csv"
+    counts = np.loadtxt(path, delimiter=",", skiprows=1, usecols=range(2, 8))
+    counts = counts[: len(counts) // 2]
+    raw = {"accel": {"scale": 9.81 / 2048.0}, "gyro": {"scale": np.deg2rad(1.0 / 16.4)}}
+    given = {"imu_t": np.arange(len(counts)) / 204.8, "accel": counts[:, :3], "gyro": counts[:, 3:]}
+    found = alidade.open(given, method="cube", config={"latitude_deg": 45.0, "cube": {"raw": raw}}).calibrate()
+    assert found.status == "unobservable"
+    assert set(found.verdicts.values()) == {"unobservable", "fixed"}
 
 
 def _normalized_error(estimate: Estimate, truth: dict[str, float]) -> float:
