@@ -103,7 +103,10 @@ def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
     """Reason why there is no solution, in words: the solver's message, or too many undetermined parameters."""
     found = [verdict(q, sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True) if q.judged]
     open_ones, free = found.count("unobservable"), len(found) - found.count("fixed")
-    if estimate.converged or deadline.passed() or open_ones <= _MOST * free:
+    # What contradicts itself has motion enough.
+    fit = None if estimate.chi_square is None else Fit.of(estimate.chi_square.value, estimate.chi_square.dof)
+    contradicts = fit is not None and not fit.value <= fit.high
+    if estimate.converged or contradicts or deadline.passed() or open_ones <= _MOST * free:
         return estimate.message
     return (
         f"the recording is too short, or has too little motion, for {open_ones} of {free} parameters "

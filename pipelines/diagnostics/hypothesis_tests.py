@@ -19,7 +19,7 @@ import numpy as np
 from alidade.factors.array import Array
 from alidade.pipelines import parallel
 from alidade.pipelines.diagnostics.cross_validation import Build, TrialFit, max_concurrent, score_trial, solve_trial
-from alidade.pipelines.diagnostics.diagnose import rejections
+from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, rejections
 from alidade.pipelines.diagnostics.fault_models import FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.observability import rejects_many
 from alidade.pipelines.estimation.finding import Finding, Severity
@@ -63,13 +63,24 @@ def find_hypotheses(
     """Find faults whose correction makes a misfitting recording fit, the best fit first.
 
     Tested is the segment where the residuals of `estimate` are worst, the whole without one. A fault has to explain
-    more than `freed` does, the config in which what the recording contradicts is free.
+    more than `freed` does, the config in which what the recording contradicts is free. Where the estimate has not
+    converged, that is explained by a fault without which there is a solution above suspicion.
     """
+    if estimate is not None and model.cut and estimate.residuals:
+        data = model.segment(data, *_worst_segment(estimate.residuals, _SEGMENT_S))
+    found = _explaining_misfit(build, model, data, config, freed)
+    if found or estimate is None or estimate.converged:
+        return found
+    return _findings(None, _above_suspicion(build, model, data, config, estimate))
+
+
+def _explaining_misfit(
+    build: Build, model: FaultModel, data: Any, config: Config, freed: Config | None
+) -> tuple[Finding, ...]:
+    """Find faults without which chi-square falls significantly, arguments as of `find_hypotheses`."""
     known = config.noise_known == 0.0
     # With the noise as stated: levels that are estimated hide what is looked for.
     config = config.model_copy(update={"noise_known": 0.0})
-    if estimate is not None and model.cut and estimate.residuals:
-        data = model.segment(data, *_worst_segment(estimate.residuals, _SEGMENT_S))
     before = solve_trial(build, data, config)
     if before is None or (before.fits and not rejects_many(rejections(before.estimate))):
         return ()
@@ -77,7 +88,8 @@ def find_hypotheses(
     if without is not None and without.fits and not rejects_many(rejections(without.estimate)):
         return ()
     concurrent = max_concurrent(model.times(data))
-    found = _explaining(build, _promising(build, model, data, config, before), before, concurrent)
+    cases = list(trial_cases(build, model, data, config))
+    found = _explaining(build, _promising(build, model, cases, data, config, before.estimate), before, concurrent)
     if any(after.fits for after, _ in found):
         found = [each for each in found if each[0].fits]
     if not found:
@@ -87,7 +99,26 @@ def find_hypotheses(
         found = _noise(build, data, config)
     if without is not None:
         found = [each for each in found if each[0].cost < without.cost]
-    return _findings(before, found[:_MAX_REPORTED])
+    return _findings(before.cost, found[:_MAX_REPORTED])
+
+
+def _above_suspicion(build: Build, model: FaultModel, data: Any, config: Config, estimate: Estimate) -> list[_Tested]:
+    """Return wrong signs and orders of axes without which there is a solution above suspicion, the likeliest first.
+
+    The noise is estimated where the config leaves it open: as stated it may be why nothing fits. Readings in other
+    units have another noise, and would not compare.
+    """
+    cases = [*_inverted_signs(model, data, config), *_axis_orders(model, data, config)]
+    cases = _promising(build, model, cases, data, config, estimate)
+    solved = _solved(build, cases, max_concurrent(model.times(data)))
+    found = [
+        each
+        for each in solved
+        if each[0].estimate.converged
+        and each[0].fits
+        and not is_suspect(each[0].estimate, diagnose(each[0].estimate, each[0].quantities))
+    ]
+    return sorted(found, key=lambda each: each[0].cost_with_priors)
 
 
 def misstatements(build: Build, model: FaultModel, data: Any, config: Config) -> tuple[Finding, ...]:
@@ -100,11 +131,14 @@ def misstatements(build: Build, model: FaultModel, data: Any, config: Config) ->
     before, *found = _solved(build, [TrialCase("", data, config), *cases], max_concurrent(model.times(data)))
     limit = before[0].cost_with_priors - _SIGNIFICANT**2
     nearer = [each for each in found if each[0].cost_with_priors < limit]
-    return _findings(before[0], sorted(nearer, key=lambda each: each[0].cost_with_priors))
+    return _findings(before[0].cost, sorted(nearer, key=lambda each: each[0].cost_with_priors))
 
 
-def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]:
-    """Combine hypotheses of nearly equal cost into one finding: the best, with the others as equivalents."""
+def _findings(before: float | None, found: Sequence[_Tested]) -> tuple[Finding, ...]:
+    """Combine hypotheses of nearly equal cost into one finding: the best, with the others as equivalents.
+
+    `before` is chi-square as recorded; None without a solution.
+    """
     groups: list[list[_Tested]] = []
     for each in found:
         if groups and each[0].cost_with_priors - groups[-1][0][0].cost_with_priors < _SIGNIFICANT**2:
@@ -117,7 +151,7 @@ def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]
             Severity.INCONSISTENT,
             {
                 "label": group[0][1],
-                "chi_square_before": before.cost,
+                "chi_square_before": before,
                 "chi_square_after": group[0][0].cost,
                 "dof": group[0][0].dof,
                 "equivalents": [label for _, label in group[1:]],
@@ -142,12 +176,13 @@ def _solved(build: Build, cases: Iterable[TrialCase], concurrent: int) -> list[_
     return [(after, case.label) for case, after in zip(cases, fits, strict=True) if after is not None]
 
 
-def _promising(build: Build, model: FaultModel, data: Any, config: Config, before: TrialFit) -> list[TrialCase]:
+def _promising(
+    build: Build, model: FaultModel, found: Sequence[TrialCase], data: Any, config: Config, before: Estimate
+) -> list[TrialCase]:
     """Select the cases worth solving, by scores after a few iterations on a short segment."""
-    found = list(trial_cases(build, model, data, config))
     cases = [*found, TrialCase("", data, config)]
-    if model.cut and before.estimate.residuals:
-        worst = _worst_segment(before.estimate.residuals, _SCORE_SEGMENT_S)
+    if model.cut and before.residuals:
+        worst = _worst_segment(before.residuals, _SCORE_SEGMENT_S)
         cases = [TrialCase(case.label, model.segment(case.data, *worst), case.config) for case in cases]
     works = [partial(score_trial, build, case.data, case.config, case.label) for case in cases]
     scored = parallel.done(works, _WHAT, max_concurrent(model.times(cases[-1].data)))

@@ -235,8 +235,9 @@ def _hypothesis(e: Mapping[str, Any], severity: Severity, quantities: Quantities
 
 
 def _corrected(e: Mapping[str, Any], _: Severity, __: Quantities) -> tuple[str, str]:
-    before, after, dof = (rounded(e[key], 4) for key in ("chi_square_before", "chi_square_after", "dof"))
-    return e["label"], f"chi-square {before} -> {after}, dof {dof}"
+    before, (after, dof) = e["chi_square_before"], (rounded(e[key], 4) for key in ("chi_square_after", "dof"))
+    was = "no solution as recorded, corrected chi-square" if before is None else f"chi-square {rounded(before, 4)} ->"
+    return e["label"], f"{was} {after}, dof {dof}"
 
 
 def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[str, str]:

@@ -219,6 +219,13 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "The recordings disagree about the device: chi-square 99 (dof 3).",
     ),
     ("remark", NOTE, {"text": "No platform IMU."}, "No platform IMU."),
+    (
+        "hypothesis",
+        INCONSISTENT,
+        {"label": "x inverted", "chi_square_before": None, "chi_square_after": 5512.0, "dof": 5397.0}
+        | {"equivalents": []},
+        "Consistent with: x inverted (no solution as recorded, corrected chi-square 5512, dof 5397).",
+    ),
 ]
 
 
@@ -365,6 +372,9 @@ def test_a_recording_that_determines_next_to_nothing_is_said_to_be_too_short() -
         "the recording is too short, or has too little motion, for 5 of 5 parameters "
         "(not converged after 63 iterations)"
     )
+    contradictory = replace(short, chi_square=ChiSquare(1e6, 1000.0, {}))
+    (finding,) = diagnose(contradictory, made.problem.quantities)[:1]
+    assert finding.evidence["message"] == "not converged after 63 iterations"
 
 
 def test_a_cause_that_is_but_noted_adds_no_stray_full_stop() -> None:

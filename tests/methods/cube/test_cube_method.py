@@ -13,6 +13,7 @@ import pytest
 
 import alidade
 from alidade.factors import so3
+from alidade.factors.array import Array
 from alidade.factors.turns import GyroRotationFactor
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.cross_validation import rms
@@ -445,6 +446,25 @@ def test_real_counts_of_an_xsens_without_camera(shared_data: Path) -> None:
     noise = {row["sensor"]: row["density"] for row in findings(data, config, estimate)["noise"]}
     for name, density in (("accel", 8e-4), ("gyro", 5.7e-4)):
         np.testing.assert_allclose(np.array(noise[name]), density, rtol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("axes", "fault"),
+    [(np.diag([1.0, 1.0, -1.0]), "the sign of the gyro's z is wrong"), (np.eye(3)[[1, 0, 2]], "x and y are swapped")],
+    ids=["inverted", "swapped"],
+)
+def test_wrong_gyro_axes_are_named_where_nothing_converges(axes: Array, fault: str) -> None:
+    """Of a gyro six times as noisy as stated. It once was `not converged` beside tiny sigmas, or an exception."""
+    data = _simulated(1, poses=20, camera=None)[0]
+    gyro = data.gyro + 3e-3 * np.random.default_rng(0).standard_normal(data.gyro.shape)
+    given = {"imu_t": data.imu_t, "accel": data.accel, "gyro": gyro @ axes.T}
+    session = alidade.open(given, method="cube", config=alidade.Config(latitude_deg=48.0))
+    found = session.calibrate(report=False)
+    assert not found.estimate.converged
+    assert fault in found.headline
+    assert set(found.verdicts.values()) == {"unobservable", "fixed"}
+    for name, q in found.quantities.items():
+        assert not q.required or found.parameters[name].sigma >= 0.9 * (q.prior_sigma or 0.0)
 
 
 def test_half_a_real_session_that_determines_next_to_nothing_is_a_result(shared_data: Path) -> None:
