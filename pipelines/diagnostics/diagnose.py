@@ -104,8 +104,8 @@ def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
     found = [verdict(q, sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True) if q.judged]
     open_ones, free = found.count("unobservable"), len(found) - found.count("fixed")
     # What contradicts itself has motion enough.
-    fit = None if estimate.chi_square is None else Fit.of(estimate.chi_square.value, estimate.chi_square.dof)
-    contradicts = fit is not None and not fit.value <= fit.high
+    square = estimate.chi_square
+    contradicts = square is not None and not Fit.of(square.value, square.dof).noise_factor <= LIMITS.noise_factor
     if estimate.converged or contradicts or deadline.passed() or open_ones <= _MOST * free:
         return estimate.message
     return (

@@ -377,6 +377,15 @@ def test_a_recording_that_determines_next_to_nothing_is_said_to_be_too_short() -
     assert finding.evidence["message"] == "not converged after 63 iterations"
 
 
+def test_residuals_far_beyond_the_noise_are_not_said_to_be_of_too_little_motion() -> None:
+    made = make_calibration()
+    wide, poor = np.diag([0.35**2] * 3 + [0.05**2, 0.05**2, 0.0]), ChiSquare(1e6, 588.0, {"vision": (1e6, 588.0)})
+    message = "not converged after 63 iterations"
+    bad = replace(made.estimate, converged=False, message=message, covariance=wide, chi_square=poor)
+    (finding,) = diagnose(bad, made.problem.quantities)[:1]
+    assert finding.evidence["message"] == message
+
+
 def test_a_cause_that_is_but_noted_adds_no_stray_full_stop() -> None:
     note = Finding("prior_conflict", NOTE, {**CONFLICT, "inseparable": (), "effect": {}})
     _, action = short_verdict([REJECTED, note], QUANTITIES, {MOUNT.name: "observable"}, "")
