@@ -21,19 +21,50 @@ GAIN, ACCEL_OFFSET, OFFSET = 0.3, 0.2, 10.0
 _LIKELY, _NOISE, _READINGS = 0.2, 2e-2, 1000
 # Samples this many sigmas from the ellipsoid are left out of an algebraic fit.
 _FAR, _ROUNDS = 5.0, 5
+# Readings farther from their median than this many times the median distance are outliers, or most are of one attitude:
+# of readings spread evenly over a sphere, a cap or a ring the farthest is less than twice as far as half of them.
+_DISTANT = 4.0
+# Noise of a sample over the radius of the ellipsoid. Through a cloud of Gaussian noise that is the mean length in it,
+# about which lengths scatter by (3 pi / 8 - 1)^.5 = .42 of it; half of that, which no sensor has, is no ellipsoid.
+CLOUD = 0.21
 _UNIT = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
 
 
 def first_guess(raw: Array, strength: float | None, offset: float) -> tuple[Array, Array]:
     """Estimate S and centre of the most likely ellipsoid |S (raw - centre)| = 1.
 
-    The starts are the algebraic ellipsoid and spheres. Readings on a ring determine only some of the nine numbers; the
-    others are the prior's.
+    It is fitted to all readings and, where some are distant, without these; the fit that most readings are near counts.
 
     Args:
         raw: (n, 3) readings.
         strength: in their unit, of a sensor whose K is about 1; None: unknown, the radius of the nearest sphere.
         offset: prior sigma of b over the strength.
+    """
+    away = np.linalg.norm(raw - np.median(raw, axis=0), axis=1)
+    near = away <= _DISTANT * np.median(away)
+    whole = _fitted(raw, strength, offset)
+    if near.all() or near.sum() < FEWEST:
+        return whole
+    trimmed = _fitted(raw[near], strength, offset)
+    radius = float(np.linalg.det(trimmed[0])) ** (-1.0 / 3.0)
+    if robust_sigma(_distances(raw[near], *trimmed)) > CLOUD * radius:
+        return whole
+    # Cauchy's loss: what outliers cost hardly grows with their distance.
+    costs = [np.log1p((_distances(raw, *each) / (_NOISE * radius)) ** 2).sum() for each in (whole, trimmed)]
+    return whole if costs[0] < costs[1] else trimmed
+
+
+def _distances(raw: Array, S: Array, centre: Array) -> Array:
+    """Distances (n,) of readings (n, 3) from an ellipsoid, to first order."""
+    vectors = (raw - centre) @ S.T
+    lengths = np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
+    return np.asarray((lengths - 1.0) * lengths / np.linalg.norm(vectors @ S, axis=1))
+
+
+def _fitted(raw: Array, strength: float | None, offset: float) -> tuple[Array, Array]:
+    """Fit S and centre with their prior; the starts are the algebraic ellipsoid and spheres.
+
+    Readings on a ring determine only some of the nine numbers; the others are the prior's.
     """
     from scipy.optimize import least_squares
 

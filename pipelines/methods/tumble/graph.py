@@ -33,6 +33,7 @@ from alidade.pipelines.estimation.priors import prior_of, rotation_about
 from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import STRENGTH_ADVICE
+from alidade.pipelines.methods.tumble.first_guess import CLOUD
 from alidade.pipelines.methods.tumble.model import TURNED, Model, Moments, Sensor, prepare, relative_scatter
 from alidade.pipelines.methods.tumble.parameters import (
     DIP_KEY,
@@ -338,9 +339,6 @@ def advice(weights: Mapping[str, float]) -> Motion:
 _OFF = 1.0
 # ... and those of its parts no farther apart, as a square in such units, than outliers do.
 _NEAR = 6.0
-# Noise of a sample over the radius of the ellipsoid. Through a cloud of Gaussian noise that is the mean length in it,
-# about which lengths scatter by (3 pi / 8 - 1)^.5 = .42 of it; half of that, which no sensor has, is no ellipsoid.
-_CLOUD = 0.21
 _TOPICS = {"accel": IMU, "mag": MAG}
 
 
@@ -379,7 +377,7 @@ def _check_turned(sensor: Sensor, config: Config) -> None:
     """Raise InputError if readings, or their means by `unturned`, cover too few attitudes for a parameter."""
     few = not sensor.rested and len(sensor.raw) < FEWEST
     # Counts may have any offset: those of a device that rests are a cloud of noise, and so is their ellipsoid.
-    still = relative_scatter(sensor.raw) < TURNED and (sensor.is_si or sensor.sample_scatter > _CLOUD)
+    still = relative_scatter(sensor.raw) < TURNED and (sensor.is_si or sensor.sample_scatter > CLOUD)
     if few or still:
         raise InputError(
             f"topic {config.topic(_TOPICS[sensor.name])}: the device did not turn, or hardly, beyond the noise of its "

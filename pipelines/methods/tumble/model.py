@@ -50,6 +50,8 @@ _EARTH_FIELD = 4.5e-5
 TURNED = 0.02
 # The same of an accelerometer without rests and gyro in use, whose motion is noise: it was within 20 deg of upright.
 _TILTED = 0.25
+# Readings of a magnetometer whose lengths are off by this many times the median: 6.7 sigma of normal ones.
+_OUTLYING = 10.0
 # No sensor resolves a smaller share of what it measures; numbers without noise leave rounding.
 _RESOLUTION = 1e-9
 # A rotation from pairs of vectors is unique where the second-best solution fits this many times worse.
@@ -326,7 +328,10 @@ def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, l
         return None, ["The gyro is not used: it reads more than rad/s can be; is it in deg/s, or in counts?"]
     if data.gyro is None or data.gyro_t is None or data.mag is None:
         return None, []
-    found = field_guess(data, sensors[-1].time, sensors[-1].raw)
+    mag = sensors[-1]
+    off = np.abs(np.linalg.norm(mag.nominal(mag.raw), axis=1) / mag.strength - 1.0)
+    some = off <= _OUTLYING * max(float(np.median(off)), _RESOLUTION)
+    found = field_guess(data, mag.time[some], mag.raw[some])
     if found is None:
         return None, [_NOT_AS_FIELD]
     notes = {

@@ -30,6 +30,7 @@ from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.methods.triads import triad_names, triad_of
+from alidade.pipelines.methods.tumble.first_guess import first_guess
 from alidade.pipelines.methods.tumble.graph import unturned
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData, read_tumble, tumble_topics
@@ -430,6 +431,63 @@ def test_left_handed_axes_are_told_beside_a_gyro() -> None:
     estimate = solve_batch(problem)
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
     assert values["mag_k33"] == pytest.approx(-simulated.truth["mag_k33"], abs=0.02)
+
+
+def _in_counts(scenario: TumbleScenario, seed: int) -> Simulated:
+    """Magnetometer of 10 nT a count that states no noise."""
+    simulated = _simulated(scenario, seed)
+    assert simulated.data.mag is not None
+    data = replace(simulated.data, mag=simulated.data.mag / 1e-8, mag_density=None)
+    return replace(simulated, data=data, config="method: tumble\n")
+
+
+def _directions(count: int, rng: np.random.Generator) -> Array:
+    vectors = rng.standard_normal((count, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def _with_outliers(simulated: Simulated, kind: str) -> Simulated:
+    rng, mag = np.random.default_rng(0), simulated.data.mag
+    assert mag is not None
+    mag = mag.copy()
+    if kind == "error codes":
+        mag[rng.choice(len(mag), 10, replace=False)] = -32768.0
+    else:
+        bad = rng.random(len(mag)) < 0.05
+        mag[bad] += 30.0 * 4500.0 * _directions(int(bad.sum()), rng)
+    return replace(simulated, data=replace(simulated.data, mag=mag))
+
+
+@pytest.mark.parametrize(
+    ("kind", "scenario"),
+    [
+        ("error codes", BRIEF),
+        ("5 % at 30 radii", BRIEF),
+        ("5 % at 30 radii", replace_scenario(TURNING, accelerometer=None)),
+    ],
+)
+def test_outliers_of_a_magnetometer_in_counts_are_rejected(kind: str, scenario: TumbleScenario) -> None:
+    clean = _in_counts(replace_scenario(scenario, latitude_deg=None), 1)
+    found, expected = (
+        Session.of(TUMBLE, each).calibrate(report=False) for each in (_with_outliers(clean, kind), clean)
+    )
+    assert (found.status, found.estimate.names) == (expected.status, expected.estimate.names)
+    off = (found.estimate.values - expected.estimate.values)[:9] / expected.estimate.sigmas[:9]
+    assert np.abs(off).max() < 1.0
+
+
+@pytest.mark.parametrize("resting", [0, 20])
+def test_first_guess_is_that_of_the_readings_without_outliers(resting: int) -> None:
+    """And distant readings of a recording that is mostly at rest are none: 95 % of it in one attitude."""
+    rng = np.random.default_rng(0)
+    directions = _directions(500, rng)
+    raw = [300.0, -200.0, 100.0] + 400.0 * np.concatenate([directions, np.tile(directions[:1], (500 * resting, 1))])
+    raw += rng.standard_normal(raw.shape)
+    if not resting:
+        raw[::20] = -32768.0
+    S, centre = first_guess(raw, None, 10.0)
+    np.testing.assert_allclose(400.0 * S, np.eye(3), atol=0.02)
+    np.testing.assert_allclose(centre, [300.0, -200.0, 100.0], atol=8.0)
 
 
 def test_much_noise_biases_an_algebraic_ellipsoid_and_not_the_graph() -> None:
