@@ -25,7 +25,7 @@ _BLOCK = 100_000
 # Differences up to this part of the largest sample are rounding, as of readings between which a driver interpolates.
 _ROUNDING = 1e-13
 # Fewer differences are not used; the best of them are not trusted to less than this, in the logarithm.
-_FEWEST, _TRUSTED = 200, 0.05
+_FEWEST, TRUSTED = 200, 0.05
 # A walk is looked for in steps of this, in the logarithm, where the bias was seen so many times.
 # ... and what was stated is contradicted by so many sigmas.
 _STEP, _FEWEST_MEANS, _SURE = 0.25, 12, 4.0
@@ -110,7 +110,7 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     if found is None:
         # A default that samples do not determine is estimated from residuals.
         return Level(noise if noise.source == "default" else held)
-    ratio, spread = found[0] / noise.stated, max(found[1], _TRUSTED)
+    ratio, spread = found[0] / noise.stated, max(found[1], TRUSTED)
     level = weighed(Level(held, 1.0, ratio, ratio * spread))
     if noise.families and level.scale < _MUCH_SMALLER:
         return replace(level, noise=noise, scale=1.0, least=level.scale)
@@ -132,7 +132,7 @@ def at_most_sampled(noise: Noise, time: Array, samples: Array) -> Level:
     if found is None:
         return level
     ratio = found[0] / float(np.median(np.diff(time))) ** 0.5 / noise.stated
-    return replace(level, scale=ratio, found=ratio, sigma=_TRUSTED * ratio) if ratio < 1.0 else level
+    return replace(level, scale=ratio, found=ratio, sigma=TRUSTED * ratio) if ratio < 1.0 else level
 
 
 def at_least_at_rest(level: Level, time: Array, gyro: Array, force: Array | None) -> Level:

@@ -216,7 +216,7 @@ def _found_beside(level: Level, groups: Sequence[Group], values: Values, redunda
         whitened = np.minimum(square / (share * (rest + part)), most) / expected
         score = share * (part / (rest + part) * (whitened - 1.0)).sum() - middle / level.known**2
         low, high = (middle, high) if score > 0.0 else (low, middle)
-    scale = float(np.exp(low))
+    scale = max(float(np.exp(low)), level.noise.least)
     part = unit * scale**2
     sigma = float((2.0 * share * ((part / (rest + part)) ** 2).sum() + level.known**-2) ** -0.5)
     changed = float(np.abs((rest + part) / variance - 1.0).max())

@@ -68,7 +68,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
     if model.guess is not None:
         return _chained(data, config, model, found)
     model = replace(model, sensors=sensors)
-    noises = [Level(sensor.noise, sensor.initial_level) for sensor in model.sensors]
+    noises = [level for sensor in model.sensors for level in sensor.levels]
     if model.moments is not None:
         noises.append(Level(model.moments.noise))
     return Problem(
@@ -153,7 +153,8 @@ def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]
         sensor.time[rows], sensor.scaled[rows], sensor.sigma[rows], sensor.excess[rows], sensor.symmetric, drivers
     )
     keys = TRIAD_KEYS[sensor.name], STRENGTH_KEYS[sensor.name], *([] if drivers is None else [SLOPE_KEY])
-    return [Factor.of(SENSOR_NAMES[sensor.name], factor.on(*keys, loss=loss))]
+    beside = None if sensor.beside is None else sensor.beside[rows]
+    return [Factor.of(SENSOR_NAMES[sensor.name], factor.on(*keys, loss=loss), beside)]
 
 
 def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: TruncatedLoss) -> list[Factor]:
@@ -210,19 +211,19 @@ def _chained(data: TumbleData, config: Config, model: Model, shared: tuple[Varia
         advice=advice,
         dropped=model.dropped,
         premises=model.premises,
-        noises=(*(_level(sensor, model.guess) for sensor in model.sensors), *turned.levels),
+        noises=(*(level for sensor in model.sensors for level in _levels(sensor, model.guess)), *turned.levels),
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=LAYOUT,
     )
 
 
-def _level(sensor: Sensor, guess: FieldGuess) -> Level:
-    """Initial noise level of a sensor; without stated noise, a magnetometer's is that of the gyro's first guess."""
+def _levels(sensor: Sensor, guess: FieldGuess) -> tuple[Level, ...]:
+    """Initial noise levels of a sensor; without stated noise, a magnetometer's is that of the gyro's first guess."""
     if sensor.name != "mag":
-        return Level(sensor.noise, sensor.initial_level)
+        return sensor.levels
     if sensor.noise.source != "default" or sensor.noise.known == 0.0:
-        return Level(sensor.noise)
-    return Level(sensor.noise, max(1.0, guess.sigma / float(np.median(sensor.sigma))))
+        return (Level(sensor.noise),)
+    return (Level(sensor.noise, max(1.0, guess.sigma / float(np.median(sensor.sigma)))),)
 
 
 def _seen(sensor: Sensor, whole: Array | None) -> Seen:
@@ -294,7 +295,9 @@ def _up(graph: _Graph, keyframes: range) -> list[Factor]:
     slope = [] if drivers is None else [SLOPE_KEY]
     keys = FILTER_KEY, TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope, *_earth_key(turned)
     states = [chain.state(int(k)) for k in seen.keyframe]
-    return [Factor.of(SENSOR_NAMES["accel"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
+    beside = None if sensor.beside is None else sensor.beside[seen.row]
+    bound = factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss)
+    return [Factor.of(SENSOR_NAMES["accel"], bound, beside)]
 
 
 def _earth_key(turned: Turning) -> list[int]:

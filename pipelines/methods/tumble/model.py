@@ -6,7 +6,7 @@ by the strength of what they measure, so that K is about a rotation whatever was
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,11 +17,11 @@ from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_o
 from alidade.pipelines.diagnostics.static_intervals import ACCEL_TREMOR, GYRO_TREMOR, Stream, find_static_intervals
 from alidade.pipelines.display.sphere_map import described
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.noise import ROUGHLY, Noise
+from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise
 from alidade.pipelines.estimation.parameters import SENSOR_NAMES, ParameterSpec, parameter
 from alidade.pipelines.estimation.parameters import stated as sheet
 from alidade.pipelines.estimation.robust import robust_sigma
-from alidade.pipelines.methods.noise import sampled, stated
+from alidade.pipelines.methods.noise import TRUSTED, repeatability, sampled, stated, weighed
 from alidade.pipelines.methods.place import FIELD, field_at, known_strength
 from alidade.pipelines.methods.temperature import ACCEL_SLOPE
 from alidade.pipelines.methods.triads import triad_names
@@ -41,6 +41,8 @@ _MOSTLY = 1.0 / 3.0
 # of 0.6 s 0.5 s are found. Quiet intervals whose median is shorter, s, are no rests: readings there are off by what the
 # device is accelerated with.
 _PAUSE = 0.4
+# Share of the differences of neighbouring values that may be smaller than the step of readings in steps.
+_DENSE = 0.1
 # Means over this time, s, show what a mean over a rest scatters by, slow tremor of a hand included.
 _BLOCK = 0.25
 # Strength of the earth's field where the place is unknown, T: 22e-6 to 67e-6.
@@ -108,7 +110,7 @@ class Sensor:
         unit: of the strength; "1" where it is unknown and called 1.
         start: (9,) or (12,) first guess, without unit.
         turned: (3, 3) the part of that which turns: the body's axes against those of a symmetric K.
-        rested: whether the readings are means over rests.
+        rest_levels: of means over rests, white noise and repeatability; none: the readings are samples.
         noise: of a sample, with its family.
         drivers: (n, m) of the offset, see factors.ellipsoid.drifted, and `driven` their assumptions; None: none.
     """
@@ -129,15 +131,30 @@ class Sensor:
     unit: str
     start: Array
     turned: Array
-    rested: bool
+    rest_levels: tuple[Level, ...]
     noise: Noise
     drivers: Array | None = None
     driven: tuple[ParameterSpec, ...] = ()
 
     @property
-    def initial_level(self) -> float:
-        """Noise level to begin with: as stated for means over rests, else at least the first guess's misfit."""
-        return 1.0 if self.rested else max(1.0, self.level)
+    def rested(self) -> bool:
+        """Whether the readings are means over rests."""
+        return bool(self.rest_levels)
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """Noise levels to begin with: of samples at least the first guess's misfit."""
+        return self.rest_levels or (Level(self.noise, max(1.0, self.level)),)
+
+    @property
+    def repeatability(self) -> float:
+        """Initial error that readings of a rest have in common, over the strength, per axis."""
+        return sum(level.used for level in self.rest_levels if level.noise.beside) / self.strength
+
+    @property
+    def beside(self) -> Array | None:
+        """What 1 m/s^2 of repeatability adds to the whitened readings (n,); None of samples."""
+        return 1.0 / (self.strength * self.sigma) if self.rested else None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -230,7 +247,7 @@ def prepare(data: TumbleData, config: Config) -> Model:
     sensors: list[Sensor] = []
     rests = None
     if data.accel is not None:
-        rests = _rests(data, config)
+        rests = static_rests(data, config)
         if data.mag is not None and _is_upright(data, rests):
             data = replace(data, accel_t=None, accel=None)
             premises.append(_UPRIGHT)
@@ -421,7 +438,7 @@ def _turned(sensor: Sensor, rotation: Array) -> Sensor:
     return replace(sensor, symmetric=False, start=start, turned=rotation)
 
 
-def _rests(data: TumbleData, config: Config) -> Array | None:
+def static_rests(data: TumbleData, config: Config) -> Array | None:
     """Start and end (P, 2), s, of intervals with all sensors at rest; None if motion is more informative."""
     assert data.accel is not None
     assert data.accel_t is not None
@@ -511,7 +528,7 @@ def _sensor(
     apart = StrengthFactor(time, raw / radius, np.ones(len(raw)), np.zeros(len(raw)), symmetric=True)
     distances = apart(np.tile(start, (len(raw), 1)), np.ones((len(raw), 1)))[0][:, 0]
     interval = float(np.median(np.diff(stream[0])))
-    at_rest = 0.0 if rests is None else _scatter_at_rest(*stream[:2], rests, centre)
+    at_rest, spread = (0.0, 0.0) if rests is None else _scatter_at_rest(*stream[:2], rests, centre)
     seen = max(radius * robust_sigma(distances * root_number), _RESOLUTION * radius, at_rest * interval**-0.5)
     noise = _noise(name, config, stream[2], is_si, seen * interval**0.5, at_rest)
     if noise.stated > 0.0:
@@ -519,6 +536,16 @@ def _sensor(
     stated_sigma = noise.stated * interval**-0.5
     level = seen / stated_sigma if noise.source == "default" and noise.estimated else 1.0
     sample_scatter = level * stated_sigma / radius
+    rest_levels: tuple[Level, ...] = ()
+    if rests is not None:
+        white = Level(replace(noise, families=()))
+        if noise.estimated and at_rest:
+            found = at_rest / noise.stated
+            white = weighed(replace(white, found=found, sigma=spread * found))
+        # Nine numbers are fitted to the readings, and take their share of what they miss.
+        misfit = robust_sigma(distances) * (len(raw) / max(len(raw) - len(start), 1)) ** 0.5
+        least = quantisation(*stream[:2], rests) / radius
+        rest_levels = white, _repeatability(config, noise.families, known[0] * misfit, known[0] * least)
     return Sensor(
         name=name,
         time=time,
@@ -536,27 +563,63 @@ def _sensor(
         unit=known[2],
         start=start,
         turned=np.eye(3),
-        rested=rests is not None,
+        rest_levels=rest_levels,
         noise=noise,
     )
 
 
-def _scatter_at_rest(t: Array, raw: Array, rests: Array, centre: Array) -> float:
-    """Noise density, per sqrt(Hz), of vector lengths within rests; 0 where undetermined.
+def _scatter_at_rest(t: Array, raw: Array, rests: Array, centre: Array) -> tuple[float, float]:
+    """Noise density, per sqrt(Hz), of vector lengths within rests, and its relative sigma; 0 where undetermined.
 
     Few rests determine the ellipsoid with hardly a residual, whose size says nothing of their noise.
     """
     interval = float(np.median(np.diff(t)))
     size = max(1, round(_BLOCK / interval))
-    variances = []
+    variances, redundancy = [], 0
     for first, last in np.searchsorted(t, rests):
         values = raw[first : last - (last - first) % size] - centre
         if len(values) > size:
             along = values @ (values.mean(axis=0) / np.linalg.norm(values.mean(axis=0)))
             means = along.reshape(-1, size).mean(axis=1)
             variances.append([along.var(ddof=1), size * means.var(ddof=1)])
+            redundancy += len(means) - 1
+    if not variances:
+        return 0.0, 0.0
     # Samples say best how large white noise is, means how much more a slow one leaves.
-    return float(np.sqrt(np.mean(variances, axis=0).max() * interval)) if variances else 0.0
+    density = float(np.sqrt(np.mean(variances, axis=0).max() * interval))
+    return density, max((2.0 * redundancy) ** -0.5, TRUSTED)
+
+
+def _repeatability(config: Config, families: Sequence[str], misfit: float, least: float) -> Level:
+    """Initial level of an accelerometer's repeatability over rests, at least `least` where no config states it, m/s^2.
+
+    It begins at the misfit of the first guess: rests that repeat badly are no outliers.
+    """
+    level = repeatability("accel", config, *families)
+    if level.noise.source != "default" or not level.noise.estimated:
+        return level
+    noise = replace(level.noise, least=least / level.noise.stated)
+    return replace(level, noise=noise, scale=max(1.0, misfit / noise.stated, noise.least))
+
+
+def quantisation(t: Array, raw: Array, rests: Array) -> float:
+    """RMS error that readings in steps have in common over a rest, per axis, in their unit; 0 where noise dithers them.
+
+    In steps q, with noise sigma, the mean square error is f = q^2 / (2 pi^2) sum exp(-(2 pi k sigma / q)^2) / k^2 over
+    k = 1, 2, ..., and the variance shown q^2 / 12 + sigma^2 - f (Widrow, Kollar, "Quantization Noise", 2008).
+    """
+    spans = [slice(*span) for span in np.searchsorted(t, rests) + [0, 1]]
+    shown = np.mean([raw[span].var(axis=0) for span in spans], axis=0)
+    k, sigma = np.arange(1.0, 100.0), np.linspace(0.0, 1.0, 101)
+    common = (np.exp(-((2.0 * np.pi * sigma[:, None] * k) ** 2)) / k**2).sum(axis=1) / (2.0 * np.pi**2)
+    variance = np.maximum.accumulate(1.0 / 12.0 + sigma**2 - common)
+    largest = max(float(np.abs(raw).max()), np.finfo(float).tiny)
+    squares = []
+    for column, own in zip(raw.T, shown, strict=True):
+        steps = np.diff(np.unique(np.round(column / largest, 12)))
+        step = largest * float(np.quantile(steps, _DENSE)) if len(steps) else 0.0
+        squares.append(step**2 * float(np.interp(own / step**2, variance, common)) if step else 0.0)
+    return float(np.sqrt(np.mean(squares)))
 
 
 def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float, at_rest: float) -> Noise:
@@ -616,7 +679,7 @@ def _together(
     interval = float(np.median(np.diff(mag.time)))
     own = mag.noise.stated * interval**-0.5 / mag.radius / np.sqrt(number)
     cosine2 = max(1.0 - sine**2, 1e-2)
-    sigma = np.sqrt(cosine2 * (accel.sigma[rows] ** 2 + own**2))
+    sigma = np.sqrt(cosine2 * (accel.sigma[rows] ** 2 + accel.repeatability**2 + own**2))
     noise = Noise("dip", float(np.median(sigma)), "default", 0.0 if config.noise_known == 0.0 else ROUGHLY, ("dip",))
     drivers = None if accel.drivers is None else accel.drivers[rows]
     moments = Moments(time, accel.scaled[rows], readings / mag.radius, sigma, noise, drivers)

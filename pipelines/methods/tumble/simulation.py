@@ -88,7 +88,8 @@ def tumble_config(scenario: TumbleScenario, **more: object) -> str:
     if scenario.magnetometer is not None:
         noise["mag_density"] = scenario.magnetometer.density
     if scenario.accelerometer is not None:
-        noise["accel_density"] = scenario.accelerometer.density
+        # Simulated sensors repeat as well as white noise lets them.
+        noise |= {"accel_density": scenario.accelerometer.density, "accel_repeatability": 0.0}
     if scenario.gyro is not None:
         noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
     return recording_config("tumble", scenario, noise, date="2026-11-20", **more)
