@@ -458,15 +458,19 @@ def static_rests(data: TumbleData, config: Config) -> Array | None:
         found = find_static_intervals(t, accel, gyro, *others)
     except InputError:
         return None
-    if np.median(np.diff(found)) < _PAUSE:
+    few = len(found) < FEWEST and (data.gyro is not None or np.diff(found).sum() <= _MOSTLY * (t[-1] - t[0]))
+    if few or np.median(np.diff(found)) < _PAUSE:
         return None
-    if len(found) >= FEWEST:
+    if data.gyro is not None:
         return found
-    if data.gyro is not None or np.diff(found).sum() <= _MOSTLY * (t[-1] - t[0]):
-        return None
-    # The scatter over gravity within rests reveals slow rotations.
-    scatter = [relative_scatter(data.accel[first:last]) for first, last in np.searchsorted(t, found)]
-    return found if np.median(scatter) < TURNED else None
+    turned = [_slow_scatter(data.accel[first:last]) for first, last in np.searchsorted(t, found)]
+    return found if np.median(turned) < TURNED else None
+
+
+def _slow_scatter(raw: Array) -> float:
+    """Scatter of readings (n, 3) over gravity beyond that of white noise: slow rotations at what looks like a rest."""
+    slow = (raw.var(axis=0, ddof=1) - 0.5 * np.square(np.diff(raw, axis=0)).mean(axis=0)).sum()
+    return float(np.sqrt(max(slow, 0.0)) / np.median(np.linalg.norm(raw, axis=1)))
 
 
 def _accelerometer(data: TumbleData, config: Config, rests: Array | None, swung: bool) -> Sensor:

@@ -790,6 +790,22 @@ def test_rests_of_a_second_are_found_and_turning_points_are_none(seed: int) -> N
         assert not found or len(model.sensors[0].time) == 20
 
 
+def test_slow_turns_that_look_like_rests_are_none() -> None:
+    """A dozen, in each of which gravity turned by degrees: errors of a hundred sigmas."""
+    simulated = _simulated(
+        TumbleScenario(
+            attitudes=20,
+            turn_rad_s=0.2,
+            magnetometer=TumbledMagnetometer(rate_hz=20.0),
+            accelerometer=TumbledAccelerometer(rate_hz=50.0, density=0.015),
+        ),
+        0,
+    )
+    assert static_rests(simulated.data, load_config(simulated.config.encode())) is None
+    error, covariance = _errors(_solved(simulated), simulated.truth)
+    assert np.abs(error / np.sqrt(np.diag(covariance))).max() < 4.0
+
+
 @pytest.mark.parametrize("seed", [3, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
 def test_nothing_changed_in_a_clean_recording_with_rests_of_a_second(seed: int) -> None:
     simulated = _simulated(replace_scenario(SECOND, **AT_50), seed)
