@@ -56,10 +56,10 @@ _STRETCHES = 3.0
 
 @dataclass(frozen=True)
 class Stability:
-    """Largest difference between the estimate at any earlier time and the final one, with its p-value.
+    """Largest difference between the estimate at any earlier time and the final one, or largest step; with its p-value.
 
     Attributes:
-        statistic: its size as a standard normal number, by the cube root of chi-square over its degrees of freedom.
+        statistic: its size as a standard normal number.
         level: p-value, anywhere in the recording.
         time_s: when, s.
         differences: parameter -> final estimate less that until then, and the sigma of that, SI; the largest over its
@@ -185,15 +185,16 @@ def with_change(estimate: Estimate, change: Finding) -> Estimate:
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
-    """Test an estimate's stability over time; None without an offset step, a history or anything that could change.
+    """Test an estimate's stability over time: by its offset step, else its history; None with neither.
+
+    None too where nothing could change.
 
     Quantities, in the estimate's order, are left out if they walk, since they may change, and if they are hardly better
     known than before.
     """
     posterior_history = estimate.posterior_history
     if (step := estimate.offset_step) is not None:
-        size = float(_as_normal(np.array([step.statistic]), np.array([len(step.steps)]))[0])
-        return Stability(size, step.level, step.time_s, _by_size(step.steps))
+        return Stability(step.statistic, step.level, step.time_s, _by_size(step.steps))
     if posterior_history is None:
         return None
     # Information about other numbers is as much the noise of its states, which moves the estimate without being

@@ -157,7 +157,7 @@ def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
 
 def max_concurrent(times: Sequence[Array]) -> int:
     """Number of trials to solve at once, limited by memory, for graphs with these stamps."""
-    return max(_MAX_SAMPLES // max((len(time) for time in times), default=1), 1)
+    return max(_MAX_SAMPLES // max((len(time) for time in times if len(time)), default=1), 1)
 
 
 def _score(problem: Problem) -> tuple[float, float]:

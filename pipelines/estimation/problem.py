@@ -608,7 +608,7 @@ class OffsetStep:
 
     Attributes:
         time_s: of the first measurement after it, s.
-        statistic: chi-square of the step.
+        statistic: size of the step as a standard normal number.
         level: p-value, anywhere in the recording.
         steps: offset -> its step and the sigma of that, SI.
     """

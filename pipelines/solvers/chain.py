@@ -100,8 +100,8 @@ class Chain(ABC):
         return ChainFactorization.of(self.damped(damping) if damping > 0.0 else self)
 
     def root(self) -> Array:
-        """`Factorization.root`, without R of the states, which exceeds the rows. Raises IndeterminateStateError."""
-        return ChainFactorization.of(self, keeps=False).root
+        """`Factorization.root` alone: R of the states takes the memory of the rows. Raises IndeterminateStateError."""
+        return _eliminated(self, with_rows=False)[2]
 
     def damped(self, damping: float) -> Chain:
         """Return the system with each unknown's own information, `damping` times, added at zero (Marquardt)."""
@@ -221,17 +221,17 @@ class _Level:
     piece: Index | None
 
     @classmethod
-    def eliminate(cls, chain: Chain, keeps: bool = True) -> tuple[_Level, ChainSystem, Index]:
+    def eliminate(cls, chain: Chain, with_rows: bool) -> tuple[_Level, ChainSystem, Index]:
         """Eliminate each segment's inner states; return the level, the chain of last states, their indices.
 
-        The level has no rows unless it `keeps` them.
+        Without rows the level serves no back-substitution.
         """
         lasts, d = chain.segments(), chain.d
         shape, begin, left = (d, 3 * d + chain.border), 0, list[tuple[Array, Array, Array]]()
-        rows = np.zeros((len(chain) if keeps else 0, *shape))
+        rows = np.zeros((len(chain) if with_rows else 0, *shape))
         for some in _together(lasts):
             end = int(lasts[some][-1]) + 1
-            own = rows[begin:end] if keeps else np.zeros((end - begin, *shape))
+            own = rows[begin:end] if with_rows else np.zeros((end - begin, *shape))
             left.append(_inner(chain.part(begin, end), lasts[some] - begin, own))
             begin = end
         measured, between, beside = (np.concatenate(each) for each in zip(*left, strict=True))
@@ -347,22 +347,10 @@ class ChainFactorization(Factorization):
     _ends: _TimeOrder
 
     @classmethod
-    def of(cls, chain: Chain, keeps: bool = True) -> ChainFactorization:
-        """Eliminate a chain down to the last node and the shared unknowns. Raises IndeterminateStateError.
-
-        Unless it `keeps` the states' R there is `root` alone.
-        """
-        own, tail, levels, keyframes = chain.d, chain.c, list[_Level | None](), np.arange(len(chain))
-        while len(chain) > SEQUENTIAL_STATES or (own == 0 and chain.walk is not None):
-            if chain.walk is not None and len(chain) == len(chain.walk):
-                chain = chain.part(0, len(chain)).with_nodes_as_states()
-                levels.append(None)
-            else:
-                level, chain, lasts = _Level.eliminate(chain, keeps)
-                levels.append(level)
-                keyframes = keyframes[lasts]
-        ends, root = _TimeOrder.eliminate(chain.part(0, len(chain)), keyframes, own)
-        return cls(own, tail, root, levels, ends)
+    def of(cls, chain: Chain) -> ChainFactorization:
+        """Eliminate a chain down to the last node and the shared unknowns. Raises IndeterminateStateError."""
+        levels, ends, root = _eliminated(chain, with_rows=True)
+        return cls(chain.d, chain.c, root, levels, ends)
 
     def nodes(self, last: Array) -> tuple[Array, Array]:
         """Return covariances and moves of the node pairs (z_j, z_j-1), for rows about nodes alone.
@@ -441,6 +429,20 @@ class ChainFactorization(Factorization):
                 border = shared[None] if level.piece is None else _with_nodes(nodes[level.piece], shared)
                 x = level.back(x, border, generator)
         return x, nodes
+
+
+def _eliminated(chain: Chain, with_rows: bool) -> tuple[list[_Level | None], _TimeOrder, Array]:
+    """Levels of a chain's elimination, with R of the states or not, the few states that remain, and the root."""
+    own, levels, keyframes = chain.d, list[_Level | None](), np.arange(len(chain))
+    while len(chain) > SEQUENTIAL_STATES or (own == 0 and chain.walk is not None):
+        if chain.walk is not None and len(chain) == len(chain.walk):
+            chain = chain.part(0, len(chain)).with_nodes_as_states()
+            levels.append(None)
+        else:
+            level, chain, lasts = _Level.eliminate(chain, with_rows)
+            levels.append(level)
+            keyframes = keyframes[lasts]
+    return levels, *_TimeOrder.eliminate(chain.part(0, len(chain)), keyframes, own)
 
 
 def _with_nodes(nodes: Array, shared: Array) -> Array:

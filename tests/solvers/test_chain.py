@@ -95,6 +95,7 @@ def test_solution_covariance_and_determinant_are_those_of_dense_least_squares(ch
     found = np.concatenate([states.ravel(), nodes.ravel(), shared])
     tail = np.arange(len(x) - len(f.root) + 1, len(x))
     R = f.root[:-1, :-1]
+    np.testing.assert_array_equal(chain.root(), f.root)
     assert np.abs((found - x) / sigma).max() < 1e-10
     scale = np.outer(sigma[tail], sigma[tail])
     assert np.abs((np.linalg.inv(R.T @ R) - covariance[np.ix_(tail, tail)]) / scale).max() < 1e-10

@@ -9,6 +9,7 @@ import pytest
 
 import alidade
 from alidade.factors.array import Array
+from alidade.pipelines.diagnostics.change_test import LEVEL
 from alidade.pipelines.estimation.problem import OffsetStep
 from alidade.pipelines.solvers.batch import solve
 from alidade.pipelines.solvers.engines import Compiled
@@ -44,7 +45,7 @@ def turned(
 @pytest.mark.parametrize("correlation_time", [0.0, 1.0])
 def test_where_no_offset_steps_none_is_significant(correlation_time: float) -> None:
     levels = [found(turned(seed, correlation_time=correlation_time)[0]).level for seed in range(12)]
-    assert min(levels) > 1e-3
+    assert min(levels) > LEVEL
     # P-values over many moments are conservative, and not always 1.
     assert np.mean(np.array(levels) < 0.05) <= 0.25
 
@@ -53,7 +54,7 @@ def test_where_no_offset_steps_none_is_significant(correlation_time: float) -> N
 def test_a_step_is_found_with_its_time_and_size(at: float) -> None:
     session, raw = turned(3, 0.05, at, 0.3)
     step, data = found(session), session.data
-    assert step.level < 1e-4
+    assert step.level < LEVEL
     span = data.mag_t[-1] - data.mag_t[0]
     assert step.time_s == pytest.approx(data.mag_t[0] + at * span, abs=0.03 * span)
     values = session.calibrate(report=False).values
@@ -82,3 +83,30 @@ def test_rests_before_a_step_are_no_outliers() -> None:
     assert stepped.status == "inconsistent"
     assert "change" in {each.kind for each in stepped.findings}
     assert alidade.open(simulated).calibrate(report=False).status == "calibrated"
+
+
+def test_outliers_are_no_step() -> None:
+    """A twentieth of the readings, all of them late, are 30 radii away."""
+    simulated = alidade.simulate("tumble", {}, 2)
+    mag, rng = simulated.data.mag.copy(), np.random.default_rng(2)
+    late = np.flatnonzero(np.arange(len(mag)) > 0.6 * len(mag))
+    mag[rng.choice(late, len(mag) // 20, replace=False)] += 30.0 * np.abs(mag).max() * TURN
+    assert found(alidade.open(replace(simulated, data=replace(simulated.data, mag=mag)))).level > LEVEL
+
+
+def test_a_rest_that_repeats_one_error_is_no_step() -> None:
+    """Readings of the first attitude for as long again as the device turned, and 1 % off."""
+    simulated = alidade.simulate("tumble", {}, 4)
+    data, rng = simulated.data, np.random.default_rng(4)
+    noise = 1e-4 * float(np.linalg.norm(data.mag[0])) * rng.standard_normal(data.mag.shape)
+    mag = np.concatenate([1.01 * data.mag[:1] + noise, data.mag])
+    t = np.concatenate([data.mag_t, 2.0 * data.mag_t[-1] - data.mag_t[-2] - data.mag_t[0] + data.mag_t])
+    assert found(alidade.open(replace(simulated, data=replace(data, mag=mag, mag_t=t)))).level > LEVEL
+
+
+def test_a_wrong_offset_that_the_config_fixes_is_no_step() -> None:
+    simulated = alidade.simulate("tumble", {"magnetometer": {"hard_iron": 1e-6}}, 1)
+    fixed = {"priors": dict.fromkeys(("mag_b1", "mag_b2", "mag_b3"), 0.0)}
+    result = alidade.open(simulated, config=alidade.Config.model_validate(fixed)).calibrate(report=False)
+    assert result.status == "inconsistent"
+    assert "change" not in {each.kind for each in result.findings}
