@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.factors.array import Array
 from alidade.pipelines.applications.table_times import Times
@@ -27,7 +28,7 @@ from alidade.pipelines.recording.messages import IMU
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, PLAUSIBLE, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import Table, TableTopic, tables_of
-from alidade.pipelines.recording.table_values import COMPATIBLE, UNITS, bare_name, unit_of
+from alidade.pipelines.recording.table_values import COMPATIBLE, UNITS, bare_name, unit_in, unit_of
 from alidade.pipelines.recording.tables import numbers
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
@@ -35,7 +36,7 @@ from alidade.pipelines.settings import Config
 # What the names of three columns along x, y and z begin with or are, lower case; `gx` is a gyro's as often as not.
 _WORDS = {
     "gyro": r"gyr|angular.?(vel|rate)|omega|rotation.?rate|^w(?=_|$)|^g(?=_|$)|ang.?vel|\brate",
-    "accel": r"acc|^a(?=_|$)|specific.?force|^f(?=_|$)|^g.?f(?=_|$|orce)",
+    "accel": r"acc(?!ur|ept)|^a(?=_|$)|specific.?force|^f(?=_|$)|^g.?f(?=_|$|orce)",
     "field": r"mag|^m(?=_|$)|^b(?=_|$)|^h(?=_|$)|field",
 }
 # SI units of the sensors.
@@ -62,8 +63,9 @@ _JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_sta
 _QUATERNION = "q|quat|orientation|rot|attitude"
 # The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
 _TURNED = 0.1
-# Rows looked at, and sensors that rows may be of by their names in a column.
+# Rows looked at; different words of a column that names the sensor of each row, at most.
 _ROWS, _MOST_SENSORS = 20_000, 30
+_RAW = re.compile(r"raw|uncal|unfilt")
 # Rates beyond a gyro's in rad/s are in deg/s up to what a gyro of 4000 deg/s may read on three axes; beyond, counts.
 _MOST_DEG_S = 7000.0
 
@@ -113,7 +115,7 @@ def propose_columns(recording: Recording) -> Columns | None:
     for table in message_tables(recording.container).values():
         with suppress(InputError):  # what cannot be read is no proposal
             if table.is_proposed:
-                one = _Table(table, True)
+                one = _whole(table, True)
                 if topics := one.topics():
                     found, made = [*found, one], [*made, topics]
     columns: dict[str, TableTopic] = {}
@@ -155,42 +157,79 @@ def with_columns(recording: Recording, config: Config) -> tuple[Recording, Confi
 
 
 def _sensors(table: Table, is_named: bool) -> list[_Table]:
-    """Return a table as one, or, where a column names the sensor that a row is of, each sensor's rows."""
-    whole = _Table(table, is_named)
-    return [_Table(table, is_named, rows) for rows in whole.rows_of_sensors()] or [whole]
+    """Return a table as one, or, where a column names the sensor that each row is of, one for each sensor."""
+    whole, names = _whole(table, is_named), _numbered(table)
+    for i in whole.columns_of_words():
+        there = list(dict.fromkeys(table.read([names[i]])[0][names[i]].tolist()))
+        if sensors := _named_sensors(there, table.form.names[i], table.form.path):
+            texts = list(table.read(names)[0].values())
+            rows = [np.flatnonzero(texts[i] == sensor)[:_ROWS] for sensor in sensors]
+            return [
+                _Table(table, is_named, [each[own] for each in texts], (i, sensor))
+                for sensor, own in zip(sensors, rows, strict=True)
+            ]
+    return [whole]
+
+
+def _whole(table: Table, is_named: bool) -> _Table:
+    """Return a table as one, by its first rows."""
+    return _Table(table, is_named, list(table.read(_numbered(table), _ROWS)[0].values()))
+
+
+def _numbered(table: Table) -> list[str]:
+    """Return names that all columns have, unlike those of headers."""
+    return [f"column {i + 1}" for i in range(len(table.form.names))]
+
+
+def _named_sensors(words: Sequence[str], header: str, path: Path) -> list[str]:
+    """Return those of a column's words that name sensors; none where the column says something else.
+
+    Of two kinds at least, or of one that the file is not named against. Raw and uncalibrated readings come last.
+    """
+    kinds = {word: _kind(word.lower()) for word in words}
+    named = [word for word in words if kinds[word]]
+    found = {kinds[word] for word in named}
+    alone = len(found) == 1 and (len(named) > 1 or "sensor" in header.lower())
+    if len(words) > _MOST_SENSORS or not (len(found) > 1 or (alone and _kind(path.stem.lower()) in ("", *found))):
+        return []
+    return sorted(named, key=lambda word: _RAW.search(word.lower()) is not None)
 
 
 class _Table:
-    """Sensors, units and time that are recognised in one table, or in its `rows` that have a text in a column."""
+    """Sensors, units and time that are recognised in one table, or in its rows that have a word in a column.
 
-    def __init__(self, table: Table, is_named: bool, rows: tuple[int, str] | None = None) -> None:
+    Args:
+        table: of the columns.
+        is_named: whether there are other tables.
+        texts: (n,) of each column, its first rows or those of the word.
+        rows: that column and the word, which names their sensor.
+    """
+
+    def __init__(
+        self, table: Table, is_named: bool, texts: Sequence[NDArray[np.str_]], rows: tuple[int, str] | None = None
+    ) -> None:
         self.path, self._form = table.form.path, table.form
         self._file = table.name if is_named else None
-        self._where = f"{table.name}: " if is_named else ""
+        self._sensor = "" if rows is None else rows[1]
+        self._rows: dict[str, str | float | int] = {} if rows is None else {self._form.called(rows[:1])[0]: rows[1]}
+        self._where = "".join(f"{each}: " for each in (table.name if is_named else "", self._sensor) if each)
         self.reasons: list[str] = []
         self.doubts: list[str] = []
-        names = [f"column {i + 1}" for i in range(len(self._form.names))]
-        texts, *_ = table.read(names, _ROWS)
-        self._texts = list(texts.values())
-        self._rows: dict[str, str | float | int] = {}
-        if rows is not None:
-            column, text = rows
-            self._rows = {self._form.called([column])[0]: text}
-            meant = self._texts[column] == text
-            self._texts = [each[meant] for each in self._texts]
-        self._values = [self._numbers(i) for i in range(len(names))]
+        self._texts = texts
+        self._values = [self._numbers(i) for i in range(len(texts))]
         self._times = Times(self._form, self._texts, self._values, self._where, self.reasons, self.doubts)
 
-    def rows_of_sensors(self) -> list[tuple[int, str]]:
-        """Return the column that names the sensor of each row, with each of its texts that do; empty without one."""
+    @property
+    def _names(self) -> list[str]:
+        """Names of the columns, empty for those that the rows of one sensor have no numbers in."""
+        has = [not self._sensor or bool(np.isfinite(values).any()) for values in self._values]
+        return [name if there else "" for name, there in zip(self._form.names, has, strict=True)]
+
+    def columns_of_words(self) -> list[int]:
+        """Return the columns without numbers, where no other is named after a sensor."""
         if any(_kind(name) for name, _ in _along_axes(self._form.names)):
             return []
-        for i, texts in enumerate(self._texts):
-            there = np.unique(texts).tolist() if np.isnan(self._values[i]).all() else []
-            named = [(i, text) for text in there if _kind(text.lower())]
-            if len(named) > 1 and len(there) <= _MOST_SENSORS:
-                return named
-        return []
+        return [i for i, values in enumerate(self._values) if len(values) and np.isnan(values).all()]
 
     def topics(self) -> dict[str, TableTopic]:
         """Return topic -> its columns."""
@@ -260,13 +299,13 @@ class _Table:
 
     def _common_unit(self, columns: Sequence[int], kind: str = "") -> str:
         """Return the unit that all columns have by their header, as a kind of sensor's; empty where they differ."""
-        stated = {unit_of(kind, self._form.stated_unit(i)) for i in columns}
+        stated = {unit_of(kind, self._form.stated_unit(i) or unit_in(self._sensor)) for i in columns}
         return stated.pop() if len(stated) == 1 else ""
 
     def _triads(self) -> dict[str, tuple[int, ...]]:
         """Return kind -> columns along x, y, z: by names, as a file's only three, or, without a header, by numbers."""
         out: dict[str, tuple[int, ...]] = {}
-        along = _along_axes(self._form.names)
+        along = _along_axes(self._names)
         first = 1 if self._times.increases(0) else 0
         if self._form.names[0] == "column 1" and len(self._values) == first + 3 and _kind(self.path.stem.lower()):
             along = [("", (first, first + 1, first + 2))]
@@ -284,10 +323,12 @@ class _Table:
             return out
         for name, columns in along:
             # Rows are named after their sensor; of x, y, z alone the file is.
-            name = " ".join(map(str, [*self._rows.values(), *filter(None, [name])])).lower() or self.path.stem.lower()
+            name = f"{self._sensor} {name}".strip().lower() or self.path.stem.lower()
             if "covariance" in name:
                 continue
             kind = _kind(name) or self._kind_of_units(columns)
+            if self._sensor and not len(self._norms(columns)):
+                continue
             norms, size = self._norms(columns), UNITS.get(self._common_unit(columns, kind))
             if len(norms) > 1 and not any(np.ptp(self._values[i]) for i in columns):
                 continue  # a placeholder
@@ -397,6 +438,8 @@ class _Table:
 
 def _kind(name: str) -> str:
     """Return the kind of sensor that a lower-case name mentions; empty for none."""
+    if _ROTATION_VECTOR.search(name):  # geomagnetic ones too
+        return ""
     return next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
 
 

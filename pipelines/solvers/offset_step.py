@@ -171,4 +171,4 @@ def _sigmas(level: float) -> float:
     """Size of a standard normal number that is exceeded with a probability."""
     from scipy.special import ndtri
 
-    return float(-ndtri(max(level, np.finfo(float).tiny)))
+    return float(-ndtri(np.clip(level, np.finfo(float).tiny, 1.0 - np.finfo(float).eps)))

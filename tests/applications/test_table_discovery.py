@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -483,15 +483,66 @@ def test_rows_named_after_their_sensor_are_a_topic_each(tmp_path: Path, alidade:
     assert "Magnetometer" in run.out
 
 
-def test_of_rows_named_after_a_sensor_twice_the_first_count(tmp_path: Path) -> None:
-    sensors = {"accel": 9.81 * DIRECTIONS, "accel_uncalibrated": 9.9 * DIRECTIONS, "linear_acceleration": RATES}
+def test_of_rows_named_after_a_sensor_twice_the_uncalibrated_ones_are_left_out(tmp_path: Path) -> None:
+    sensors = {"Uncalibrated accel": 9.9 * DIRECTIONS, "accel": 9.81 * DIRECTIONS, "linear_acceleration": RATES}
     path = rows_of_sensors(tmp_path / "a.csv", sensors, "type,t,value_x,value_y,value_z")
     found = propose_columns(open_recording(path))
     assert found is not None
     assert [table.where for table in found.columns.values()] == [{"type": "accel"}]
     assert found.topics["imu"].topic == "/imu/accel"
-    assert "accel_uncalibrated is not used: /imu/accel is of another sensor" in found.doubts
+    assert "Uncalibrated accel is not used: /imu/accel is of another sensor" in found.doubts
     assert any("gravity" in doubt for doubt in found.doubts)
+
+
+def test_a_rotation_vector_is_no_magnetometer_and_units_may_stand_with_the_sensor(tmp_path: Path) -> None:
+    sensors = {
+        "android.sensor.geomagnetic_rotation_vector": 0.1 * DIRECTIONS,
+        "android.sensor.magnetic_field": 45.0 * DIRECTIONS,
+        "Gyroscope (deg/s)": RATES,
+    }
+    found = propose_columns(open_recording(rows_of_sensors(tmp_path / "phone.csv", sensors)))
+    assert found is not None
+    assert found.columns["/mag"].where == {"sensor": "android.sensor.magnetic_field"}
+    assert found.columns["/imu/gyro"].units == {"gyro": "deg/s"}
+
+
+def test_sensors_that_are_written_one_after_the_other_are_all_found(tmp_path: Path) -> None:
+    """Longer, each, than what is looked at of a table."""
+    lines, repeats = ["sensor,time,x,y,z"], 21_000
+    for name, size in (("accelerometer", 9.81), ("magnetometer", 45.0)):
+        lines += [f"{name},{0.01 * i},{x * size},{y * size},{z * size}" for i, (x, y, z) in _many(repeats)]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    found = propose_columns(open_recording(tmp_path / "log.csv"))
+    assert found is not None
+    assert found.columns.keys() == {"/imu/accel", "/mag"}
+
+
+def _many(count: int) -> Iterator[tuple[int, list[float]]]:
+    return enumerate(np.resize(DIRECTIONS, (count, 3)).tolist())
+
+
+def test_one_sensor_by_name_beside_an_empty_w_is_found(tmp_path: Path) -> None:
+    lines = [f"magnetometer,{t},{x},{y},{z}," for t, (x, y, z) in zip(SECONDS, 45.0 * DIRECTIONS, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join(["sensor,time,x,y,z,w", *lines]))
+    found = propose_columns(open_recording(tmp_path / "log.csv"))
+    assert found is not None
+    assert found.columns["/mag"].where == {"sensor": "magnetometer"}
+
+
+@pytest.mark.parametrize(
+    ("file", "words", "topic"),
+    [("mag", ("accuracy high", "accuracy low"), "/mag"), ("accel", ("magnet near", "magnet far"), "/imu")],
+)
+def test_a_word_in_each_row_that_is_no_sensor_changes_nothing(
+    file: str, words: tuple[str, str], topic: str, tmp_path: Path
+) -> None:
+    size = 45.0 if file == "mag" else 9.81
+    rows = zip(SECONDS, size * DIRECTIONS, strict=True)
+    lines = [f"{t},{words[i % 2]},{x},{y},{z}" for i, (t, (x, y, z)) in enumerate(rows)]
+    (tmp_path / f"{file}.csv").write_text("\n".join(["time,state,x,y,z", *lines]))
+    found = propose_columns(open_recording(tmp_path / f"{file}.csv"))
+    assert found is not None
+    assert {name: table.where for name, table in found.columns.items()} == {topic: {}}
 
 
 def test_a_column_that_mentions_sensors_does_not_say_what_named_columns_are(tmp_path: Path) -> None:
