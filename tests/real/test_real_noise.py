@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 
 import alidade
 from alidade.pipelines.recording.recording import open_recording
@@ -49,6 +50,18 @@ def test_an_accelerometer_whose_offset_stepped(at: float, shared_data: Path) -> 
     found = alidade.open({"accel_t": time, "accel": accel}, method="tumble").calibrate(report=False)
     assert found.status == "inconsistent"
     assert "change" in {finding.kind for finding in found.findings}
+
+
+def test_a_magnetometer_that_rests_before_it_is_turned(shared_data: Path) -> None:
+    """At rest it repeats one error, which is no step of its offset."""
+    trial = loadmat(str(shared_data / "broad" / "07_undisturbed_fast_rotation_B.mat"))
+    field, rate = 1e-6 * trial["imu_mag"], float(trial["sampling_rate"].item())
+    field = field[: len(field) // 2]
+    arrays = {"mag_t": np.arange(len(field)) / rate, "mag": field}
+    found = alidade.open(arrays, method="tumble").calibrate(report=False)
+    assert found.status in ("calibrated", "weak"), found.headline
+    assert found.stability is not None
+    assert found.stability.level > 0.05
 
 
 @pytest.mark.slow
