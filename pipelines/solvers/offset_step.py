@@ -108,8 +108,8 @@ class _Rows:
         Raises numpy.linalg.LinAlgError where it is not determined.
         """
         pieces, blocks = len(self.starts), int(self.block[-1]) + 1
-        least = -(-_SIDE * pieces // blocks)
-        tests = [self._test(moment, moves) for moment in range(least, pieces - least + 1)]
+        least, prior = -(-_SIDE * pieces // blocks), self._prior_without(moves)
+        tests = [self._test(moment, moves, prior) for moment in range(least, pieces - least + 1)]
         best = int(np.argmax([fall for fall, *_ in tests]))
         _, size, step, covariance = tests[best]
         each = zip(names, zip(step.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True), strict=True)
@@ -125,7 +125,7 @@ class _Rows:
         of_moves = self.prior[:, :-1] @ moves
         return self.prior - of_moves @ np.linalg.pinv(moves.T @ of_moves[:-1]) @ of_moves.T
 
-    def _test(self, moment: int, moves: Array) -> tuple[float, float, Array, Array]:
+    def _test(self, moment: int, moves: Array, prior: Array) -> tuple[float, float, Array, Array]:
         """Fall of chi-square by a step before a piece, its test statistic, the step (q,) and its covariance (q, q)."""
         s, q = moves.shape
         after = np.block([[np.eye(s), moves, np.zeros((s, 1))], [np.zeros((1, s + q)), np.ones((1, 1))]])
@@ -133,7 +133,7 @@ class _Rows:
         of_blocks = np.zeros((int(self.block[-1]) + 1, s + q + 1, s + q + 1))
         for part, columns in ((slice(moment), before), (slice(moment, None), after)):
             np.add.at(of_blocks, self.block[part], columns.T @ self.squares[part] @ columns)
-        whole = before.T @ self._prior_without(moves) @ before + of_blocks.sum(axis=0)
+        whole = before.T @ prior @ before + of_blocks.sum(axis=0)
         found = np.linalg.solve(whole[:-1, :-1], whole[:-1, -1])
         without = whole - of_blocks
         each = np.linalg.solve(without[:, :-1, :-1], without[:, :-1, -1:])[..., 0]
