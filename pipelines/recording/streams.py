@@ -92,10 +92,13 @@ def screened(stream: str, t: Array, sensors: Sequence[SensorReadings], dropped: 
     """
     if not sensors:
         return np.arange(len(t))
-    once = plausibility.measured_once(stream, np.hstack([sensor.values for sensor in sensors]), dropped)
-    sound = np.arange(len(once))
+    # Recordings of hours: a copy is made where it has to be.
+    readings = sensors[0].values if len(sensors) == 1 else np.hstack([sensor.values for sensor in sensors])
+    once = plausibility.measured_once(stream, readings, dropped)
+    del readings
+    time, sound = checks.take_rows(t, once), np.arange(len(once))
     for name, values, unit, may_be_constant in sensors:
-        kept = drop_faults(name, t[once], values[once], dropped, unit, may_be_constant)
+        kept = drop_faults(name, time, checks.take_rows(values, once), dropped, unit, may_be_constant)
         sound = np.intersect1d(sound, kept, assume_unique=True)
     return once[sound]
 
@@ -151,6 +154,7 @@ class StreamReader:
             _check_recorded(topic, found, name)
         values = np.concatenate([getattr(found, name).reshape(len(found), -1) for name in quantities], axis=1)
         t, rows = checks.clean(topic, found.t_ns, self.epoch_ns, values, self.dropped, least, slowest_s)
+        del values
         samples = Samples(t, _rows(found, rows))
         sensors = [
             SensorReadings(topic, getattr(samples.series, name), _UNITS[name], may_be_constant)
