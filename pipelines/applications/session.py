@@ -35,7 +35,7 @@ from alidade.pipelines.diagnostics.cross_validation import SplitHalf, held_out_r
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, prior_conflicts
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
-from alidade.pipelines.diagnostics.observability import finite_covariance, prior_covariance
+from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config, with_conflicts
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
@@ -310,7 +310,8 @@ class Session:
             findings += [*_remarks(problem, estimate, difference), *carried]
             findings += map(remark, filter(None, [deadline.stopped()]))
             if not estimate.converged and estimate.solver != "published":  # curvature where no minimum is
-                estimate = replace(estimate, covariance=prior_covariance(quantities))
+                priors = np.array([0.0 if q.prior_sigma == 0.0 else q.scale for q in quantities])
+                estimate = replace(estimate, covariance=problem.prior_covariance(estimate.names, priors))
             found.append(
                 Calibration(
                     method=self.method,
@@ -626,7 +627,7 @@ def _feed(digest: hashlib._Hash, data: Any) -> None:
 
 
 def _counted(data: Any) -> tuple[str, ...]:
-    """Notes on what was done to many samples of the data."""
+    """Sentences on samples of a recording that were copied, overtaken, held or kept without a stamp, with counts."""
     noted = (COPIED, OVERTAKEN, HELD, "not used (reading kept)")
     return tuple(f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted))
 

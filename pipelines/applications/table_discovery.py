@@ -172,12 +172,12 @@ def _sensors(table: Table, is_named: bool) -> list[_Table]:
 
 
 def _whole(table: Table, is_named: bool) -> _Table:
-    """Return a table as one, by its first rows."""
+    """Read the first rows of a table, as those of one device."""
     return _Table(table, is_named, list(table.read(_numbered(table), _ROWS)[0].values()))
 
 
 def _numbered(table: Table) -> list[str]:
-    """Return names that all columns have, unlike those of headers."""
+    """Return names of a table's columns by their number, which all have, whatever the header says."""
     return [f"column {i + 1}" for i in range(len(table.form.names))]
 
 
@@ -221,15 +221,19 @@ class _Table:
 
     @property
     def _names(self) -> list[str]:
-        """Names of the columns, empty for those that the rows of one sensor have no numbers in."""
+        """Names of the table's columns; empty for those without numbers in the rows of one sensor."""
         has = [not self._sensor or bool(np.isfinite(values).any()) for values in self._values]
         return [name if there else "" for name, there in zip(self._form.names, has, strict=True)]
 
     def columns_of_words(self) -> list[int]:
-        """Return the columns without numbers, where no other is named after a sensor."""
+        """Return the columns that hold a few words and no numbers; none where headers name the sensors."""
         if any(_kind(name) for name, _ in _along_axes(self._form.names)):
             return []
-        return [i for i, values in enumerate(self._values) if len(values) and np.isnan(values).all()]
+        return [
+            i
+            for i, values in enumerate(self._values)
+            if len(values) and np.isnan(values).all() and len(np.unique(self._texts[i])) <= _MOST_SENSORS
+        ]
 
     def topics(self) -> dict[str, TableTopic]:
         """Return topic -> its columns."""

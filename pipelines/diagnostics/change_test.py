@@ -185,16 +185,16 @@ def with_change(estimate: Estimate, change: Finding) -> Estimate:
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
-    """Test an estimate's stability over time: by its offset step, else its history; None with neither.
+    """Test whether calibrated quantities changed during a recording, by the offset step found, else by the history.
 
-    None too where nothing could change.
+    None where an estimate has neither, and where nothing could change.
 
     Quantities, in the estimate's order, are left out if they walk, since they may change, and if they are hardly better
     known than before.
     """
-    posterior_history = estimate.posterior_history
     if (step := estimate.offset_step) is not None:
         return Stability(step.statistic, step.level, step.time_s, _by_size(step.steps))
+    posterior_history = estimate.posterior_history
     if posterior_history is None:
         return None
     # Information about other numbers is as much the noise of its states, which moves the estimate without being

@@ -182,11 +182,6 @@ def rejects_many(findings: Sequence[Finding]) -> bool:
     )
 
 
-def prior_covariance(quantities: Sequence[Quantity]) -> Array:
-    """Covariance (n, n) of quantities that nothing but their priors determines; fixed ones are zero."""
-    return np.diag([0.0 if q.prior_sigma == 0.0 else q.scale**2 for q in quantities])
-
-
 def finite_covariance(quantities: Sequence[Quantity], covariance: Array) -> Array:
     """Make a covariance (n, n) symmetric and finite: fixed quantities 0, invalid variances very wide, uncorrelated."""
     covariance = np.asarray(covariance, dtype=float).reshape(len(quantities), len(quantities))

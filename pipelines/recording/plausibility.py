@@ -191,6 +191,18 @@ def measured_once(topic: str, values: Array, dropped: dict[str, int]) -> NDArray
     return np.flatnonzero(~repeats)
 
 
+def without_rounding(values: Array) -> Array:
+    """Round readings to twelve digits of the largest: conversions of units make many values of one."""
+    largest = max(float(np.abs(values).max(initial=0.0)), np.finfo(float).tiny)
+    return np.asarray(largest * np.round(values / largest, 12))
+
+
+def quantum(values: Array) -> float:
+    """Step of readings in steps, in their unit: a tenth of the values are nearer to the next one; 0 of one value."""
+    steps = np.diff(np.unique(values))
+    return float(np.quantile(steps, _DENSE)) if len(steps) else 0.0
+
+
 def dead_band(t: Array, values: Array) -> tuple[float, Array]:
     """Return the half width of a device's dead band, 0 without one, and the side of it (-1, 0, 1) of readings (N, k).
 
@@ -202,15 +214,13 @@ def dead_band(t: Array, values: Array) -> tuple[float, Array]:
         t: (N,) s.
         values: in any unit.
     """
-    # Conversions of units leave rounding of doubles, which makes many values of one.
-    largest = max(float(np.abs(values).max(initial=0.0)), np.finfo(float).tiny)
-    values = largest * np.round(values / largest, 12)
+    values = without_rounding(values)
     found = [value for column in values.T if (value := _one_value(column)) is not None]
     side = np.sign(values - np.median(found)) if found else np.zeros_like(values)
     passed = np.concatenate([_passed(t, *columns) for columns in zip(values.T, side.T, strict=True)])
     half_width = 0.5 * float(passed.mean()) if len(passed) else 0.0
     # Held readings are not passed through, and those in coarse steps within half a step.
-    if not found or half_width <= _FEWEST_STEPS * np.quantile(np.diff(np.unique(values)), _DENSE):
+    if not found or half_width <= _FEWEST_STEPS * quantum(values):
         return 0.0, np.zeros_like(values)
     return half_width, side
 

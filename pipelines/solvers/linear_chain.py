@@ -99,7 +99,7 @@ class Rows:
         return (self._added(level) if level.noise.beside else self._white(levels)) / self.variance(levels)
 
     def _white(self, levels: Sequence[Level]) -> Array:
-        """Variance (n,) that the rows have by their own noise, relative to the stated variance."""
+        """Variance (n,) of linearised rows by their own noise alone, over their stated one."""
         out = np.ones(len(self.time)) if self.fixed is None else 1.0 - self.fixed
         for level in levels:
             if self.has(level.noise) and not level.noise.beside:
@@ -107,7 +107,7 @@ class Rows:
         return out
 
     def _added(self, level: Level) -> Array:
-        """Variance (n,) that a noise beside the rows' own adds to them, relative to the stated variance."""
+        """Variance (n,) that an additional noise, as of repeatability, adds to linearised rows, over the stated one."""
         assert self.beside is not None
         return np.asarray((level.used * self.beside) ** 2)
 
@@ -228,7 +228,7 @@ class LinearChain:
 
     @property
     def _without_process(self) -> tuple[Rows, ...]:
-        """Rows but for those of the process, which are the last ones."""
+        """Linearised rows of the chain without those of its Gauss-Markov process, which come last."""
         return tuple(rows for rows in self.rows if rows.family != CORRELATED_ERROR)
 
     def with_correlation_time(self, correlation_time: float) -> LinearChain:
@@ -336,7 +336,7 @@ class LinearChain:
         return replace(found, states=states[:, 0], shared=shared[:, 0], value=value)
 
     def moves(self, states: Array, shared: Array) -> list[Array]:
-        """Multiply states (N d, k) and shared parameters (p, k) by the rows' Jacobians: (n, m, k) for each kind."""
+        """Multiply moves of states (N d, k) and shared numbers (p, k) by Jacobians: (n, m, k) by kind of rows."""
         n, d = self.size
         each, out = states.reshape(n, d, -1), []
         for rows in self.rows:
@@ -484,7 +484,7 @@ class LinearSolution:
         return states.reshape(n * d, k), shared
 
     def spread(self, states: Array, shared: Array) -> list[Array]:
-        """Multiply states (N d, k) and shared parameters (p, k) by the rows' whitened Jacobians: (n, m, k) by kind."""
+        """Multiply moves of states (N d, k) and shared numbers (p, k) by whitened Jacobians: (n, m, k) by kind."""
         moves = self.chain.moves(states, shared)
         return [w[:, None, None] * move for w, move in zip(self.weights, moves, strict=True)]
 

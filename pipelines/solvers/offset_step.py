@@ -83,7 +83,7 @@ class _Rows:
 
     @classmethod
     def of(cls, compiled: Compiled, solution: Point) -> _Rows:
-        """Linearise all measurements, each with Huber's weight."""
+        """Linearise all measurements of a recording at a solution, each with Huber's weight."""
         size = compiled.layout.sizes[4] + 1
         times, measured, weighted, prior = list[Array](), list[Array](), list[Array](), np.zeros((size, size))
         for group in solution.engine.groups:
@@ -118,7 +118,7 @@ class _Rows:
         return OffsetStep(float(self.starts[least + best]), _sigmas(level), min(level * tried, 1.0), dict(each))
 
     def _prior_without(self, moves: Array) -> Array:
-        """Priors' normal equations (s + 1, s + 1) without what they say of the numbers that step.
+        """Normal equations (s + 1, s + 1) of the priors, their say on the numbers that step taken out.
 
         A prior that the recording contradicts would ask for a step.
         """
@@ -168,7 +168,7 @@ def _level(square: float, q: int, before: float, blocks: int) -> float:
 
 
 def _sigmas(level: float) -> float:
-    """Size of a standard normal number that is exceeded with a probability."""
+    """Convert a p-value to the size of a standard normal number that is exceeded with that probability."""
     from scipy.special import ndtri
 
     return float(-ndtri(np.clip(level, np.finfo(float).tiny, 1.0 - np.finfo(float).eps)))

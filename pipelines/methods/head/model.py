@@ -149,7 +149,7 @@ def _error_map(config: Config, model: _Model, estimate: Estimate) -> ErrorMap | 
 
 
 def _refined_graph(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
-    """Build the graph that the noise levels require; see Problem.refined_graph."""
+    """Build a head recording's graph with the keyframes and states that noise levels need; None where it has them."""
     noises = model.noises | {level.noise.name: level for level in levels}
     if _CORRELATED not in noises and _shared(data, noises) > 0.5 * model.origins[2]:
         return None
@@ -199,7 +199,7 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
 
 
 def _correlated_error(model: _Model) -> CorrelatedError:
-    """Vision's correlated error: as its default noise, within a factor 7, if it is material for the mount."""
+    """Describe the error of vision, correlated in time, to be looked for: about as large as vision's default noise."""
     vision = model.noises["vision_attitude"].noise
     assert vision.spec.default is not None
     noise = Noise(_CORRELATED, vision.spec.default, "default", vision.known and HARDLY, (CORRELATED_ERROR,))

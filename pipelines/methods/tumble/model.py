@@ -29,7 +29,15 @@ from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, f
 from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, NO_RATE, TumbleData
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
-from alidade.pipelines.recording.plausibility import DEAD_BAND, PLAUSIBLE, SI, dead_band, likely_unit
+from alidade.pipelines.recording.plausibility import (
+    DEAD_BAND,
+    PLAUSIBLE,
+    SI,
+    dead_band,
+    likely_unit,
+    quantum,
+    without_rounding,
+)
 from alidade.pipelines.settings import Config
 
 # Standard gravity, and what it is off by where the latitude is unknown, m/s^2.
@@ -41,8 +49,6 @@ _MOSTLY = 1.0 / 3.0
 # of 0.6 s 0.5 s are found. Quiet intervals whose median is shorter, s, are no rests: readings there are off by what the
 # device is accelerated with.
 _PAUSE = 0.4
-# Share of the differences of neighbouring values that may be smaller than the step of readings in steps.
-_DENSE = 0.1
 # Means over this time, s, show what a mean over a rest scatters by, slow tremor of a hand included.
 _BLOCK = 0.25
 # Strength of the earth's field where the place is unknown, T: 22e-6 to 67e-6.
@@ -617,13 +623,9 @@ def quantisation(t: Array, raw: Array, rests: Array) -> float:
     k, sigma = np.arange(1.0, 100.0), np.linspace(0.0, 1.0, 101)
     common = (np.exp(-((2.0 * np.pi * sigma[:, None] * k) ** 2)) / k**2).sum(axis=1) / (2.0 * np.pi**2)
     variance = np.maximum.accumulate(1.0 / 12.0 + sigma**2 - common)
-    largest = max(float(np.abs(raw).max()), np.finfo(float).tiny)
-    squares = []
-    for column, own in zip(raw.T, shown, strict=True):
-        steps = np.diff(np.unique(np.round(column / largest, 12)))
-        step = largest * float(np.quantile(steps, _DENSE)) if len(steps) else 0.0
-        squares.append(step**2 * float(np.interp(own / step**2, variance, common)) if step else 0.0)
-    return float(np.sqrt(np.mean(squares)))
+    steps = [quantum(column) for column in without_rounding(raw).T]
+    found = [q**2 * float(np.interp(own / q**2, variance, common)) for q, own in zip(steps, shown, strict=True) if q]
+    return float(np.sqrt(sum(found) / len(steps)))
 
 
 def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float, at_rest: float) -> Noise:
