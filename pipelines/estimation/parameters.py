@@ -184,10 +184,15 @@ def time_offset(prior: float, require: float = math.inf, data_sheet: str = "") -
     return scalar("time_offset", "s", prior, text, data_sheet, require=require, per_recording=True)
 
 
-def accel_square(sigma: float) -> ParameterSpec:
-    """Declare the three square terms of an accelerometer that reads u + square u^2."""
-    return ParameterSpec(
-        "accel_square", "s^2/m", sigma, "Accelerometer quadratic nonlinearity, {axis}.", "accel.square", axes="123"
+def accel_curvature(square: float, cube: float) -> tuple[ParameterSpec, ParameterSpec]:
+    """Declare the three square and three cube terms of an accelerometer, of these prior sigmas."""
+    return (
+        ParameterSpec(
+            "accel_square", "s^2/m", square, "Accelerometer quadratic nonlinearity, {axis}.", "accel.square", axes="123"
+        ),
+        ParameterSpec(
+            "accel_cube", "s^4/m^2", cube, "Accelerometer cubic nonlinearity, {axis}.", "accel.cube", axes="123"
+        ),
     )
 
 

@@ -18,7 +18,7 @@ from alidade.pipelines.methods.indexer.parameters import NUISANCE as INDEXER
 from alidade.pipelines.methods.los.parameters import NUISANCE as LOS
 from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.methods.tumble import turning
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, SLOPES
+from alidade.pipelines.methods.tumble.recording import ACCEL_CURVATURE, SLOPES
 from alidade.pipelines.settings import Sensors
 from docs._site.tables import SHEETS, default_sigmas
 from tests.install.walk import steps
@@ -29,7 +29,7 @@ ASSUMED: dict[str, Sequence[ParameterSpec]] = {
     "head": (*HEAD, DEAD_BAND),
     "indexer": INDEXER,
     "cube": (*CUBE, FIELD, DEAD_BAND),
-    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD, ACCEL_SQUARE, DEAD_BAND),
+    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD, *ACCEL_CURVATURE, DEAD_BAND),
 }
 DEFAULTS = {
     (method, f"{each.sheet}.{each.figure}"): each.prior for method, assumed in ASSUMED.items() for each in assumed

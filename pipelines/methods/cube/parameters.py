@@ -17,7 +17,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
     DEAD_BAND,
     ParameterSpec,
-    accel_square,
+    accel_curvature,
     check_parameters,
     g_sensitivity,
     parameter,
@@ -78,10 +78,7 @@ HEADING = scalar("reference_heading", "rad", 1e-2, "Heading error of the referen
 
 # The grades of consumer MEMS sensors and of a dual-antenna reference, one sigma.
 SENSITIVITY = g_sensitivity(2e-4)
-SQUARE = accel_square(1e-5)
-CUBE = ParameterSpec(
-    "accel_cube", "s^4/m^2", 1e-6, "Accelerometer cubic nonlinearity, {axis}.", "accel.cube", axes="123"
-)
+SQUARE, CUBE = accel_curvature(1e-5, 1e-6)
 TEMPERATURE = {"gyro": GYRO_SLOPE, "accel": ACCEL_SLOPE}
 TILT = ParameterSpec(
     "reference_tilt",

@@ -7,7 +7,7 @@ from alidade.pipelines.methods import Method, deferred
 from alidade.pipelines.methods.triads import triad_specs
 from alidade.pipelines.methods.tumble import turning
 from alidade.pipelines.methods.tumble.recording import (
-    ACCEL_SQUARE,
+    ACCEL_CURVATURE,
     REQUIREMENTS,
     SLOPES,
     TOPICS,
@@ -34,7 +34,7 @@ PARAMETERS = (
     turning.FILTER,
     DEAD_BAND,
     turning.ARM,
-    ACCEL_SQUARE,
+    *ACCEL_CURVATURE,
     *SLOPES,
 )
 

@@ -27,7 +27,7 @@ from alidade.pipelines.methods.temperature import ACCEL_SLOPE
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.first_guess import ACCEL_OFFSET, OFFSET, first_guess, ring
 from alidade.pipelines.methods.tumble.published import FEWEST
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, NO_RATE, TumbleData
+from alidade.pipelines.methods.tumble.recording import ACCEL_CURVATURE, NO_RATE, TumbleData, beside
 from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
 from alidade.pipelines.recording.plausibility import (
     DEAD_BAND,
@@ -486,7 +486,7 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None, swung:
     strength = float(gravity(data.latitude, data.height)) if data.latitude is not None else _GRAVITY
     of = strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"
     found = _sensor("accel", (data.accel_t, data.accel, data.accel_density), rests, config, of, swung)
-    causes = {ACCEL_SQUARE: found.nominal(found.raw) ** 2}
+    causes = dict(zip(ACCEL_CURVATURE, beside(found.nominal(found.raw)), strict=True))
     if data.temperature is not None:
         temperature = data.temperature.above(data.temperature.first, data.accel_t)
         causes[ACCEL_SLOPE] = np.repeat(_means(data.accel_t, temperature[:, None], rests)[1], 3, axis=1)

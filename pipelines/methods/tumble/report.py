@@ -39,7 +39,7 @@ from alidade.pipelines.methods.triads import (
 )
 from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.parameters import STRENGTHS
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData
+from alidade.pipelines.methods.tumble.recording import ACCEL_CURVATURE, TumbleData, beside
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -49,10 +49,11 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
     found = []
     if "accel_k11" in parameters:
         formula = triad_formula("accel", parameters, "accel", ("accel",), "body's")
-        if any(name in parameters for name in ACCEL_SQUARE.names):
-            found.append(replace(formula, description=f"{formula.description}, its square term in it", name="f_read"))
-            square = vector_text(ACCEL_SQUARE.names, parameters)
-            formula = replace(formula, expression=f"f_read - {square} * f_read**2", inputs=("accel",))
+        if any(name in parameters for each in ACCEL_CURVATURE for name in each.names):
+            found.append(replace(formula, description=f"{formula.description}, its curvature in it", name="f_read"))
+            square, cube = (vector_text(each.names, parameters) for each in ACCEL_CURVATURE)
+            expression = f"f_read - {square} * f_read**2 - {cube} * (f_read**3 - 9.80665**2 * f_read)"
+            formula = replace(formula, expression=expression, inputs=("accel",))
         if any(name in parameters for name in ACCEL_SLOPE.names):
             drift = temperature_text(ACCEL_SLOPE.names, parameters)
             inputs = *formula.inputs, "temperature"
@@ -282,7 +283,8 @@ def _readings(true: Truth, nominal: Mapping[str, Array]) -> dict[str, Array]:
         found["mag"] = raw_of(true, "mag", nominal["mag"])
     if "accel" in nominal and "accel_k11" in true:
         f = nominal["accel"]
-        found["accel"] = raw_of(true, "accel", f + true.vector(*ACCEL_SQUARE.names)[..., None, :] * f**2)
+        terms = zip((true.vector(*each.names)[..., None, :] for each in ACCEL_CURVATURE), beside(f), strict=True)
+        found["accel"] = raw_of(true, "accel", f + sum(size * term for size, term in terms))
     if "gyro" in nominal:
         found["gyro"] = gyro_reading(true, nominal["gyro"], nominal.get("accel", np.array([0.0, 0.0, G])))
     return found

@@ -6,12 +6,13 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
 import alidade
@@ -33,7 +34,7 @@ from alidade.pipelines.methods.triads import triad_names, triad_of
 from alidade.pipelines.methods.tumble.first_guess import first_guess
 from alidade.pipelines.methods.tumble.graph import unturned
 from alidade.pipelines.methods.tumble.model import prepare, quantisation, static_rests
-from alidade.pipelines.methods.tumble.recording import ACCEL_SQUARE, TumbleData, read_tumble, tumble_topics
+from alidade.pipelines.methods.tumble.recording import ACCEL_CURVATURE, TumbleData, read_tumble, tumble_topics
 from alidade.pipelines.methods.tumble.report import formulas
 from alidade.pipelines.methods.tumble.simulation import (
     TumbledAccelerometer,
@@ -174,7 +175,7 @@ def test_without_noise_there_is_no_error() -> None:
     quiet = replace_scenario(
         RESTING,
         magnetometer={"density": 1e-13},
-        accelerometer={"density": 1e-9, "arm": 0.0, "square": 0.0},
+        accelerometer={"density": 5e-10, "arm": 0.0, "square": 0.0, "cube": 0.0},
         field_error=0.0,
         field_measured=None,
         priors={"field_strength": 0.0},
@@ -1013,16 +1014,18 @@ def test_a_real_accelerometer_alone() -> None:
         Session.read(open_recording(path), "tumble", Config.model_validate({"latitude_deg": 52.38} | each)).calibrate(
             report=False
         )
-        for each in ({}, {"sensors": {"accel": {"square": 0.0}}})
+        for each in ({}, {"sensors": {"accel": {"square": 0.0, "cube": 0.0}}})
     )
-    # Rests of one attitude scatter by 2 to 3 mm/s^2, and show no square term.
-    (repeats,) = (level for level in calibration.estimate.levels if level.noise.beside)
-    assert repeats.used == pytest.approx(2.9e-3, rel=0.3)
-    for name in ACCEL_SQUARE.names:
+    # Rests of one attitude repeat to 1.3 mm/s^2. A line is off by 3, by attitude: cubic terms, and no square ones.
+    for each, scatter in ((calibration, 9e-4), (straight, 2.9e-3)):
+        (repeats,) = (level for level in each.estimate.levels if level.noise.beside)
+        assert repeats.used == pytest.approx(scatter, rel=0.3)
+        assert not any(each.estimate.rejected.values())
+        assert each.status == "calibrated"
+    for name in ACCEL_CURVATURE[0].names:
         assert abs(calibration.parameters[name].value) < 2.0 * calibration.parameters[name].sigma
-    assert not any(calibration.estimate.rejected.values())
-    assert calibration.status == straight.status == "calibrated"
-    calibration = straight
+    cubes = (calibration.parameters[name] for name in ACCEL_CURVATURE[1].names)
+    assert max(abs(each.value) / each.sigma for each in cubes) > 5.0
     scale = 9.8126 / 9.81744
     K = scale * np.array([[0.96276, 0.0015751, -0.00018891], [0.0, 0.96732, 0.000859], [0.0, 0.0, 0.97079]])
     squares, axes = np.linalg.eigh(K.T @ K)
@@ -1030,7 +1033,22 @@ def test_a_real_accelerometer_alone() -> None:
     b = symmetric @ np.linalg.solve(K, -scale * np.array([0.064447, 0.011034, 0.034253]))
     published = [*symmetric[np.triu_indices(3)], *b]
     for name, value in zip(triad_names("accel", symmetric=True), published, strict=True):
-        assert abs(calibration.parameters[name].value - value) < 3.0 * calibration.parameters[name].sigma, name
+        assert abs(straight.parameters[name].value - value) < 3.0 * straight.parameters[name].sigma, name
+
+
+def test_half_the_attitudes_of_a_real_accelerometer(shared_data: Path) -> None:
+    """Rests of half a sphere do not tell cubic terms from offsets: without them they were 3 to 6.5 sigmas off."""
+    session = Session.read(open_recording(shared_data / "openaxes_imu9" / "adxl.mcap"), "tumble", None)
+    data, whole = session.data, session.calibrate(report=False)
+    smooth = uniform_filter1d(data.accel, 100, axis=0)
+    for axis, sign in product(range(3), (1.0, -1.0)):
+        kept = sign * smooth[:, axis] > -1.0
+        half = replace(data, accel_t=data.accel_t[kept], accel=data.accel[kept])
+        found = Session.of(TUMBLE, Simulated(half, {}, "")).calibrate(report=False)
+        assert found.status in ("calibrated", "weak")
+        for name, each in found.parameters.items():
+            off = abs(each.value - whole.parameters[name].value)
+            assert off <= 2.5 * np.hypot(each.sigma, whole.parameters[name].sigma), (axis, sign, name)
 
 
 def test_ten_real_rests_by_hand_in_counts(shared_data: Path) -> None:
@@ -1119,10 +1137,17 @@ def test_a_swung_accelerometer_that_turns_about_one_axis_stays_as_it_is() -> Non
     assert np.abs(calibrated_force(t, accel, path) - up).max() < np.abs(read - up).max() + 0.1
 
 
-def test_the_formula_takes_the_square_term_off() -> None:
-    names = ("accel_k11", "accel_k12", "accel_k13", "accel_k22", "accel_k23", "accel_k33", *ACCEL_SQUARE.names)
-    given = dict.fromkeys([*names, *(f"accel_b{i}" for i in "123")], 0.0)
-    given |= {"accel_k11": 1.01, "accel_k22": 0.99, "accel_k33": 1.0, "accel_square_1": 4e-5, "accel_b2": 0.1}
+def test_the_formula_takes_the_curvature_off() -> None:
+    K, curvature = (f"accel_k{ij}" for ij in ("11", "12", "13", "22", "23", "33")), (e.names for e in ACCEL_CURVATURE)
+    given = dict.fromkeys([*K, *chain.from_iterable(curvature), *(f"accel_b{i}" for i in "123")], 0.0)
+    given |= {
+        "accel_k11": 1.01,
+        "accel_k22": 0.99,
+        "accel_k33": 1.0,
+        "accel_square_1": 4e-5,
+        "accel_cube_2": 1e-5,
+        "accel_b2": 0.1,
+    }
     force = np.array([[9.0, -3.0, 2.0]])
-    raw = (force + [4e-5 * 81.0, 0.0, 0.0] - [0.0, 0.1, 0.0]) / [1.01, 0.99, 1.0]
+    raw = (force + [4e-5 * 81.0, 1e-5 * -3.0 * (9.0 - 9.80665**2), 0.0] - [0.0, 0.1, 0.0]) / [1.01, 0.99, 1.0]
     np.testing.assert_allclose(apply(formulas(given), given, {"accel": raw})["f_b"], force, atol=1e-5)
