@@ -365,7 +365,7 @@ class Session:
         if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
             return findings
         hypotheses = misstatements(self.method.graph, self.method.faults, self.data, self.config)
-        if not hypotheses and not is_suspect(estimate, findings):
+        if not hypotheses and not is_suspect(estimate, findings, quantities):
             return findings
         severe = any(each.severity > Severity.NOTE for each in contradicted)
         freed = self._freed[0] if severe and self._freed is not None else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,13 +41,15 @@ class Thresholds:
     correlated: float = 0.10
     prior_z: float = 4.0
     far_from_prior: float = 5.0  # of a calibrated parameter, in prior sigmas
-    no_device: float = 50.0  # z of a prior: 5 sigmas of a device ten times worse than usual; beyond is a data fault
+    no_device: float = 5.0  # sigmas of a device ten times worse than usual, and of the estimate; beyond is a data fault
     determined: float = 0.7  # posterior over prior sigma; above it a prior conflict that a device can have is a note
     inseparable: float = 0.9  # correlation
     material: float = 0.5  # effect over requirement
 
 
 LIMITS = Thresholds()
+# Sigmas of the worst devices over those of usual ones.
+_WORSE = 10.0
 # Share of the parameters from which on a recording is said not to determine them.
 _MOST = 0.5
 # A data-sheet figure with at least this share of a variance is worth stating better; the largest ones are reported.
@@ -114,16 +116,13 @@ def _failure(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
     )
 
 
-def is_suspect(estimate: Estimate, findings: Sequence[Finding]) -> bool:
+def is_suspect(estimate: Estimate, findings: Sequence[Finding], quantities: Sequence[Quantity]) -> bool:
     """Whether the findings call for tests of data faults, each of which solves the problem again.
 
     A wrong sign that a scale takes leaves no residuals.
     """
-    correlated = estimate.colours.keys()
-    if any(
-        f.severity == INCONSISTENT and (f.kind in _RESIDUAL or abs(f.evidence.get("z", 0.0)) > LIMITS.no_device)
-        for f in findings
-    ):
+    correlated, known = estimate.colours.keys(), {q.name: q for q in quantities}
+    if any(f.severity == INCONSISTENT and (f.kind in _RESIDUAL or _no_device(f, known)) for f in findings):
         return True
     return any(
         level.contradicted and (level.found or 0.0) > factor
@@ -149,11 +148,26 @@ def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple
         shift = sensitivities[:, j] * (x[j] - worst.prior_mean)
         effect = {q.name: float(shift[i]) for i, q in enumerate(quantities) if q.required and shift[i]}
         material = any(abs(effect.get(q.name, 0.0)) >= LIMITS.material * q.require for q in quantities if q.required)
-        severe = material and (abs(z[j]) > LIMITS.no_device or sigma[j] < LIMITS.determined * worst.scale)
         others = tuple(sorted(quantities[k].name for k in same))
-        found.append((material, _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)))
+        conflict = _prior_conflict(estimate, j, z[j], others, effect, NOTE)
+        determined = sigma[j] < LIMITS.determined * worst.scale
+        if material and (determined or _no_device(conflict, {worst.name: worst})):
+            conflict = replace(conflict, severity=INCONSISTENT)
+        found.append((material, conflict))
         left = [k for k in left[1:] if k not in same]
     return tuple(conflict for _, conflict in sorted(found, key=lambda each: not each[0]))
+
+
+def _no_device(finding: Finding, quantities: Mapping[str, Quantity]) -> bool:
+    """Whether a finding's number is farther from its prior, or from what is stated, than any device can be."""
+    found = finding.evidence
+    if finding.kind != "prior_conflict":
+        return abs(found.get("z", 0.0)) > LIMITS.no_device * _WORSE
+    prior = quantities[found["parameter"]]
+    # Errors that are slow widen sigma, not what a device can be.
+    return bool(
+        abs(found["value"] - prior.prior_mean) > LIMITS.no_device * np.hypot(_WORSE * prior.scale, found["sigma"])
+    )
 
 
 def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
@@ -189,6 +203,11 @@ def rejections(estimate: Estimate) -> list[Finding]:
         evidence = {"family": family, "share": share, "noise_factor": factor}
         found.append(Finding("rejection", INCONSISTENT if share > LIMITS.rejected else NOTE, evidence))
     return found
+
+
+def is_beyond_noise(estimate: Estimate) -> bool:
+    """Whether a noise level is one that no noise has."""
+    return any(each.severity == INCONSISTENT for each in _noise(estimate))
 
 
 def _noise(estimate: Estimate) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ import numpy as np
 from alidade.factors.array import Array
 from alidade.pipelines import parallel
 from alidade.pipelines.diagnostics.cross_validation import Build, TrialFit, max_concurrent, score_trial, solve_trial
-from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, rejections
+from alidade.pipelines.diagnostics.diagnose import diagnose, is_beyond_noise, is_suspect, rejections
 from alidade.pipelines.diagnostics.fault_models import FaultModel, ScaleFactor
 from alidade.pipelines.diagnostics.observability import rejects_many
 from alidade.pipelines.estimation.finding import Finding, Severity
@@ -64,12 +64,12 @@ def find_hypotheses(
 
     Tested is the segment where the residuals of `estimate` are worst, the whole without one. A fault has to explain
     more than `freed` does, the config in which what the recording contradicts is free. Where the estimate has not
-    converged, that is explained by a fault without which there is a solution above suspicion.
+    converged, or its noise is none, that is explained by a fault without which there is a solution above suspicion.
     """
     if estimate is not None and model.cut and estimate.residuals:
         data = model.segment(data, *_worst_segment(estimate.residuals, _SEGMENT_S))
     found = _explaining_misfit(build, model, data, config, freed)
-    if found or estimate is None or estimate.converged:
+    if found or estimate is None or (estimate.converged and not is_beyond_noise(estimate)):
         return found
     return _findings(None, _above_suspicion(build, model, data, config, estimate))
 
@@ -116,7 +116,7 @@ def _above_suspicion(build: Build, model: FaultModel, data: Any, config: Config,
         for each in solved
         if each[0].estimate.converged
         and each[0].fits
-        and not is_suspect(each[0].estimate, diagnose(each[0].estimate, each[0].quantities))
+        and not is_suspect(each[0].estimate, diagnose(each[0].estimate, each[0].quantities), each[0].quantities)
     ]
     return sorted(found, key=lambda each: each[0].cost_with_priors)
 

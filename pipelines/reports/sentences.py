@@ -236,7 +236,11 @@ def _hypothesis(e: Mapping[str, Any], severity: Severity, quantities: Quantities
 
 def _corrected(e: Mapping[str, Any], _: Severity, __: Quantities) -> tuple[str, str]:
     before, (after, dof) = e["chi_square_before"], (rounded(e[key], 4) for key in ("chi_square_after", "dof"))
-    was = "no solution as recorded, corrected chi-square" if before is None else f"chi-square {rounded(before, 4)} ->"
+    was = (
+        "no usable solution as recorded, corrected chi-square"
+        if before is None
+        else f"chi-square {rounded(before, 4)} ->"
+    )
     return e["label"], f"{was} {after}, dof {dof}"
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from alidade.factors.array import Array
 from alidade.factors.loss import TruncatedLoss
-from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
@@ -216,11 +216,14 @@ def _found_beside(level: Level, groups: Sequence[Group], values: Values, redunda
         whitened = np.minimum(square / (share * (rest + part)), most) / expected
         score = share * (part / (rest + part) * (whitened - 1.0)).sum() - middle / level.known**2
         low, high = (middle, high) if score > 0.0 else (low, middle)
-    scale = max(float(np.exp(low)), level.noise.least)
-    part = unit * scale**2
+    found = max(float(np.exp(low)), level.noise.least)
+    part = unit * found**2
+    # As in `_level`, of all noise of the rows: the mean square is more than the mode's by what few rows leave unknown.
+    more = np.expm1(2.0 / (2.0 * redundancy + ROUGHLY**-2)) * (rest + part).sum() / unit.sum()
+    scale, part = float(np.sqrt(found**2 + more)), part + more * unit
     sigma = float((2.0 * share * ((part / (rest + part)) ** 2).sum() + level.known**-2) ** -0.5)
     changed = float(np.abs((rest + part) / variance - 1.0).max())
-    return replace(level, scale=scale, found=scale, sigma=scale * sigma), changed < 2.0 * _NEGLIGIBLE
+    return replace(level, scale=scale, found=found, sigma=found * sigma), changed < 2.0 * _NEGLIGIBLE
 
 
 def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float) -> Level:

@@ -34,7 +34,7 @@ def test_what_scatters_by_many_times_its_default_does_not_fit(
     found = [each for each in findings if each.kind == "noise"]
     assert [each.severity for each in found] == severities
     assert all(each.evidence["noise"] == noise for each in found)
-    assert is_suspect(estimate, findings) is (share > 1.0)
+    assert is_suspect(estimate, findings, calibration.problem.quantities) is (share > 1.0)
 
 
 @pytest.mark.parametrize(("count", "rejected", "told"), [(6, 4, True), (6, 3, False), (3, 3, False), (20, 4, False)])

@@ -224,7 +224,7 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         INCONSISTENT,
         {"label": "x inverted", "chi_square_before": None, "chi_square_after": 5512.0, "dof": 5397.0}
         | {"equivalents": []},
-        "Consistent with: x inverted (no solution as recorded, corrected chi-square 5512, dof 5397).",
+        "Consistent with: x inverted (no usable solution as recorded, corrected chi-square 5512, dof 5397).",
     ),
 ]
 

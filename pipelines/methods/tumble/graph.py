@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors import so3
-from alidade.factors.array import Array, Index
+from alidade.factors.array import Array, Index, interpolated
 from alidade.factors.chi_square import gate
 from alidade.factors.ellipsoid import DipFactor, StrengthFactor, entries, excess, sagitta
 from alidade.factors.loss import TruncatedLoss
@@ -45,7 +45,16 @@ from alidade.pipelines.methods.tumble.parameters import (
 )
 from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.methods.tumble.turning import DELAY_KEY, FILTER_KEY, FieldGuess, Rows, Seen, Turning, turning
+from alidade.pipelines.methods.tumble.turning import (
+    DELAY_KEY,
+    FILTER_KEY,
+    FieldGuess,
+    Rows,
+    Seen,
+    Turning,
+    specific_force,
+    turning,
+)
 from alidade.pipelines.recording.topics import IMU, MAG
 from alidade.pipelines.settings import Config
 
@@ -191,16 +200,14 @@ def _chained(data: TumbleData, config: Config, model: Model, shared: tuple[Varia
     assert model.guess is not None
     assert model.dip is not None
     sensors = {sensor.name: sensor for sensor in model.sensors}
-    accel = sensors.get("accel")
-    turned = turning(
-        data,
-        config,
-        model.guess,
-        _seen(sensors["mag"], data.mag),
-        None if accel is None else _seen(accel, data.accel),
-        model.declination,
-        model.dip.start,
-    )
+    seen = {"mag": _seen(sensors["mag"], data.mag)}
+    force = None
+    if (accel := sensors.get("accel")) is not None and data.accel_t is not None:
+        seen["accel"] = _seen(accel, data.accel)
+        force = specific_force(data, seen["accel"], model.guess)
+        if not accel.rested:
+            sensors["accel"] = accel.nonlinear_at(interpolated(accel.time, data.accel_t, force))
+    turned = turning(data, config, model.guess, seen, force, model.declination, model.dip.start)
     graph = _Graph(sensors, turned, shared, TruncatedLoss(gate(3)))
     return Problem(
         method="tumble",

@@ -182,6 +182,14 @@ class Sensor:
         """Nominal vectors (m, 3) of readings (m, 3) at the first guess, in the unit of the strength."""
         return self.strength * nominal_of(raw / self.radius, self.start @ entries(self.symmetric).T)
 
+    def nonlinear_at(self, force: Array) -> Sensor:
+        """Return the sensor with what nonlinearities multiply at forces (n, 3) along the body's axes, m/s^2."""
+        if self.drivers is None:
+            return self
+        terms = dict(zip(ACCEL_CURVATURE, beside(force), strict=True))
+        columns = zip(self.driven, np.split(self.drivers, len(self.driven), axis=1), strict=True)
+        return replace(self, drivers=np.concatenate([terms.get(cause, each) for cause, each in columns], axis=1))
+
     @property
     def directions(self) -> Array:
         """Unit vectors (n, 3) of the readings at the first guess."""
@@ -433,7 +441,8 @@ def _is_mounted_straight(rotation: Array) -> bool:
 
 def _inverted(accel: Sensor) -> Sensor:
     """Invert the sign of all of an accelerometer's readings."""
-    return replace(accel, start=-accel.start, turned=-accel.turned)
+    found = replace(accel, start=-accel.start, turned=-accel.turned)
+    return found.nonlinear_at(found.nominal(found.raw))
 
 
 def _turned(sensor: Sensor, rotation: Array) -> Sensor:
@@ -441,7 +450,8 @@ def _turned(sensor: Sensor, rotation: Array) -> Sensor:
     numbers = sensor.start @ entries(sensor.symmetric).T
     K = rotation @ numbers[:9].reshape(3, 3)
     start = np.concatenate([K.ravel(), rotation @ numbers[9:]])
-    return replace(sensor, symmetric=False, start=start, turned=rotation)
+    found = replace(sensor, symmetric=False, start=start, turned=rotation)
+    return found.nonlinear_at(found.nominal(found.raw))
 
 
 def static_rests(data: TumbleData, config: Config) -> Array | None:

@@ -6,6 +6,7 @@ gyro's own errors are symmetric.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations, product
@@ -296,15 +297,29 @@ def calibrated_force(time: Array, accel: Seen, path: GyroPath) -> Array:
     return np.asarray(force * size / lengths.mean())
 
 
+def specific_force(data: TumbleData, accel: Seen, guess: FieldGuess) -> Array:
+    """Specific force (m, 3), m/s^2, in the body's axes b, of all samples of an accelerometer, roughly calibrated."""
+    if not accel.swung or data.accel_t is None or data.gyro_t is None or data.gyro is None:
+        return accel.whole
+    return calibrated_force(data.accel_t, accel, GyroPath(data.gyro_t, data.gyro, guess.bias))
+
+
 def turning(
-    data: TumbleData, config: Config, guess: FieldGuess, mag: Seen, accel: Seen | None, declination: float, dip: float
+    data: TumbleData,
+    config: Config,
+    guess: FieldGuess,
+    seen: Mapping[str, Seen],
+    force: Array | None,
+    declination: float,
+    dip: float,
 ) -> Turning:
     """Build the chain of attitudes of a tumble recording.
 
     Args:
         data: with a gyro.
         guess: of mounting and bias.
-        mag, accel: what the sensors measured.
+        seen: what magnetometer ("mag") and accelerometer ("accel"), if there is one, measured.
+        force: (m, 3) of the accelerometer's samples, see `specific_force`.
         declination: of the field, rad east.
         dip: first guess, rad.
     """
@@ -313,10 +328,8 @@ def turning(
     density = sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.gyro_t, data.gyro)
     walk = walking(config)
     drivers: dict[ParameterSpec, Array] = {}
-    if accel is not None and data.accel_t is not None:
-        force = accel.whole
-        if accel.swung:
-            force = calibrated_force(data.accel_t, accel, GyroPath(data.gyro_t, data.gyro, guess.bias))
+    mag, accel = seen["mag"], seen.get("accel")
+    if force is not None and data.accel_t is not None:
         drivers[SENSITIVITY] = interpolated(data.gyro_t, data.accel_t, force)
     if data.temperature is not None:
         drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)
