@@ -598,8 +598,8 @@ class StepEstimate:
 
     @property
     def statistic(self) -> float:
-        """Chi-square of the step: the smaller of both tests if these agree, else 0."""
-        return min(self.fall, self.by_motion) / self.ratio**2 if self.agrees else 0.0
+        """Chi-square of the step: the smaller of both tests if these agree and it is no rise, else 0."""
+        return max(min(self.fall, self.by_motion), 0.0) / self.ratio**2 if self.agrees else 0.0
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from alidade.factors import so3
 from alidade.factors.array import Array, Mask
+from alidade.factors.model import ROT3
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.noise import ROUGHLY, Level
 from alidade.pipelines.estimation.problem import Problem, Residuals
@@ -385,7 +387,8 @@ def _for_levels(problem: Problem, known: Compiled, found: LikelihoodMaximum) -> 
     late = [g.model.time[np.isinf(w)] for g, w in zip(known.engine.groups, found.widening, strict=True)]
     times = np.concatenate(late)
     used = [~(np.isin(g.model.time, times) & g.is_measurement) for g in compiled.engine.groups]
-    found = LikelihoodMaximum(_with_parameters(compiled, known, found.values), found.levels, unwidened(used))
+    values = _attitudes_of_inliers(compiled, used, _with_parameters(compiled, known, found.values))
+    found = LikelihoodMaximum(values, found.levels, unwidened(used))
     # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
     found = replace(found, values=states_first(_engine_at(compiled.engine, found), found.values))
     if _correlation_time(found.levels) is not None:
@@ -472,6 +475,29 @@ def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Val
     keys = [p.key for p in compiled.problem.parameters]
     for key, at in zip(keys, layout.at(keys).tolist(), strict=True):
         arrays[layout.blocks[layout.block[at]]][layout.row[at]] = known.layout.of_key(values, key)
+    return Values(arrays)
+
+
+def _attitudes_of_inliers(compiled: Compiled, used: Sequence[Mask], values: Values) -> Values:
+    """Initial values with the attitudes beside rejected measurements on arcs between those at others.
+
+    First attitudes are as measured. From one that is half a turn off no increment says which way to turn.
+    """
+    groups = [(g, own) for g, own in zip(compiled.engine.groups, used, strict=True) if g.is_measurement]
+    seen = [(g.place[own], g.place[~own]) for g, own in groups if g.target == "state"]
+    inliers, outliers = (np.unique(np.concatenate(each)) for each in zip(*seen, strict=True)) if seen else ((), ())
+    kept = np.setdiff1d(inliers, outliers)
+    layout = compiled.layout
+    states = np.flatnonzero((layout.keyframe >= 0) & (layout.block == layout.blocks.index(ROT3)))
+    keyframes, rows = layout.keyframe[states], layout.row[states]
+    after = np.searchsorted(kept, keyframes)
+    # Of keyframes between the same two inliers as an outlier.
+    lost = np.isin(after, np.searchsorted(kept, outliers)) & ~np.isin(keyframes, kept)
+    if len(kept) < 2 or not lost.any():
+        return values
+    arrays = {block: array.copy() for block, array in values.arrays.items()}
+    measured = arrays[ROT3][rows[np.argsort(keyframes)]][kept]
+    arrays[ROT3][rows[lost]] = so3.interpolate(kept, measured, keyframes[lost])
     return Values(arrays)
 
 

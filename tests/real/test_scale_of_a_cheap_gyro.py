@@ -112,6 +112,18 @@ def test_the_noise_of_the_gyro_is_at_least_that_at_rest_and_visions_grows_with_t
     assert 1e-3 < levels["vision_rate_noise"].used < 2e-3
 
 
+def test_attitudes_half_a_turn_off_are_outliers(recording: Path) -> None:
+    """No increment says which way to turn from there; at 179.9 deg they were, at 180 nothing was `observable`."""
+    session = alidade.open(recording, method="head", config=load_config(TRUE_SHEET.encode()))
+    wxyz = session.data.vision_wxyz.copy()
+    wxyz[[647, 1114]] = so3.multiply(wxyz[[647, 1114]], so3.exp([0.0, 0.0, np.pi]))
+    found = replace(session, data=replace(session.data, vision_wxyz=wxyz)).calibrate(report=False)
+    assert found.status == "calibrated"
+    healthy = calibrated(recording, TRUE_SHEET)
+    for name in ("helmet_mount_x", "helmet_mount_y", "helmet_mount_z"):
+        assert abs(found.values[name] - healthy.values[name]) < 0.5 * healthy.parameters[name].sigma
+
+
 def test_an_attitude_that_is_published_five_times_counts_once(recording: Path, tmp_path: Path) -> None:
     """As by a node that republishes the last pose at its own rate: the delay was 0.08 s larger, and `calibrated`."""
     session = alidade.open(recording, method="head", config={"sensors": {"gyro": {"scale": 0.1}}})

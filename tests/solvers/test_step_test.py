@@ -221,6 +221,10 @@ def judged(*steps: StepEstimate) -> tuple[str, Severity] | None:
     return None if finding is None else (finding.kind, finding.severity)
 
 
+def test_a_step_that_fits_worse_has_a_p_value() -> None:
+    assert step_stability(step(fall=-0.5), 60.0).level == 1.0
+
+
 def test_what_is_a_change_and_what_is_a_jump() -> None:
     assert judged(step()) == ("change", Severity.INCONSISTENT)
     assert judged(step(size=0.005)) == ("change", Severity.NOTE)

@@ -464,10 +464,11 @@ def test_wrong_gyro_axes_are_named_where_only_noise_that_is_none_converges(axes:
     assert found.status == "inconsistent"
     assert fault in found.headline
     assert found.estimate.converged or set(found.verdicts.values()) == {"unobservable", "fixed"}
+    least = 0.8 if found.estimate.converged else 0.9
     for name, q in found.quantities.items():
         if q.required and (name.startswith("gyro_k") or not found.estimate.converged):
             assert found.verdicts[name] != "observable"
-            assert found.parameters[name].sigma >= 0.9 * (q.prior_sigma or 0.0)
+            assert found.parameters[name].sigma >= least * (q.prior_sigma or 0.0)
 
 
 def test_half_a_real_session_that_determines_next_to_nothing_is_a_result(shared_data: Path) -> None:
