@@ -26,6 +26,7 @@ from alidade.pipelines.config import Settings, configured, load_config
 from alidade.pipelines.diagnostics.change_test import (
     Stability,
     change_finding,
+    offset_finding,
     stability,
     step_finding,
     step_stability,
@@ -302,7 +303,7 @@ class Session:
             conflicts = prior_conflicts(estimate, quantities)
             if estimate.converged and estimate.solver != "published":
                 estimate = with_conflicts(estimate, quantities, conflicts)
-            if change is not None and change.kind == "change" and change.severity == Severity.NOTE:
+            if change is not None and change.kind == "change" and change.severity < Severity.INCONSISTENT:
                 estimate = with_change(estimate, change)
             tables = self.method.report.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(estimate)
@@ -409,6 +410,9 @@ class Session:
         if estimate.steps is not None:
             span = float(np.ptp(np.concatenate([r.time for r in estimate.residuals.values()])))
             found = step_finding(estimate.steps, span, quantities)
+            offset = None if estimate.offset_step is None else offset_finding(estimate.offset_step, quantities)
+            if offset is not None and (found is None or offset.severity > found.severity):
+                return stability(estimate, quantities), offset
             return (step_stability(estimate.steps[0], span) if estimate.steps else None), found
         stable = stability(estimate, quantities)
         if stable is None or not stable.changed:

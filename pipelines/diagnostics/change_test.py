@@ -21,7 +21,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.parameters import prior_z_scores
-from alidade.pipelines.estimation.problem import Estimate, Quantity, StepEstimate
+from alidade.pipelines.estimation.problem import Estimate, OffsetStep, Quantity, StepEstimate
 from alidade.pipelines.estimation.widening import by_wider_priors, widened
 
 # Probability of calling a recording changed in which nothing changed.
@@ -120,6 +120,20 @@ def _significant(steps: Mapping[str, tuple[float, float]], ratio: float) -> dict
 def _by_size(steps: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
     """Sort steps by size over sigma, the largest first."""
     return dict(sorted(steps.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
+
+
+def offset_finding(step: OffsetStep, quantities: Sequence[Quantity]) -> Finding | None:
+    """Finding of kind `change` on a step of offsets that are a mean over the recording; None if it is not significant.
+
+    WEAK if it is material: a mean of what changed is right for no part of the recording.
+    """
+    steps = _significant(step.steps, 1.0)
+    if step.level >= LEVEL or not steps:
+        return None
+    required = {q.name: q.require for q in quantities}
+    material = any(abs(size) - _SURE * sigma > _MATERIAL * required[name] for name, (size, sigma) in steps.items())
+    evidence = {"since_s": step.time_s, "time_s": step.time_s, "steps": steps}
+    return Finding("change", Severity.WEAK if material else Severity.NOTE, evidence)
 
 
 def step_stability(step: StepEstimate, duration: float) -> Stability:

@@ -351,8 +351,7 @@ class Problem:
         layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
         step_candidates: keys of rotations that are tested for a step at one moment, as of a mount that slips.
-        offsets: names of the quantities, each sensor's together, that are tested for a step at one moment in graphs of
-            shared unknowns alone.
+        offsets: names of the quantities, each sensor's together, that are tested for a step at one moment.
         correlated_error: that measurements may have, and that is looked for; None: the method has none.
         refined_graph: noise levels -> the graph that they need, with more keyframes or with an error that is
             correlated in time; None where this one serves.

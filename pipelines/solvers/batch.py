@@ -49,6 +49,7 @@ from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
 from alidade.pipelines.solvers.offset_step import largest_offset_step
+from alidade.pipelines.solvers.offset_step_of_chain import largest_offset_step_of_chain
 from alidade.pipelines.solvers.posterior import Reported, chi_square, leverages, moved_to, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
 from alidade.pipelines.solvers.robust import solve_robust, solve_truncated, without_onsets
@@ -257,10 +258,13 @@ def whole_estimate(
     covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
     by = sigma_ratio(np.diag(nominal), np.diag(covariance))
     sandwich, largest, wide, innovations = None, None, by, dict[str, Residuals]()
+    offset_step = largest_offset_step(compiled, found) if steps else None
     if problem.marginal_likelihood and engine.is_chain and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
         innovations = innovations_of(compiled, solved.levels, solved.solution) if budget else innovations
-        largest = largest_steps(compiled, solved.levels, solved.solution) if steps else None
+        if steps:
+            largest = largest_steps(compiled, solved.levels, solved.solution)
+            offset_step = largest_offset_step_of_chain(compiled, solved.levels, solved.solution)
         widened = slow_widening(sandwich, len(names))
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
     past = posterior_history(compiled, posterior) if history else None
@@ -273,7 +277,7 @@ def whole_estimate(
         inflation=by,
         sandwich=sandwich,
         steps=largest,
-        offset_step=largest_offset_step(compiled, found) if steps else None,
+        offset_step=offset_step,
         colours={family: noise.together for family, noise in noises.items()},
         converged=solved.converged,
         message=solved.message,

@@ -16,7 +16,7 @@ them, relative to the first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -218,10 +218,7 @@ def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = No
     p = chain.prior.shape[1] - 1
     known = chain.prior[:, :p].T @ chain.prior[:, :p]
     information, of_scores, blocks = known.copy(), known.copy(), 0
-    for kind, each in chain.innovations(variances, chain.limits, by_shared=True).items():
-        time = chain.rows[kind].time
-        G = each.whitened[..., 1:]
-        e = each.whitened[..., 0] + (0.0 if at is None else G @ at)
+    for time, G, e in innovations_by_shared(chain, variances, at):
         information += np.einsum("nmi,nmj->ij", G, G)
         block = ((time - time.min()) / SANDWICH_BLOCK_S).astype(int)
         blocks = int(block.max()) + 1
@@ -229,6 +226,18 @@ def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = No
         np.add.at(sums, block, np.einsum("nmi,nm->ni", G, e))
         of_scores += sums.T @ sums
     return information, of_scores, blocks
+
+
+def innovations_by_shared(
+    chain: LinearChain, variances: Sequence[Array], at: Array | None = None
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield times (n,), s, of each kind of measurements, derivatives (n, m, p) of their innovations, and these (n, m).
+
+    Arguments as of `scores`.
+    """
+    for kind, each in chain.innovations(variances, chain.limits, by_shared=True).items():
+        G = each.whitened[..., 1:]
+        yield chain.rows[kind].time, G, each.whitened[..., 0] + (0.0 if at is None else G @ at)
 
 
 def sandwich(information: Array, of_scores: Array) -> tuple[Array, Array]:
@@ -507,7 +516,7 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     Above 1 where something errs slowly that no noise of the model has, as with the pose. Up to `certain_ratio` it
     counts as 1.
     """
-    chain, variances = _at(compiled, levels, solution)
+    chain, variances = linear_chain(compiled, levels, solution)
     reported = Reported.of(compiled, solution.values).jacobian[:, compiled.layout.sizes[3] :]
     information, of_scores, blocks = scores(chain, variances)
     nominal, robust = sandwich(information, of_scores)
@@ -516,7 +525,7 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     return np.where(ratio > certain_ratio(blocks), np.maximum(ratio, 1.0), 1.0)
 
 
-def _at(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[LinearChain, list[Array]]:
+def linear_chain(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[LinearChain, list[Array]]:
     """Linearise the chain about a solution; return it and the variances (n,) of each kind of rows."""
     chain = LinearChain.of(compiled.engine, solution.values)
     return chain, chain.variances(levels, unwidened(solution.engine.inliers(solution.values)), NO_SAY)
@@ -565,7 +574,7 @@ def levels_settled(
 
 def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> dict[str, Residuals]:
     """Innovations of each family at given noise levels: white, of unit variance, if the model is right."""
-    chain, variances = _at(compiled, levels, solution)
+    chain, variances = linear_chain(compiled, levels, solution)
     used = solution.engine.inliers(solution.values)
     return {
         chain.rows[k].family: Residuals(chain.rows[k].time, each.whitened[..., 0], used[chain.rows[k].group])

@@ -115,7 +115,7 @@ class _Rows:
         each = zip(names, zip(step.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True), strict=True)
         level = _level(size, len(names), blocks * (least + best) / pieces, blocks)
         tried = blocks - 2 * _SIDE + 1
-        return OffsetStep(float(self.starts[least + best]), _sigmas(level), min(level * tried, 1.0), dict(each))
+        return OffsetStep(float(self.starts[least + best]), as_sigmas(level), min(level * tried, 1.0), dict(each))
 
     def _prior_without(self, moves: Array) -> Array:
         """Normal equations (s + 1, s + 1) of the priors, their say on the numbers that step taken out.
@@ -167,7 +167,7 @@ def _level(square: float, q: int, before: float, blocks: int) -> float:
     return float(fdtrc(q, dof - q + 1.0, square * (dof - q + 1.0) / (q * dof)))
 
 
-def _sigmas(level: float) -> float:
+def as_sigmas(level: float) -> float:
     """Convert a p-value to the size of a standard normal number that is exceeded with that probability."""
     from scipy.special import ndtri
 

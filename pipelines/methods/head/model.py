@@ -120,6 +120,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         layout=replace(LAYOUT, states="xu"),
         marginal_likelihood=True,
         step_candidates=(model.parameters.helmet.key,),
+        offsets=(tuple(q.name for q in model.parameters.bias.quantities),),
         correlated_error=_correlated_error(model),
         refined_graph=partial(_refined_graph, config, data, model),
         error_map=partial(_error_map, config, model),

@@ -1,0 +1,126 @@
+"""Test for a step of offsets at one moment, in a chain of states: a gyro bias that jumped.
+
+By the innovations e of the solution, whitened, and their derivatives G by the shared unknowns, summed before and after
+a moment (Andrews, "Tests for parameter instability and structural change with unknown change point", Econometrica 61,
+1993). With I and S the sums of G'G and -G'e over the whole, I2 and S2 over what is after the moment, and M what a unit
+of the offsets moves, the step d lowers chi-square by d' A d:
+
+    d = A^-1 M' (S2 - I2 I^-1 S),     A = M' (I2 - I2 I^-1 I2) M
+
+Its covariance is A^-1, or that of the scores of blocks with the step taken out where that is more. Priors have no say:
+one that the recording contradicts would ask for a step. The moment is that of the largest fall, its p-value that of one
+moment times their number (Bonferroni).
+
+Limits: what an innovation remembers of states before the step is left out, a second or so. There are no moments in the
+first and the last seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from alidade.factors.array import Array
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import OffsetStep
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.levenberg import Solution
+from alidade.pipelines.solvers.linear_chain import LinearChain
+from alidade.pipelines.solvers.marginal_likelihood import SANDWICH_BLOCK_S, innovations_by_shared, linear_chain
+from alidade.pipelines.solvers.offset_step import as_sigmas
+from alidade.pipelines.solvers.posterior import Reported
+
+# s, blocks of scores; so many together count as independent, and are on either side of a moment.
+_BLOCK_S = 1.0
+_APART = round(SANDWICH_BLOCK_S / _BLOCK_S)
+
+
+def largest_offset_step_of_chain(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> OffsetStep | None:
+    """Find the most significant step of one of `Problem.offsets` in a chain; None in a short recording.
+
+    Args:
+        compiled: the problem.
+        levels, solution: of it.
+    """
+    found: list[OffsetStep] = []
+    if compiled.problem.offsets:
+        scores = _Scores.of(*linear_chain(compiled, levels, solution))
+        jacobian = Reported.of(compiled, solution.values).jacobian[:, compiled.layout.sizes[3] :]
+        inverse = np.asarray(np.linalg.pinv(jacobian), dtype=float)
+        names = [q.name for q in compiled.problem.quantities]
+        for offsets in compiled.problem.offsets:
+            with suppress(np.linalg.LinAlgError, ValueError):
+                found.append(scores.largest(offsets, inverse[:, [names.index(name) for name in offsets]]))
+    return min(found, key=lambda each: each.level, default=None)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scores:
+    """Scores of a chain's shared unknowns, summed over blocks of `_BLOCK_S`.
+
+    Attributes:
+        start: of the first block, s.
+        information: (B, s, s) of each.
+        scores: (B, s) as innovations ask the unknowns to move.
+    """
+
+    start: float
+    information: Array
+    scores: Array
+
+    @classmethod
+    def of(cls, chain: LinearChain, variances: Sequence[Array]) -> _Scores:
+        """Sum the scores of all measurements of a chain about its solution; of none there are no blocks."""
+        s, parts = chain.prior.shape[1] - 1, list(innovations_by_shared(chain, variances))
+        start = min((float(time.min()) for time, *_ in parts), default=0.0)
+        blocks = [((time - start) / _BLOCK_S).astype(int) for time, *_ in parts]
+        count = 1 + max((int(block.max()) for block in blocks), default=-1)
+        out = cls(start, np.zeros((count, s, s)), np.zeros((count, s)))
+        for block, (_, G, e) in zip(blocks, parts, strict=True):
+            np.add.at(out.information, block, np.einsum("nmi,nmj->nij", G, G))
+            np.subtract.at(out.scores, block, np.einsum("nmi,nm->ni", G, e))
+        return out
+
+    def largest(self, names: tuple[str, ...], moves: Array) -> OffsetStep:
+        """Most significant step of numbers (q,) whose unit moves (s, q) the shared unknowns.
+
+        Raises:
+            numpy.linalg.LinAlgError: the step is not determined.
+            ValueError: the recording is too short for any moment.
+        """
+        from scipy.special import chdtrc
+
+        after, score = (np.cumsum(each[::-1], axis=0)[::-1] for each in (self.information, self.scores))
+        known = np.linalg.pinv(after[0], hermitian=True)
+        tests = []
+        for first in range(_APART, len(after) - _APART):
+            seen = after[first] @ known
+            A = moves.T @ (after[first] - seen @ after[first]) @ moves
+            step = np.linalg.solve(A, moves.T @ (score[first] - seen @ score[0]))
+            tests.append((float(step @ A @ step), first, step, A))
+        fall, first, step, A = max(tests, key=lambda each: each[0])
+        ratio = self._ratio(first, moves @ step, known, fall)
+        level = float(chdtrc(len(names), fall / ratio**2))
+        sigmas = ratio * np.sqrt(np.diag(np.linalg.inv(A)))
+        steps = dict(zip(names, zip(step.tolist(), sigmas.tolist(), strict=True), strict=True))
+        return OffsetStep(self.start + _BLOCK_S * first, as_sigmas(level), min(level * len(tests), 1.0), steps)
+
+    def _ratio(self, first: int, move: Array, known: Array, fall: float) -> float:
+        """Ratio of sandwich to nominal sigma of the size of a step, at least 1.
+
+        Args:
+            first: block from which on the step is.
+            move: (s,) of the shared unknowns by the step.
+            known: (s, s) covariance of the shared unknowns without the step.
+            fall: of chi-square by the step.
+        """
+        later = np.arange(len(self.scores)) >= first
+        of_move = known @ self.information[later].sum(axis=0) @ move
+        whole = known @ self.scores.sum(axis=0) - of_move
+        left = self.scores - self.information @ whole - later[:, None] * (self.information @ move)
+        of_step = later * (left @ move) - left @ of_move
+        together = np.add.reduceat(of_step, np.arange(0, len(of_step), _APART))
+        return max(1.0, float(np.sqrt((together**2).sum() / fall)))
