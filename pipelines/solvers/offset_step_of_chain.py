@@ -11,8 +11,8 @@ Its covariance is A^-1, or that of the scores of blocks with the step taken out 
 one that the recording contradicts would ask for a step. The moment is that of the largest fall, its p-value that of one
 moment times their number (Bonferroni).
 
-Limits: what an innovation remembers of states before the step is left out, a second or so. There are no moments in the
-first and the last seconds.
+Limits: noise levels are those without a step, which raises them, and sigmas with them. What an innovation remembers of
+states before the step is left out, a second or so. There are no moments in the first and the last seconds.
 """
 
 from __future__ import annotations
