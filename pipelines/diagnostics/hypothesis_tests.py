@@ -162,8 +162,16 @@ def _findings(before: float | None, found: Sequence[_Tested]) -> tuple[Finding, 
 
 
 def _explaining(build: Build, cases: Iterable[TrialCase], before: TrialFit, concurrent: int) -> list[_Tested]:
-    """Solve the cases and keep those that explain the misfit, the best fit first."""
+    """Solve the cases and keep those that explain the misfit, the best fit first.
+
+    A unit counts where its rates fit better than zeros do: at rest, but for a fault of the gyro, all small rates fit.
+    """
+    cases = list(cases)
     found = [each for each in _solved(build, cases, concurrent) if _explains(before, each[0])]
+    explained = {label for _, label in found}
+    silent = [replace(case, data=case.silent) for case in cases if case.silent is not None and case.label in explained]
+    costs = {label: without.cost for without, label in _solved(build, silent, concurrent)}
+    found = [each for each in found if each[0].cost < costs.get(each[1], np.inf) - _SIGNIFICANT**2]
     # Corrections that fit alike are weighed by their priors: a mount that is likely before one that is not.
     return sorted(found, key=lambda each: each[0].cost_with_priors / max(each[0].dof, 1.0))
 
@@ -241,11 +249,18 @@ _FIRST_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 0.01, 5e-3, 4
 
 @dataclass(frozen=True)
 class TrialCase:
-    """A fault, in words, with the data and config that correct the fault."""
+    """A fault, in words, with the data and config that correct the fault.
+
+    Attributes:
+        label: the fault.
+        data, config: without it.
+        silent: data with zero in place of the readings in question, which the correction has to fit better than.
+    """
 
     label: str
     data: Any
     config: Config
+    silent: Any = None
 
 
 def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
@@ -312,7 +327,8 @@ def _units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
                 f"the {sensor} is in deg/s, not rad/s": np.deg2rad(values),
                 f"the {sensor} was turned from deg/s to rad/s twice": np.rad2deg(values),
             }.items():
-                yield TrialCase(label, replace(data, **{name: changed}), config)
+                silent = replace(data, **{name: 0.0 * values})
+                yield TrialCase(label, replace(data, **{name: changed}), config, silent)
 
 
 def _late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:

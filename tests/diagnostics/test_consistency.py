@@ -481,3 +481,16 @@ def test_a_platform_taken_for_at_rest_is_a_note() -> None:
 
     calibration = alidade.open(alidade.simulate("head", {"duration_s": 10.0}, seed=1)).calibrate(report=False)
     assert "No platform IMU: the platform counts as at rest" in calibration.notes
+
+
+def test_a_gyro_at_rest_with_a_fault_of_its_own_is_not_said_to_be_in_deg_s() -> None:
+    """A drone on the ground, and a gyro that got stuck: the rates in any unit that are small enough fit."""
+    find, data, config = head_of(10.0, moving=False)
+    rng = np.random.default_rng(2)
+    rates = 3e-4 * rng.standard_normal(data.head_gyro.shape)
+    rates[500:520] += [1.0, -0.5, 0.7]
+    first = np.broadcast_to(data.vision_wxyz[:1], data.vision_wxyz.shape)
+    seen = so3.multiply(first, so3.exp(8.7e-3 * rng.standard_normal((len(first), 3))))
+    still = replace(data, head_gyro=rates, vision_wxyz=seen)
+    labels = [each.evidence["label"] for each in find_hypotheses(find.graph, find.faults, still, config)]
+    assert not any("deg/s" in label for label in labels)
