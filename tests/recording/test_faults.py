@@ -336,6 +336,18 @@ def test_a_useless_sensor_is_refused(spoil: Callable[[Array], Array], message: s
         drop_faults("/imu", data.gyro_t, spoil(data.gyro), {}, "rad/s")
 
 
+def test_a_dead_axis_of_a_coarse_gyro_is_refused() -> None:
+    """In steps of 1 deg/s, mostly at rest, its other axes repeat in three samples of ten."""
+    t = np.arange(6000) / 100.0
+    rates = np.where(t > 45.0, np.sin(3.0 * t), 0.0)[:, None] * [1.0, -0.5, 2.0]
+    rates += 0.012 * np.random.default_rng(0).standard_normal(rates.shape)
+    counts = 0.0169 * np.round(rates / 0.0169)
+    assert (np.diff(counts, axis=0) == 0.0).mean(axis=0).min() > 0.25
+    assert len(drop_faults("/imu", t, counts, {}, "rad/s")) == len(t)
+    with pytest.raises(InputError, match="axis y reads 0 throughout while the others move"):
+        drop_faults("/imu", t, counts * [1.0, 0.0, 1.0], {}, "rad/s")
+
+
 @pytest.mark.parametrize(
     ("name", "readings", "brief"),
     [
