@@ -200,14 +200,16 @@ def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[
 def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
     """Return the config's keys that would allow for conflicts with data sheets or priors; empty without conflicts.
 
-    1 + scale is negative for a reversed axis, which no data sheet allows for.
+    None allows for a reversed axis, whose scale is -2, or for a dead one, -1.
     """
     stated: dict[str, dict[str, float]] = {}  # sensor, or none for `priors` -> figure or parameter -> size
-    reversed_axes = []
+    faults = []
     for e in (finding.evidence for finding in findings if finding.kind == "prior_conflict"):
         q = quantities[e["parameter"]]
-        if e["value"] < -1.0 and "_scale_" in q.name:
-            reversed_axes.append(f"{q.name} is that of a reversed axis: correct its sign.")
+        if e["value"] < -1.5 and "_scale_" in q.name:
+            faults.append(f"{q.name} is that of a reversed axis: correct its sign.")
+        elif e["value"] < -0.5 and "_scale_" in q.name:
+            faults.append(f"{q.name} is that of a dead or wrong axis, with less than half of its input: check it.")
         elif q.group == "assumption":
             sensor, _, figure = q.sheet.partition(".")
             known = stated.setdefault(sensor, {})
@@ -221,7 +223,7 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
     priors = [f"`priors: {written.pop('')}`"] if "" in written else []
     sensors = [f"`sensors: {{{', '.join(map(': '.join, written.items()))}}}`"] if written else []
     state = [f"If the device is so, state it: {' and '.join([*sensors, *priors])}."] if stated else []
-    return " ".join([*reversed_axes, *state])
+    return " ".join([*faults, *state])
 
 
 def _weak(severity: Severity, labels: str, sigma_ratio: float, advice: str) -> str:

@@ -257,6 +257,10 @@ def test_a_departure_that_is_significant_is_applied_though_its_sigma_is_nearly_t
     (note,) = (note for note in said if "state it" in note)
     assert note.startswith("gyro_scale_z is that of a reversed axis: correct its sign. If the device is so, state it")
     assert "{gyro: {scale: 0.1}}" in note  # for x, not 2 for z
+    # Nor a dead one.
+    dead_axis = replace(estimate, values=np.array([0.0786, 0.0399, -1.0007]))
+    said = sentences.notes(diagnose(dead_axis, scales), calibration.quantities)
+    assert any(note.startswith("gyro_scale_z is that of a dead or wrong axis, with less than") for note in said)
     # A prior of the config's own goes before the data sheet, which would change nothing.
     own = replace(problem, parameters=(Parameter(9, (replace(scales[0], sheet=""), *scales[1:])),))
     priors = replace(calibration, problem=own)
