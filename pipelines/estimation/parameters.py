@@ -67,6 +67,7 @@ class ParameterSpec:
         require: accuracy wanted, one sigma.
         per_recording: it belongs to a recording; other parameters belong to the device.
         rotation: the rotation whose rotation vector it is, as "vRh"; empty: it is none.
+        valid_below: as Quantity has it.
     """
 
     name: str
@@ -78,6 +79,7 @@ class ParameterSpec:
     require: float = math.inf
     per_recording: bool = False
     rotation: str = ""
+    valid_below: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -244,7 +246,8 @@ def quantities(
         usual = sheet or spec.prior
         prior = _FREE * usual if prior is None else prior
         figure = "" if name in config.priors else spec.data_sheet
-        return Quantity(name, spec.unit, prior, usual, require, group="assumption", sheet=figure)
+        found = Quantity(name, spec.unit, prior, usual, require, group="assumption", sheet=figure)
+        return replace(found, valid_below=spec.valid_below)
 
     return tuple(map(quantity, spec.names))
 
@@ -303,7 +306,7 @@ def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: flo
         value, sigma: its estimate.
         inflation: by what sigma is larger because noise is coloured, or errors are slow.
     """
-    prior, white = quantity.prior_sigma or 0.0, sigma / inflation
+    prior, white = quantity.prior_at(value), sigma / inflation
     if white > _UNINFORMED * prior or prior == 0.0:
         return None
     elsewhere = sigma**2 - (white**2 / prior) ** 2

@@ -128,6 +128,8 @@ class Quantity:
         sheet: of an assumption, the data sheet's figure that its prior comes from, as in the config: "gyro.scale".
         factor: that it has in common with others; None: none.
         relative: its required accuracy is up to that factor, and it is judged with the others.
+        valid_below: how far below its prior's mean the model is valid, one sigma, however wide the prior; None: as far
+            as the prior allows.
     """
 
     name: str
@@ -142,6 +144,7 @@ class Quantity:
     sheet: str = ""
     factor: CommonFactor | None = None
     relative: bool = False
+    valid_below: float | None = None
 
     @property
     def assumed(self) -> bool:
@@ -167,6 +170,11 @@ class Quantity:
     def scale(self) -> float:
         """Reference for the quantity's sigma: the sigma of its prior, or of the default prior."""
         return self.prior_sigma or self.prior_scale
+
+    def prior_at(self, value: float) -> float:
+        """Sigma by which a value may differ from the prior's mean; 0 without a prior."""
+        prior = self.prior_sigma or 0.0
+        return prior if self.valid_below is None or value > self.prior_mean else min(prior, self.valid_below)
 
     def determined(self, sigma: float) -> bool:
         """Whether the recording rather than the prior determines the quantity, by its posterior sigma."""

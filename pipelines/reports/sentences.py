@@ -200,7 +200,7 @@ def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[
 def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
     """Return the config's keys that would allow for conflicts with data sheets or priors; empty without conflicts.
 
-    None allows for a reversed axis, whose scale is -2, or for a dead one, -1.
+    None allows for a reversed axis, whose scale is -2, for a dead one, -1, or for a negative filter of vision.
     """
     stated: dict[str, dict[str, float]] = {}  # sensor, or none for `priors` -> figure or parameter -> size
     faults = []
@@ -210,6 +210,11 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
             faults.append(f"{q.name} is that of a reversed axis: correct its sign.")
         elif e["value"] < -0.5 and "_scale_" in q.name:
             faults.append(f"{q.name} is that of a dead or wrong axis, with less than half of its input: check it.")
+        elif e["value"] < 0.0 and q.name == "vision_filter":
+            faults.append(
+                "A negative vision_filter suggests a gyro that is low-passed more than vision, which no setting "
+                "describes: raise its bandwidth."
+            )
         elif q.group == "assumption":
             sensor, _, figure = q.sheet.partition(".")
             known = stated.setdefault(sensor, {})
@@ -249,7 +254,8 @@ def _corrected(e: Mapping[str, Any], _: Severity, __: Quantities) -> tuple[str, 
 def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[str, str]:
     q = quantities[e["parameter"]]
     unit, factor = human_unit(q)
-    prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
+    sigma = q.prior_at(e["value"]) or q.scale
+    prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * sigma)} {unit}".rstrip()
     numbers = f"{format_estimate(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
     if not (q.assumed or q.tight):
         return (

@@ -9,11 +9,14 @@ import pytest
 
 import alidade
 from alidade.factors.array import Array
+from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.stated_priors import with_conflicts
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.parameters import quantities
 from alidade.pipelines.estimation.problem import Estimate, Quantity
+from alidade.pipelines.methods.head.parameters import VISION_FILTER
 from alidade.pipelines.reports.sentences import headline, sentence
 
 HEAD = {"duration_s": 40.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
@@ -116,6 +119,23 @@ def test_slow_errors_neither_hide_a_departure_nor_make_one() -> None:
     # Of a sigma near the prior's the shift has that of the slow errors, not next to none.
     near = replace(estimate([0.03], [9e-3]), sandwich=np.array([1.8]))
     assert conflicts(near, [assumption("a")]) == []
+
+
+@pytest.mark.parametrize("config", ["{}", "{sensors: {camera: {filter: 3.0e-4}}}", "{priors: {vision_filter: 3.0e-4}}"])
+def test_no_sheet_of_vision_allows_for_a_gyro_that_is_low_passed_more(config: str) -> None:
+    """BROAD 21 behind 5 Hz, with the line that was advised, was `calibrated` with its mount 1.2 deg off."""
+    of = [REQUIRED, *quantities(VISION_FILTER, load_config(config.encode()))]
+    gyro, vision = (estimate([0.0, value], [2e-3, 1e-5], 0.3) for value in (-2.8e-4, 2.8e-4))
+    (found,) = conflicts(gyro, of)
+    assert found.severity == Severity.INCONSISTENT
+    assert found.evidence["z"] == pytest.approx(-5.6, abs=0.2)
+    named = {q.name: q for q in of}
+    renamed = replace(found, evidence=found.evidence | {"parameter": "vision_filter"})
+    assert "prior 0 ± 0.000050 s^2" in sentence(renamed, named)
+    advice = headline([renamed], named, {})
+    assert "A negative vision_filter suggests a gyro that is low-passed more than vision" in advice
+    assert "state it" not in advice
+    assert bool(conflicts(vision, of)) is (config == "{}")
 
 
 def linear(truth: list[float], rows: Array, priors: list[float]) -> tuple[Estimate, list[Quantity]]:
