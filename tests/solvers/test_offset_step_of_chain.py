@@ -70,7 +70,7 @@ def test_a_step_is_material_beyond_half_of_what_is_required() -> None:
 
     assert severity(2e-3) == Severity.WEAK
     assert severity(1e-3) == Severity.NOTE
-    assert severity(2e-3, level=0.01) is None
+    assert severity(2e-3, level=1e-4) is None
     assert severity(1e-4) is None
 
 
