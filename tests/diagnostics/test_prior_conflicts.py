@@ -130,7 +130,7 @@ def test_no_sheet_of_vision_allows_for_a_gyro_that_is_low_passed_more(config: st
     assert found.severity == Severity.INCONSISTENT
     assert found.evidence["z"] == pytest.approx(-5.6, abs=0.2)
     named = {q.name: q for q in of}
-    renamed = replace(found, evidence=found.evidence | {"parameter": "vision_filter"})
+    renamed = replace(found, evidence={**found.evidence, "parameter": "vision_filter"})
     assert "prior 0 ± 0.000050 s^2" in sentence(renamed, named)
     advice = headline([renamed], named, {})
     assert "A negative vision_filter suggests a gyro that is low-passed more than vision" in advice

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,13 @@ from alidade.pipelines.simulation.scenario import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
 from datasets.broad import read_trial, to_session
 
-SCENARIO = {"duration_s": 40.0, "vision_rate_hz": 20.0, "gyro_rate_hz": 100.0, "latitude_deg": None, "sensors": {}}
+SCENARIO: dict[str, Any] = {
+    "duration_s": 40.0,
+    "vision_rate_hz": 20.0,
+    "gyro_rate_hz": 100.0,
+    "latitude_deg": None,
+    "sensors": {},
+}
 NAMES = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
 
 
