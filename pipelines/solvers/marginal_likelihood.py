@@ -396,10 +396,12 @@ def _for_levels(problem: Problem, known: Compiled, found: LikelihoodMaximum) -> 
     late = [g.model.time[np.isinf(w)] for g, w in zip(known.engine.groups, found.widening, strict=True)]
     times = np.concatenate(late)
     used = [~(np.isin(g.model.time, times) & g.is_measurement) for g in compiled.engine.groups]
-    values = _attitudes_of_inliers(compiled, used, _with_parameters(compiled, known, found.values))
+    values = _with_parameters(compiled, known, found.values)
     found = LikelihoodMaximum(values, found.levels, unwidened(used))
     # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
-    found = replace(found, values=states_first(_engine_at(compiled.engine, found), found.values))
+    engine = _engine_at(compiled.engine, found)
+    starts = [states_first(engine, each) for each in (values, *_attitudes_of_inliers(compiled, used, values))]
+    found = replace(found, values=min(starts, key=engine.cost))
     if _correlation_time(found.levels) is not None:
         # Unwidened outliers would pass for noise, and once its level is small what is correlated stays so.
         chain = LinearChain.of(compiled.engine, found.values)
@@ -487,10 +489,11 @@ def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Val
     return Values(arrays)
 
 
-def _attitudes_of_inliers(compiled: Compiled, used: Sequence[Mask], values: Values) -> Values:
-    """Initial values with the attitudes beside rejected measurements on arcs between those at others.
+def _attitudes_of_inliers(compiled: Compiled, used: Sequence[Mask], values: Values) -> list[Values]:
+    """Initial values with the attitudes beside rejected measurements on arcs between those at others, if there are any.
 
-    First attitudes are as measured. From one that is half a turn off no increment says which way to turn.
+    First attitudes are as measured. From one that is half a turn off no increment says which way to turn; over long
+    rejected stretches they are better than arcs.
     """
     groups = [(g, own) for g, own in zip(compiled.engine.groups, used, strict=True) if g.is_measurement]
     seen = [(g.place[own], g.place[~own]) for g, own in groups if g.target == "state"]
@@ -503,11 +506,11 @@ def _attitudes_of_inliers(compiled: Compiled, used: Sequence[Mask], values: Valu
     # Of keyframes between the same two inliers as an outlier.
     lost = np.isin(after, np.searchsorted(kept, outliers)) & ~np.isin(keyframes, kept)
     if len(kept) < 2 or not lost.any():
-        return values
+        return []
     arrays = {block: array.copy() for block, array in values.arrays.items()}
     measured = arrays[ROT3][rows[np.argsort(keyframes)]][kept]
     arrays[ROT3][rows[lost]] = so3.interpolate(kept, measured, keyframes[lost])
-    return Values(arrays)
+    return [Values(arrays)]
 
 
 def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> Array:
