@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -73,15 +74,19 @@ class _Scores:
 
     @classmethod
     def of(cls, chain: LinearChain, variances: Sequence[Array]) -> _Scores:
-        """Sum the scores of all measurements of a chain about its solution; of none there are no blocks."""
-        s, parts = chain.prior.shape[1] - 1, list(innovations_by_shared(chain, variances))
-        start = min((float(time.min()) for time, *_ in parts), default=0.0)
-        blocks = [((time - start) / _BLOCK_S).astype(int) for time, *_ in parts]
-        count = 1 + max((int(block.max()) for block in blocks), default=-1)
+        """Sum the scores of all measurements of a chain about its solution."""
+        s, times = chain.prior.shape[1] - 1, [rows.time for rows in chain.rows if rows.is_measurement]
+        start, stop = min(float(t.min()) for t in times), max(float(t.max()) for t in times)
+        count = 1 + int((stop - start) / _BLOCK_S)
         out = cls(start, np.zeros((count, s, s)), np.zeros((count, s)))
-        for block, (_, G, e) in zip(blocks, parts, strict=True):
-            np.add.at(out.information, block, np.einsum("nmi,nmj->nij", G, G))
-            np.subtract.at(out.scores, block, np.einsum("nmi,nm->ni", G, e))
+        for time, G, e in innovations_by_shared(chain, variances):
+            order = np.argsort(time, kind="stable")
+            firsts = np.searchsorted(time[order], start + _BLOCK_S * np.arange(count + 1))
+            for block, (first, last) in enumerate(pairwise(firsts.tolist())):
+                some = order[first:last]
+                own = G[some].reshape(-1, s)
+                out.information[block] += own.T @ own
+                out.scores[block] -= e[some].ravel() @ own
         return out
 
     def largest(self, names: tuple[str, ...], moves: Array) -> OffsetStep:
