@@ -85,10 +85,11 @@ def diagnose(
     if not published:
         conflicts = prior_conflicts(estimate, quantities) if conflicts is None else conflicts
         noise = tuple(_noise(estimate))
-        # In noise that is none conflicts look immaterial, and may be what it comes from.
+        # In noise that is none conflicts and steps of a bias look immaterial, and may be what it comes from.
         symptom = any(each.severity == INCONSISTENT for each in noise)
-        found += [replace(each, severity=INCONSISTENT) if symptom else each for each in conflicts]
-        found += [*([change] if change else []), *rejections(estimate), *noise, *_correlations(estimate)]
+        weak = [change] if change is not None and change.severity == WEAK else []
+        found += [replace(each, severity=INCONSISTENT) if symptom else each for each in (*conflicts, *weak)]
+        found += [*([change] if change and not weak else []), *rejections(estimate), *noise, *_correlations(estimate)]
         found += [*_error_map(estimate, quantities), *_slow_errors(estimate, quantities), *disturbances(estimate)]
     found += misfits(estimate.chi_square, estimate.levels)
     is_weak = any(finding.severity == WEAK for finding in directions)

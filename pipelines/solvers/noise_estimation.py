@@ -219,7 +219,7 @@ def _found_beside(level: Level, groups: Sequence[Group], values: Values, redunda
     found = max(float(np.exp(low)), level.noise.least)
     part = unit * found**2
     # As in `_level`, of all noise of the rows: the mean square is more than the mode's by what few rows leave unknown.
-    more = np.expm1(2.0 / (2.0 * redundancy + ROUGHLY**-2)) * (rest + part).sum() / unit.sum()
+    more = np.expm1(2.0 / (2.0 * redundancy + min(level.known, ROUGHLY) ** -2)) * (rest + part).sum() / unit.sum()
     scale, part = float(np.sqrt(found**2 + more)), part + more * unit
     sigma = float((2.0 * share * ((part / (rest + part)) ** 2).sum() + level.known**-2) ** -0.5)
     changed = float(np.abs((rest + part) / variance - 1.0).max())
