@@ -409,10 +409,11 @@ class Session:
         ratio = max(ratios, default=1.0)
         if estimate.steps is not None:
             span = float(np.ptp(np.concatenate([r.time for r in estimate.residuals.values()])))
-            found = step_finding(estimate.steps, span, quantities)
             offset = None if estimate.offset_step is None else offset_finding(estimate.offset_step, quantities)
-            if offset is not None and (found is None or offset.severity > found.severity):
-                return stability(estimate, quantities), offset
+            each = [f for f in (step_finding(estimate.steps, span, quantities), offset) if f is not None]
+            found = max(each, key=lambda finding: (finding.severity, finding.kind == "change"), default=None)
+            if found is not None and found is offset:
+                return stability(estimate, quantities), found
             return (step_stability(estimate.steps[0], span) if estimate.steps else None), found
         stable = stability(estimate, quantities)
         if stable is None or not stable.changed:

@@ -48,7 +48,7 @@ class Thresholds:
 
 
 LIMITS = Thresholds()
-# Sigmas of the worst devices over those of usual ones.
+# Prior sigma of the worst devices over that of usual ones.
 _WORSE = 10.0
 # Share of the parameters from which on a recording is said not to determine them.
 _MOST = 0.5
@@ -151,7 +151,7 @@ def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple
         material = any(abs(effect.get(q.name, 0.0)) >= LIMITS.material * q.require for q in quantities if q.required)
         others = tuple(sorted(quantities[k].name for k in same))
         conflict = _prior_conflict(estimate, j, z[j], others, effect, NOTE)
-        determined = sigma[j] < LIMITS.determined * worst.scale
+        determined = sigma[j] < LIMITS.determined * (worst.prior_at(x[j]) or worst.scale)
         if material and (determined or _no_device(conflict, {worst.name: worst})):
             conflict = replace(conflict, severity=INCONSISTENT)
         found.append((material, conflict))
@@ -162,7 +162,7 @@ def prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple
 def _no_device(finding: Finding, quantities: Mapping[str, Quantity]) -> bool:
     """Whether a finding's number is farther from its prior, or from what is stated, than any device can be."""
     found = finding.evidence
-    if finding.kind != "prior_conflict":
+    if finding.kind != "prior_conflict" or abs(found["z"]) > LIMITS.no_device * _WORSE:
         return abs(found.get("z", 0.0)) > LIMITS.no_device * _WORSE
     prior = quantities[found["parameter"]]
     # Errors that are slow widen sigma, not what a device can be.
@@ -207,7 +207,7 @@ def rejections(estimate: Estimate) -> list[Finding]:
 
 
 def is_beyond_noise(estimate: Estimate) -> bool:
-    """Whether a noise level is one that no noise has."""
+    """Whether a noise level is beyond what noise can be."""
     return any(each.severity == INCONSISTENT for each in _noise(estimate))
 
 

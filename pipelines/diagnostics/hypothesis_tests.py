@@ -64,7 +64,8 @@ def find_hypotheses(
 
     Tested is the segment where the residuals of `estimate` are worst, the whole without one. A fault has to explain
     more than `freed` does, the config in which what the recording contradicts is free. Where the estimate has not
-    converged, or its noise is none, that is explained by a fault without which there is a solution above suspicion.
+    converged, or its noise is beyond what noise can be, that is explained by a fault without which there is a solution
+    above suspicion.
     """
     if estimate is not None and model.cut and estimate.residuals:
         data = model.segment(data, *_worst_segment(estimate.residuals, _SEGMENT_S))

@@ -299,18 +299,20 @@ def prior_z_score(quantity: Quantity, value: float, sigma: float, inflation: flo
     """Shift of a nuisance parameter from its prior, in sigmas of that shift; None if not determined.
 
     With s = sigma / inflation, p the prior's sigma and V = sigma^2 - (s^2 / p)^2 what comes from elsewhere than from
-    the prior, the estimate's change from the prior has the variance (p - s^2 / p)^2 + V; for white noise p^2 - s^2.
+    the prior, the estimate's change from the prior has the variance (p - s^2 / p)^2 + V; for white noise p^2 - s^2. The
+    first p is less where the model is valid less far.
 
     Args:
         quantity: the assumption.
         value, sigma: its estimate.
         inflation: by what sigma is larger because noise is coloured, or errors are slow.
     """
-    prior, white = quantity.prior_at(value), sigma / inflation
+    prior, white = quantity.prior_sigma or 0.0, sigma / inflation
     if white > _UNINFORMED * prior or prior == 0.0:
         return None
     elsewhere = sigma**2 - (white**2 / prior) ** 2
-    return (value - quantity.prior_mean) / math.sqrt((prior - white**2 / prior) ** 2 + elsewhere)
+    may_differ = quantity.prior_at(value) * (1.0 - (white / prior) ** 2)
+    return (value - quantity.prior_mean) / math.sqrt(may_differ**2 + elsewhere)
 
 
 def prior_z_scores(estimate: Estimate, quantities: Sequence[Quantity]) -> list[float | None]:

@@ -210,7 +210,7 @@ def _sheets(findings: Sequence[Finding], quantities: Quantities) -> str:
             faults.append(f"{q.name} is that of a reversed axis: correct its sign.")
         elif e["value"] < -0.5 and "_scale_" in q.name:
             faults.append(f"{q.name} is that of a dead or wrong axis, with less than half of its input: check it.")
-        elif e["value"] < 0.0 and q.name == "vision_filter":
+        elif e["value"] < q.prior_mean and q.valid_below is not None:
             faults.append(
                 "A negative vision_filter suggests a gyro that is low-passed more than vision, which no setting "
                 "describes: raise its bandwidth."

@@ -258,7 +258,7 @@ def whole_estimate(
     covariance[np.ix_(posterior.reported.free, posterior.reported.free)] += sum(added.values(), np.zeros(()))
     by = sigma_ratio(np.diag(nominal), np.diag(covariance))
     sandwich, largest, wide, innovations = None, None, by, dict[str, Residuals]()
-    offset_step = largest_offset_step(compiled, found) if steps else None
+    offset_step = None
     if problem.marginal_likelihood and engine.is_chain and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
         innovations = innovations_of(compiled, solved.levels, solved.solution) if budget else innovations
@@ -267,6 +267,8 @@ def whole_estimate(
             offset_step = largest_offset_step_of_chain(compiled, solved.levels, solved.solution)
         widened = slow_widening(sandwich, len(names))
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
+    elif steps:
+        offset_step = largest_offset_step(compiled, found)
     past = posterior_history(compiled, posterior) if history else None
     residuals = residuals_by_family(engine, values)
     out = Estimate(

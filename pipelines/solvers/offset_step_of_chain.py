@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -40,7 +40,9 @@ _APART = round(SANDWICH_BLOCK_S / _BLOCK_S)
 
 
 def largest_offset_step_of_chain(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> OffsetStep | None:
-    """Find the most significant step of one of `Problem.offsets` in a chain; None in a short recording.
+    """Find the most significant step of one of `Problem.offsets` in a chain.
+
+    None without offsets, in a recording too short for a moment, and where no step is determined.
 
     Args:
         compiled: the problem.
@@ -55,7 +57,8 @@ def largest_offset_step_of_chain(compiled: Compiled, levels: Sequence[Level], so
         for offsets in compiled.problem.offsets:
             with suppress(np.linalg.LinAlgError, ValueError):
                 found.append(scores.largest(offsets, inverse[:, [names.index(name) for name in offsets]]))
-    return min(found, key=lambda each: each.level, default=None)
+    best = min(found, key=lambda each: each.level, default=None)
+    return None if best is None else replace(best, level=min(best.level * len(found), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +102,10 @@ class _Scores:
         from scipy.special import chdtrc
 
         after, score = (np.cumsum(each[::-1], axis=0)[::-1] for each in (self.information, self.scores))
-        known = np.linalg.pinv(after[0], hermitian=True)
+        scale = np.sqrt(np.maximum(np.diag(after[0]), np.finfo(float).tiny))
+        known = np.linalg.pinv(after[0] / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
         tests = []
-        for first in range(_APART, len(after) - _APART):
+        for first in range(_APART, len(self.scores) - _APART):
             seen = after[first] @ known
             A = moves.T @ (after[first] - seen @ after[first]) @ moves
             step = np.linalg.solve(A, moves.T @ (score[first] - seen @ score[0]))
@@ -128,4 +132,4 @@ class _Scores:
         left = self.scores - self.information @ whole - later[:, None] * (self.information @ move)
         of_step = later * (left @ move) - left @ of_move
         together = np.add.reduceat(of_step, np.arange(0, len(of_step), _APART))
-        return max(1.0, float(np.sqrt((together**2).sum() / fall)))
+        return max(1.0, float(np.sqrt((together**2).sum() / max(fall, np.finfo(float).tiny))))

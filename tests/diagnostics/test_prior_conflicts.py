@@ -14,7 +14,7 @@ from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.stated_priors import with_conflicts
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.noise import Level, Noise
-from alidade.pipelines.estimation.parameters import quantities
+from alidade.pipelines.estimation.parameters import prior_z_score, quantities
 from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods.head.parameters import VISION_FILTER
 from alidade.pipelines.reports.sentences import headline, sentence
@@ -119,6 +119,14 @@ def test_slow_errors_neither_hide_a_departure_nor_make_one() -> None:
     # Of a sigma near the prior's the shift has that of the slow errors, not next to none.
     near = replace(estimate([0.03], [9e-3]), sandwich=np.array([1.8]))
     assert conflicts(near, [assumption("a")]) == []
+
+
+def test_a_departure_where_the_model_is_not_valid_is_judged_by_where_it_is() -> None:
+    """However wide the prior: what the recording leaves unknown counts as without it."""
+    (q,) = quantities(VISION_FILTER, load_config(b"sensors: {camera: {filter: 3.0e-4}}"))
+    assert prior_z_score(q, -6e-5, 4.9e-5) == pytest.approx(-0.87, abs=0.02)
+    assert prior_z_score(q, -1e-3, 5.5e-5) == pytest.approx(-13.6, abs=0.2)
+    assert prior_z_score(q, 2.8e-4, 1e-5) == pytest.approx(0.93, abs=0.02)
 
 
 @pytest.mark.parametrize("config", ["{}", "{sensors: {camera: {filter: 3.0e-4}}}", "{priors: {vision_filter: 3.0e-4}}"])

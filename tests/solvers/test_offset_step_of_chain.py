@@ -60,6 +60,13 @@ def test_a_step_is_found_with_its_size() -> None:
     assert total < quantile(0.995, dof)
 
 
+def test_a_step_is_named_where_it_raises_the_noise_beyond_what_is_stated() -> None:
+    session = alidade.open(alidade.simulate("head", SCENARIO, 0))
+    found = replace(session, data=stepped(session.data, 18.0, np.deg2rad([0.6, 0.0, -0.4]))).calibrate(report=False)
+    assert found.status == "inconsistent"
+    assert "Change at 18 s: gyro_bias_x by 0.5" in found.headline
+
+
 def test_nothing_is_found_where_nothing_steps() -> None:
     """Of ten p-values for a step anywhere, at most one is below a twentieth: with two of them, p = .09."""
     levels = [found(seed, 18.0, (0.0, 0.0, 0.0)).level for seed in range(10)]

@@ -138,8 +138,8 @@ def simulated(scenario: TumbleScenario, seed: int, _images: bool = False) -> Sim
         truth |= {f"accel_square_{i + 1}": float(each) for i, each in enumerate(square)}
         truth |= {f"accel_cube_{i + 1}": float(each) for i, each in enumerate(cube)}
         f = raw @ K.T + b
-        beside = square * f**2 + cube * f * (f**2 - 9.80665**2) + drift(scenario.temperature, "accel", slopes, t)
-        raw = raw + beside @ np.linalg.inv(K).T
+        added = square * f**2 + cube * f * (f**2 - 9.80665**2) + drift(scenario.temperature, "accel", slopes, t)
+        raw = raw + added @ np.linalg.inv(K).T
         found |= {"accel_t": t, "accel": raw, "accel_density": accel.density}
         truth |= _truth("accel", K, b, symmetric=gyro is None) | {"gravity": g}
         truth |= {"accel_arm_x": accel.arm, "accel_arm_y": 0.0, "accel_arm_z": 0.0}
