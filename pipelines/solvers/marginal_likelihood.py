@@ -519,7 +519,7 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     Above 1 where something errs slowly that no noise of the model has, as with the pose. Up to `certain_ratio` it
     counts as 1.
     """
-    chain, variances = linear_chain(compiled, levels, solution)
+    chain, variances = chain_about(compiled, levels, solution)
     reported = Reported.of(compiled, solution.values).jacobian[:, compiled.layout.sizes[3] :]
     information, of_scores, blocks = scores(chain, variances)
     nominal, robust = sandwich(information, of_scores)
@@ -528,7 +528,7 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     return np.where(ratio > certain_ratio(blocks), np.maximum(ratio, 1.0), 1.0)
 
 
-def linear_chain(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[LinearChain, list[Array]]:
+def chain_about(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[LinearChain, list[Array]]:
     """Linearise the chain about a solution; return it and the variances (n,) of each kind of rows."""
     chain = LinearChain.of(compiled.engine, solution.values)
     return chain, chain.variances(levels, unwidened(solution.engine.inliers(solution.values)), NO_SAY)
@@ -577,7 +577,7 @@ def levels_settled(
 
 def innovations_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> dict[str, Residuals]:
     """Innovations of each family at given noise levels: white, of unit variance, if the model is right."""
-    chain, variances = linear_chain(compiled, levels, solution)
+    chain, variances = chain_about(compiled, levels, solution)
     used = solution.engine.inliers(solution.values)
     return {
         chain.rows[k].family: Residuals(chain.rows[k].time, each.whitened[..., 0], used[chain.rows[k].group])

@@ -30,7 +30,7 @@ from alidade.pipelines.estimation.problem import OffsetStep
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.levenberg import Solution
 from alidade.pipelines.solvers.linear_chain import LinearChain
-from alidade.pipelines.solvers.marginal_likelihood import SANDWICH_BLOCK_S, innovations_by_shared, linear_chain
+from alidade.pipelines.solvers.marginal_likelihood import SANDWICH_BLOCK_S, chain_about, innovations_by_shared
 from alidade.pipelines.solvers.offset_step import as_sigmas
 from alidade.pipelines.solvers.posterior import Reported
 
@@ -50,7 +50,7 @@ def largest_offset_step_of_chain(compiled: Compiled, levels: Sequence[Level], so
     """
     found: list[OffsetStep] = []
     if compiled.problem.offsets:
-        scores = _Scores.of(*linear_chain(compiled, levels, solution))
+        scores = _Scores.of(*chain_about(compiled, levels, solution))
         jacobian = Reported.of(compiled, solution.values).jacobian[:, compiled.layout.sizes[3] :]
         inverse = np.asarray(np.linalg.pinv(jacobian), dtype=float)
         names = [q.name for q in compiled.problem.quantities]
