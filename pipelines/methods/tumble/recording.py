@@ -29,16 +29,18 @@ REQUIREMENTS: tuple[Need, ...] = (((MAG,), (IMU, _METHOD)),)
 NO_RATE = "gyro beyond what rad/s can be, not used"
 
 SLOPES = temperature.GYRO_SLOPE, temperature.ACCEL_SLOPE
-# Along each axis an accelerometer reads f + square f^2 + cube f (f^2 - _ONE_G): K is the line through what it reads at
-# +-1 g, as other calibrations have it. At 1 g the terms are 3e-4 and 2e-3, a nonlinearity of .2 % of 2 g: an ADXL355
-# states .1 % and had .3 %, consumer parts state .5 %.
+# Along each axis an accelerometer reads f + square f^2 + cube f (f^2 - LINE). At 1 g the terms are 3e-4 and 2e-3 of f,
+# a nonlinearity of .2 % of 2 g: an ADXL355 states .1 % and had .3 %, consumer parts state .5 %.
 ACCEL_CURVATURE = accel_curvature(3e-5, 2e-5)
-_ONE_G = 9.80665**2
+# (m/s^2)^2: K is a line, as other calibrations have it. It is half-way between the one through what is read at +-1 g,
+# where this is g^2, and the one that fits best over all directions of gravity, 27/35 g^2: least squares of lengths, in
+# which u_x^4 has 6/7 u_x^2 - 3/35 of degrees 2 and 0.
+LINE = 31.0 / 35.0 * 9.80665**2
 
 
 def beside(force: Array) -> tuple[Array, Array]:
     """What the terms of `ACCEL_CURVATURE` multiply, at forces of shape (..., 3), m/s^2."""
-    return force**2, force * (force**2 - _ONE_G)
+    return force**2, force * (force**2 - LINE)
 
 
 @dataclass(frozen=True, eq=False)

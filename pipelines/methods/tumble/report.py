@@ -39,7 +39,7 @@ from alidade.pipelines.methods.triads import (
 )
 from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.parameters import STRENGTHS
-from alidade.pipelines.methods.tumble.recording import ACCEL_CURVATURE, TumbleData, beside
+from alidade.pipelines.methods.tumble.recording import ACCEL_CURVATURE, LINE, TumbleData, beside
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
@@ -52,7 +52,7 @@ def formulas(parameters: Collection[str], _config: Config | None = None) -> list
         if any(name in parameters for each in ACCEL_CURVATURE for name in each.names):
             found.append(replace(formula, description=f"{formula.description}, its curvature in it", name="f_read"))
             square, cube = (vector_text(each.names, parameters) for each in ACCEL_CURVATURE)
-            expression = f"f_read - {square} * f_read**2 - {cube} * (f_read**3 - 9.80665**2 * f_read)"
+            expression = f"f_read - {square} * f_read**2 - {cube} * (f_read**3 - {LINE:.4f} * f_read)"
             formula = replace(formula, expression=expression, inputs=("accel",))
         if any(name in parameters for name in ACCEL_SLOPE.names):
             drift = temperature_text(ACCEL_SLOPE.names, parameters)

@@ -48,7 +48,7 @@ class TumbledAccelerometer(ScenarioPart):
     mounting_deg: NotNegative = 3.0  # sigma of the magnetometer's rotation against it, each component
     temperature: NotNegative = 1e-2  # m/s^2/K, sigma of each slope of b, where there is a temperature
     square: NotNegative = 3e-5  # s^2/m, sigma of what is felt squared that each axis reads beside it
-    cube: NotNegative = 2e-5  # s^4/m^2, sigma of its cube, less what a line through +-1 g has of it
+    cube: NotNegative = 2e-5  # s^4/m^2, sigma of its cube, less what K has of it
     arm: NotNegative = 0.1  # m, from the centre that the device is turned about
 
 
@@ -138,7 +138,11 @@ def simulated(scenario: TumbleScenario, seed: int, _images: bool = False) -> Sim
         truth |= {f"accel_square_{i + 1}": float(each) for i, each in enumerate(square)}
         truth |= {f"accel_cube_{i + 1}": float(each) for i, each in enumerate(cube)}
         f = raw @ K.T + b
-        added = square * f**2 + cube * f * (f**2 - 9.80665**2) + drift(scenario.temperature, "accel", slopes, t)
+        added = (
+            square * f**2
+            + cube * f * (f**2 - 31.0 / 35.0 * 9.80665**2)
+            + drift(scenario.temperature, "accel", slopes, t)
+        )
         raw = raw + added @ np.linalg.inv(K).T
         found |= {"accel_t": t, "accel": raw, "accel_density": accel.density}
         truth |= _truth("accel", K, b, symmetric=gyro is None) | {"gravity": g}
