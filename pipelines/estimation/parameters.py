@@ -189,8 +189,8 @@ def time_offset(prior: float, require: float = math.inf, data_sheet: str = "") -
 def accel_curvature(square: float, cube: float) -> tuple[ParameterSpec, ParameterSpec]:
     """Declare the three square and three cube terms of an accelerometer, of these prior sigmas.
 
-    It reads u + square u^2 + cube u^3, axis by axis. Of cube u is A f + c; in tumble K has a part of the cubic term, the
-    line in it.
+    It reads u + square u^2 + cube u^3, axis by axis. Of cube u is A f + c; in tumble K has the line that is in the
+    cubic term.
     """
     return (
         ParameterSpec(

@@ -497,6 +497,9 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None, swung:
     of = strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"
     found = _sensor("accel", (data.accel_t, data.accel, data.accel_density), rests, config, of, swung)
     causes = dict(zip(ACCEL_CURVATURE, beside(found.nominal(found.raw)), strict=True))
+    if rests is None and not swung:
+        # The errors of a hand in motion are coloured by attitudes as cubic terms are, and far larger.
+        del causes[ACCEL_CURVATURE[1]]
     if data.temperature is not None:
         temperature = data.temperature.above(data.temperature.first, data.accel_t)
         causes[ACCEL_SLOPE] = np.repeat(_means(data.accel_t, temperature[:, None], rests)[1], 3, axis=1)
