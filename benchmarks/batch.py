@@ -21,9 +21,11 @@ from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
-from alidade.pipelines.solvers.batch import minimum, solve_batch
+from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.levenberg import Solution
+from alidade.pipelines.solvers.noise_estimation import apply_levels
+from alidade.pipelines.solvers.robust import solve_robust
 from benchmarks.ahrs import ahrs_factors
 from benchmarks.measure import Ratio, costs, growth
 
@@ -114,7 +116,8 @@ def native(t: Array, gyro: Array, seen: Array, sigma: float) -> Graph:
 
 def solve(compiled: Compiled) -> Solution:
     """By the batch solver's outer loop, gate included, noise levels as stated."""
-    return minimum(compiled, compiled.problem.noises)
+    engine = apply_levels(compiled.engine, compiled.problem.noises)
+    return solve_robust(engine, compiled.initial, compiled.problem.loss).at_inliers()
 
 
 def solve_native(graph: Graph) -> int:

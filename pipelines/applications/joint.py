@@ -1,9 +1,9 @@
 """Several recordings of one device as one calibration.
 
 Each recording is solved by itself, and what it says of the device, linear about the joint estimate of those before it
-and itself, is joined with what the others say. Then those that were farthest from the final estimate are solved again
-with that of the others as prior, which moves their linearisation there, until the joint estimate stays. What is kept of
-a recording meanwhile is small; its data wait in a temporary file.
+and itself, is joined with what the others say. Then those that were farthest from the final estimate are linearised
+again there, with the noise levels and inliers of their own solutions, until the joint estimate stays. What is kept of a
+recording meanwhile is small; its data wait in a temporary file.
 """
 
 from __future__ import annotations
@@ -33,8 +33,16 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.parameters import kind
-from alidade.pipelines.estimation.prior_replacement import with_priors
-from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Parameter, Problem, Quantity, SqrtInformation
+from alidade.pipelines.estimation.problem import (
+    ChiSquare,
+    Estimate,
+    Parameter,
+    Problem,
+    Quantity,
+    Residuals,
+    SqrtInformation,
+)
+from alidade.pipelines.estimation.widening import marginalised
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.container import total
@@ -42,7 +50,8 @@ from alidade.pipelines.recording.topics import SessionFacts
 from alidade.pipelines.reports.joint_report import recording_blocks
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import PartParameter, PartResult
-from alidade.pipelines.solvers.joint import Joined, grown, information_at_levels, join
+from alidade.pipelines.solvers.freed import information_at
+from alidade.pipelines.solvers.joint import Joined, grown, join
 
 # The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
 # square), and those that were not tried are foreseen to; so many times they are tried.
@@ -92,6 +101,10 @@ class Alone:
             message=estimate.message,
             chi_square=estimate.chi_square,
             rejected=estimate.rejected,
+            residuals={
+                family: Residuals(np.empty(0), np.empty((0, 0)), each.used)
+                for family, each in estimate.residuals.items()
+            },
             levels=estimate.levels,
             inflation=estimate.inflation,
             error_map=estimate.error_map,
@@ -235,7 +248,7 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
         squares = [joined.distance(i, each) ** 2 for i, each in enumerate(sqrt_info)]
         order = sorted(range(len(alone)), key=lambda i: -squares[i])
         for done, i in enumerate(progress.track(order, "joining", len(order)), 1):
-            sqrt_info[i] = _again(method, alone[i], joined.others(i), rates).with_priors_of(sqrt_info[i])
+            sqrt_info[i] = _again(method, alone[i], joined.all(i), rates, sqrt_info[i].added)
             joined = join(sqrt_info, rates, days)
             step = before.sigmas_to(joined)
             near, far = (sum(squares[k] for k in some) for some in (order[:done], order[done:]))
@@ -246,12 +259,21 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
     return joined, step
 
 
-def _again(method: Method, alone: Alone, others: GaussianPrior, rates: Mapping[str, float]) -> SqrtInformation:
-    """Return the information of one recording, linearised at the estimate of the device by all others."""
-    problem = with_priors(method.graph(alone.loaded(), alone.calibration.config), [others])
-    estimate = alone.calibration.estimate
-    known = information_at_levels(problem, estimate.levels, rates)
-    return known if estimate.error_map is None else estimate.error_map.known(known, estimate.inflations)
+def _again(
+    method: Method, alone: Alone, known: GaussianPrior, rates: Mapping[str, float], added: Array | None
+) -> SqrtInformation:
+    """Return the information of one recording, linear about the joint estimate of its numbers.
+
+    Its noise levels and inliers stay those of its own solution: found anew at these levels, other inliers may fit too.
+    """
+    estimate, found = alone.calibration.estimate, dict(zip(known.names, known.mean.tolist(), strict=True))
+    values = np.array([found.get(name, value) for name, value in zip(estimate.names, estimate.values, strict=True)])
+    moves = estimate.error_map if estimate.error_map is not None and estimate.error_map.map.moves else None
+    problem = method.graph(alone.loaded(), alone.calibration.config).near(found)
+    without = replace(estimate, values=values if moves is None else values - moves.shift)
+    again = information_at(problem, without, rates)
+    again = again if moves is None else moves.moved(again)
+    return again if added is None else marginalised(again, added)
 
 
 def _calibration(

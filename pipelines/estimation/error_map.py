@@ -30,7 +30,7 @@ from alidade.pipelines.estimation.problem import (
     Step,
     changed,
 )
-from alidade.pipelines.estimation.widening import marginalised, widened
+from alidade.pipelines.estimation.widening import widened
 
 # Components of harmonics below this share of the largest one's rms are of high order, or noise.
 _LEAST = 0.01
@@ -223,14 +223,10 @@ class FoundMap:
         out = widened(estimate, SOURCE, self.columns)
         if not self.map.moves:
             return out
-        sqrt_info = None if out.sqrt_info is None else self._moved(out.sqrt_info)
+        sqrt_info = None if out.sqrt_info is None else self.moved(out.sqrt_info)
         return replace(out, values=out.values + self.shift, sqrt_info=sqrt_info)
 
-    def known(self, sqrt_info: SqrtInformation, inflations: Array) -> SqrtInformation:
-        """Return a recording's information, made without the map, with the map's shift and uncertainty applied."""
-        moved = self._moved(sqrt_info) if self.map.moves else sqrt_info
-        return marginalised(moved, self.names, self.columns / inflations[:, None])
-
-    def _moved(self, sqrt_info: SqrtInformation) -> SqrtInformation:
+    def moved(self, sqrt_info: SqrtInformation) -> SqrtInformation:
+        """Shift a recording's information, made without the map."""
         shift = dict(zip(self.names, self.shift.tolist(), strict=True))
         return replace(sqrt_info, at=sqrt_info.at + [shift[name] for name in sqrt_info.names])

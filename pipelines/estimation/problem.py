@@ -539,6 +539,7 @@ class SqrtInformation:
         prior_R: (p, n) of the device's priors.
         prior_d: (p,).
         scales: (n,) the usual priors' sigmas, so that angles, rates and seconds are comparable.
+        added: (n, m) S of the errors S a, a unit normal, that are marginalised out of R and d beside; None: none.
     """
 
     names: tuple[str, ...]
@@ -548,10 +549,7 @@ class SqrtInformation:
     prior_R: Array
     prior_d: Array
     scales: Array
-
-    def with_priors_of(self, other: SqrtInformation) -> SqrtInformation:
-        """Replace the device's priors by those of another information of the same graph, relinearised here."""
-        return replace(self, prior_R=other.prior_R, prior_d=other.prior_d + other.prior_R @ (other.at - self.at))
+    added: Array | None = None
 
 
 @dataclass(frozen=True)

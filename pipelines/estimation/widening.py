@@ -34,7 +34,8 @@ def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.
         budget = {name: _with_share(shares, source, float(share[name])) for name, shares in budget.items()}
     sqrt_info = estimate.sqrt_info
     if sqrt_info is not None:
-        sqrt_info = marginalised(sqrt_info, estimate.names, columns / estimate.inflations[:, None])
+        rows = [estimate.names.index(name) for name in sqrt_info.names]
+        sqrt_info = marginalised(sqrt_info, (columns / estimate.inflations[:, None])[rows])
     return replace(estimate, covariance=covariance, history=history, budget=budget, sqrt_info=sqrt_info)
 
 
@@ -72,16 +73,17 @@ def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[
     return dict(sorted(whole.items(), key=lambda item: -item[1]))
 
 
-def marginalised(sqrt_info: SqrtInformation, names: Sequence[str], columns: Array) -> SqrtInformation:
-    """Marginalise a unit normal a (m,) out of R (x - S a - at) = d, with S `columns` (n, m) of the names.
+def marginalised(sqrt_info: SqrtInformation, columns: Array) -> SqrtInformation:
+    """Marginalise a unit normal a (m,) out of R (x - S a - at) = d, with S `columns` (n, m).
 
     Column by column: rows whitened by (I + r r')^-1/2, r = R s.
     """
-    for step in columns[[names.index(name) for name in sqrt_info.names]].T:
-        r = sqrt_info.R @ step
+    R, d = sqrt_info.R, sqrt_info.d
+    for step in columns.T:
+        r = R @ step
         square = float(r @ r)
         if square > 0.0:
             k = (1.0 - 1.0 / np.sqrt(1.0 + square)) / square
-            R, d = sqrt_info.R - k * np.outer(r, r @ sqrt_info.R), sqrt_info.d - k * r * float(r @ sqrt_info.d)
-            sqrt_info = replace(sqrt_info, R=R, d=d)
-    return sqrt_info
+            R, d = R - k * np.outer(r, r @ R), d - k * r * float(r @ d)
+    before = [] if sqrt_info.added is None else [sqrt_info.added]
+    return replace(sqrt_info, R=R, d=d, added=np.column_stack([*before, columns]))

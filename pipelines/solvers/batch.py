@@ -12,7 +12,7 @@ would be excluded at one percent.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -110,12 +110,6 @@ class Solved:
     def values(self) -> Values:
         """Values of all variables, weak directions at their priors."""
         return self.posterior.at.values
-
-
-def minimum(compiled: Compiled, levels: Sequence[Level]) -> Solution:
-    """Return the robust minimum at known noise levels, the rejected measurements removed from the system."""
-    engine = apply_levels(compiled.engine, levels)
-    return solve_robust(engine, compiled.initial, compiled.problem.loss).at_inliers()
 
 
 def solve(compiled: Compiled, config: LevenbergConfig = DEFAULT, levels: tuple[Level, ...] | None = None) -> Solved:

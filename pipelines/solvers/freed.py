@@ -1,8 +1,8 @@
-"""Information about numbers that were fixed in the solution: only the states are solved again."""
+"""Graphs linearised about a known solution, some numbers freed or moved: only the states are solved again."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.linear_chain import LinearChain
 from alidade.pipelines.solvers.linearization import Group, Linearization
-from alidade.pipelines.solvers.marginal_likelihood import estimate_levels, unwidened
+from alidade.pipelines.solvers.marginal_likelihood import at_widening, estimate_levels, unwidened, widened
 from alidade.pipelines.solvers.noise_estimation import apply_levels
 from alidade.pipelines.solvers.posterior import moved_to, sqrt_information
 
@@ -45,18 +45,41 @@ def at_solution(freed: Problem, estimate: Estimate) -> tuple[Compiled, Lineariza
     Raises:
         IndeterminateStateError, LinAlgError: the graph does not determine its states.
     """
-    levels = estimate.levels
-    compiled = Compiled.of(freed.at_levels(levels))
+    compiled, engine, values, used = _linearised(freed, estimate)
+    if freed.marginal_likelihood and compiled.engine.is_chain:
+        found = estimate_levels(LinearChain.of(compiled.engine, values), estimate.levels, unwidened(used))
+        engine = apply_levels(compiled.engine, found).counting(used)
+    return compiled, engine, values
+
+
+def information_at(problem: Problem, estimate: Estimate, device: Collection[str]) -> SqrtInformation:
+    """Square-root information of a graph about other values of its numbers than those of its solution.
+
+    Args:
+        problem: the graph that was solved.
+        estimate: its solution, with the values about which the information is to be linear.
+        device: names of the numbers whose priors are set apart.
+
+    Raises:
+        IndeterminateStateError: a state is not determined.
+    """
+    compiled, engine, values, used = _linearised(problem, estimate)
+    if problem.marginal_likelihood and engine.is_chain:
+        chain = LinearChain.of(compiled.engine, values)
+        engine = at_widening(compiled.engine, estimate.levels, widened(chain, estimate.levels, unwidened(used)))
+    return sqrt_information(compiled, engine, values, device)
+
+
+def _linearised(problem: Problem, estimate: Estimate) -> tuple[Compiled, Linearization, Values, list[Mask]]:
+    """Compile a graph; return it with an estimate's noise levels and inliers, its states optimal for the values."""
+    compiled = Compiled.of(problem.at_levels(estimate.levels))
     used, values = _used(compiled.engine.groups, estimate), compiled.initial
     numbers = {q.name: q.prior_mean for q in compiled.problem.quantities}
     numbers |= zip(estimate.names, estimate.values.tolist(), strict=True)
-    engine = apply_levels(compiled.engine, levels).counting(used)
+    engine = apply_levels(compiled.engine, estimate.levels).counting(used)
     for _ in range(_STEPS):
         values = moved_to(compiled, engine, values, numbers)
-    if freed.marginal_likelihood and compiled.engine.is_chain:
-        found = estimate_levels(LinearChain.of(compiled.engine, values), levels, unwidened(used))
-        engine = apply_levels(compiled.engine, found).counting(used)
-    return compiled, engine, values
+    return compiled, engine, values, used
 
 
 def _used(groups: Sequence[Group], estimate: Estimate) -> list[Mask]:

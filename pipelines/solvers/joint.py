@@ -4,25 +4,21 @@ Numbers of the device are one unknown, or one for each recording where they walk
 its own. Each recording's own numbers are eliminated first, so that what is left is as small as the device.
 
     joined = join([first.sqrt_info, second.sqrt_info], rates, days)
-    joined.device(0), joined.own(0)         # the numbers of the first recording, from all recordings
-    joined.others(0)                        # what the others say of the device as it was then
+    joined.all(0)                           # the numbers of the first recording, from all recordings
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from alidade.factors.array import Array
-from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Problem, SqrtInformation
+from alidade.pipelines.estimation.problem import SqrtInformation
 from alidade.pipelines.gaussian_prior import GaussianPrior
-from alidade.pipelines.solvers.batch import minimum
-from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.posterior import fewest, sqrt_information
+from alidade.pipelines.solvers.posterior import fewest
 
 # Two dates are never nearer than this, days.
 _LEAST_DAYS = 1e-6
@@ -99,15 +95,6 @@ class Joined:
     scales: Array
     values: Array
     covariance: Array
-
-    def device(self, recording: int) -> GaussianPrior:
-        """Posterior of the device's numbers as of one recording."""
-        return self._gaussian_prior(recording, self.values, self.covariance)
-
-    def others(self, recording: int) -> GaussianPrior:
-        """Prior for one recording from all other recordings and the device's priors."""
-        rows = [each for i, each in enumerate(self.rows) if i != recording]
-        return self._gaussian_prior(recording, *_solved(rows, self.scales))
 
     def own(self, recording: int) -> GaussianPrior:
         """Posterior of a recording's own numbers, by the joint estimate."""
@@ -189,12 +176,6 @@ class Joined:
         left = b - fitted @ (fitted.T @ b)
         return float(left @ left), len(b) - fitted.shape[1]
 
-    def _gaussian_prior(self, recording: int, values: Array, covariance: Array) -> GaussianPrior:
-        at = np.array(self._places(recording), dtype=np.intp)
-        return GaussianPrior(
-            self.parts[recording].names, values[at], covariance[np.ix_(at, at)], "that of the other recordings"
-        )
-
     def _places(self, recording: int) -> list[int]:
         """Positions among the unknowns of the device's numbers as of a recording."""
         places = {unknown: i for i, unknown in enumerate(self.unknowns)}
@@ -209,17 +190,6 @@ def grown(sigmas: Sequence[float], inflations: Sequence[float]) -> float:
         return 1.0
     own, factors = np.array(found).T
     return float(np.average(factors**2, weights=own**-2.0) ** 0.5)
-
-
-def information_at_levels(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> SqrtInformation:
-    """Square-root information about a problem's numbers, linearised at its solution, for given noise levels.
-
-    Raises:
-        IndeterminateError: a state is not determined.
-    """
-    compiled = Compiled.of(problem.at_levels(levels))
-    solution = minimum(compiled, tuple(levels) or problem.noises)
-    return sqrt_information(compiled, solution.engine, solution.values, device)
 
 
 def join(informations: Sequence[SqrtInformation], rates: Mapping[str, float], days: Sequence[float]) -> Joined:

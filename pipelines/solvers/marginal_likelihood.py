@@ -345,13 +345,13 @@ def _from_above(chain: LinearChain, levels: Sequence[Level]) -> tuple[Level, ...
     return tuple(out) if found else None
 
 
-def _engine_at(linearization: Linearization, found: LikelihoodMaximum) -> Linearization:
-    """Return a linearisation weighted by the noise levels of a likelihood maximum, and widened; outliers left out."""
-    used = [np.isfinite(wide) for wide in found.widening]
-    engine = apply_levels(linearization, found.levels).counting(used)
+def at_widening(linearization: Linearization, levels: Sequence[Level], widening: Widening) -> Linearization:
+    """Return a linearisation weighted by noise levels and widened; outliers left out."""
+    used = [np.isfinite(wide) for wide in widening]
+    engine = apply_levels(linearization, levels).counting(used)
     groups = [
         replace(group, weights=group.all_weights / np.where(own, wide, 1.0)[:, None]) if group.is_measurement else group
-        for group, wide, own in zip(engine.groups, found.widening, used, strict=True)
+        for group, wide, own in zip(engine.groups, widening, used, strict=True)
     ]
     return engine.with_groups(groups)
 
@@ -380,7 +380,7 @@ def solve_likelihood(
     for number in range(_MOST_SOLUTIONS):
         before = found.levels
         found = maximise_likelihood(engine, found, 1 if number else _ROUNDS, from_above=not number)
-        solution = minimize(_engine_at(engine, found), found.values, config)
+        solution = minimize(at_widening(engine, found.levels, found.widening), found.values, config)
         found = replace(found, values=solution.values)
         if deadline.passed() or (number and _settled(found.levels, before)):
             break
@@ -399,7 +399,7 @@ def _for_levels(problem: Problem, known: Compiled, found: LikelihoodMaximum) -> 
     values = _with_parameters(compiled, known, found.values)
     found = LikelihoodMaximum(values, found.levels, unwidened(used))
     # Its first states follow vision's noise, and about these a scale of the gyro's rates would fit noise.
-    engine = _engine_at(compiled.engine, found)
+    engine = at_widening(compiled.engine, found.levels, found.widening)
     starts = [states_first(engine, each) for each in (values, *_attitudes_of_inliers(compiled, used, values))]
     found = replace(found, values=min(starts, key=engine.cost))
     if _correlation_time(found.levels) is not None:

@@ -17,11 +17,12 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_hea
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.sensors import EulerMotion
 from alidade.pipelines.solvers import incremental as online
-from alidade.pipelines.solvers.batch import minimum, solve, solve_batch
+from alidade.pipelines.solvers.batch import solve, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver, solve_incremental
 from alidade.pipelines.solvers.weak_directions import at_prior
 from benchmarks.initialisation import CASES, beginning, drawn_los, followed, made, nees, report, run
+from tests.support.solved import minimum
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35
@@ -177,7 +178,7 @@ def test_a_valley_that_bends_between_bias_and_mount_is_followed_to_its_end(
     settings, _ = CASES["los"]["rest"](seed)
     problem, _ = made("los", settings.model_copy(update=rates), seed)
     compiled = Compiled.of(problem, steps=[step for step in problem.steps(1) if step.time <= 47.0])
-    found = minimum(compiled, problem.noises)
+    found = minimum(compiled)
     assert found.converged, found.message
     assert found.iterations < systems
 

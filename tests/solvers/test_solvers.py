@@ -19,7 +19,7 @@ from alidade.pipelines.estimation.problem import Estimate, Factor, Parameter, Pr
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers import levenberg
-from alidade.pipelines.solvers.batch import minimum, solve_batch
+from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import solve_incremental
@@ -29,6 +29,7 @@ from alidade.pipelines.solvers.window import Keyframes
 from tests.support import chain
 from tests.support.chain import INTERVAL, PARAMETER, PRIOR, Walk
 from tests.support.judged import judge
+from tests.support.solved import minimum
 
 # Slopes of a gyro's bias, rad/s/K.
 WARMING = (1.5e-4, -2e-4, 2.5e-4)
@@ -308,7 +309,7 @@ def test_a_roll_that_pictures_do_not_determine_does_not_swing(duration_s: float,
     scenario = LosScenario(duration_s=duration_s, gyro_rate_hz=200.0, image_rate_hz=50.0)
     problem = los.problem(simulate_los(scenario, seed).data, load_config(los_config(scenario).encode()))
     compiled = Compiled.of(problem)
-    found = minimum(compiled, problem.noises)
+    found = minimum(compiled)
     assert found.iterations <= most
     last = levenberg.minimize(found.engine, found.values, levenberg.LevenbergConfig(cost_tolerance=1e-9))
     assert found.engine.cost(found.values) - last.cost < 0.01**2

@@ -10,10 +10,10 @@ import numpy as np
 
 from alidade.factors.bridge import BoundModel
 from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Step
-from alidade.pipelines.solvers.batch import minimum
 from alidade.pipelines.solvers.engines import ALL, Compiled
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
 from alidade.pipelines.solvers.posterior import Reported
+from tests.support.solved import minimum
 
 # Indices of one recording's variables stay below this.
 _APART = 10_000_000
@@ -91,7 +91,7 @@ def _copy(values: gtsam.Values, key: int, to: int, out: gtsam.Values) -> None:
 def solved(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     """Values and sigmas by name of the problem's solution, steps made until nothing is left of them."""
     compiled = Compiled.of(problem)
-    found = minimum(compiled, problem.noises)
+    found = minimum(compiled)
     found = minimize(found.engine, found.values, LevenbergConfig(cost_tolerance=1e-14))
     reported = Reported.of(compiled, found.values)
     covariance = reported.covariance(reported.root(found.factorization.root).covariance())

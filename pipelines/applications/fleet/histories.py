@@ -55,7 +55,8 @@ def packed(sqrt_info: SqrtInformation) -> str:
     """The square-root information of a recording as text, R and d in triangular form."""
     triangle = np.linalg.qr(np.column_stack([sqrt_info.R, sqrt_info.d])).R
     with io.BytesIO() as stream:
-        np.savez_compressed(stream, **vars(replace(sqrt_info, R=triangle[:, :-1], d=triangle[:, -1])))
+        kept = {name: each for name, each in vars(sqrt_info).items() if name != "added"}
+        np.savez_compressed(stream, **{**kept, "R": triangle[:, :-1], "d": triangle[:, -1]})
         return base64.b64encode(stream.getvalue()).decode()
 
 
