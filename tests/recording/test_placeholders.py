@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import clean, tracked
@@ -131,6 +132,19 @@ def test_readings_of_two_devices_in_turn_are_refused() -> None:
     with pytest.raises(InputError, match=r"axis y alternates between two levels .*two devices"):
         drop_faults("/imu", T_S, RATES * 0.01 + np.array([0.0, 0.2, 0.0]) * (np.arange(1000) % 2)[:, None], {}, "")
     assert len(drop_faults("/imu", T_S, RATES, {}, "rad/s")) == 1000
+
+
+def test_readings_of_two_devices_in_turn_are_refused_when_only_their_mounts_differ() -> None:
+    """By 2 deg, the motion and the noise as of a head; nothing that shakes, nor stamps 9 and 11 ms apart."""
+    rng, n = np.random.default_rng(5), 4000
+    t = 0.01 * np.arange(n) + 0.001 * (np.arange(n) % 2)
+    swings = rng.uniform(0.1, 1.0, 9).reshape(3, 3)[:, None] * t[:, None]
+    rates = np.sin(2.0 * np.pi * swings + rng.uniform(0.0, 6.0, (3, 1, 3))).sum(axis=0)
+    noisy = rates + np.where(t % 20.0 < 2.0, 0.5, 0.01)[:, None] * rng.standard_normal((n, 3))
+    assert len(drop_faults("/imu", t, noisy, {}, "rad/s")) == n
+    turned = noisy @ so3.matrix(so3.exp(np.deg2rad([[0.0, 2.0, 0.0]])))[0].T
+    with pytest.raises(InputError, match=r"alternates between two levels .*two devices"):
+        drop_faults("/imu", t, np.where(np.arange(n)[:, None] % 2, turned, noisy), {}, "rad/s")
 
 
 def _imu_message(stamp_ns: int, frame: str, rate: float) -> object:
