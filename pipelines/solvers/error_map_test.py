@@ -70,8 +70,9 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
 def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float) -> Estimate:
     """Re-estimate with the error map as free parameters, its prior at least as wide as the map's rms, or that rms.
 
-    Directions that are weak `without` the map keep their values. A map that moves a required number by more than its
-    prior's sigma takes that number's place, as where a device hardly turns, and is no error: the estimate stays.
+    Directions that are weak `without` the map keep their values. A map that moves a required number by more than the
+    sigma of its default prior takes that number's place, as where a device hardly turns, and is no error: the estimate
+    stays. Moves beyond a prior known from an earlier calibration are what such errors do.
     """
     compiled, solution, information = _solved(problem, error_map, estimate)
     chi_square, dof, rms = _tested(_rows(information, error_map)[1], error_map, ratio)
@@ -87,7 +88,7 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
     posterior = constrained_solution(compiled, solution)
     at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
     shift = np.array([at[name] for name in estimate.names]) - estimate.values
-    required = {q.name: q.scale for q in problem.quantities if q.required}
+    required = {q.name: q.prior_scale for q in problem.quantities if q.required}
     if any(abs(by) > required.get(name, np.inf) for name, by in zip(estimate.names, shift.tolist(), strict=True)):
         return estimate
     rows, root = _rows(information, error_map)

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import alidade
 from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.finding import Severity
 from benchmarks.altered import Alteration, calibrated, errors
 from datasets.broad import read_trial, to_session
@@ -62,3 +64,15 @@ def test_correlated_errors_of_vision_are_no_slip(
     errors = so3.exp(_correlated(data.vision_t, np.deg2rad(0.5), length, seed))
     found = calibrated(replace(data, vision_wxyz=so3.multiply(data.vision_wxyz, errors)))
     assert not {finding.kind for finding in found.findings if finding.severity > Severity.NOTE} & {"change", "jump"}
+
+
+def test_known_biases_do_not_hide_that_vision_errs_with_the_attitude(shared_data: Path) -> None:
+    """Errors of .2 deg move a bias by two sigmas of what an earlier calibration knew; mounts were 5 sigmas off."""
+    known = b"priors: {gyro_bias_x: {mean: 0.0, sigma: 5.0e-4}, gyro_bias_y: {mean: 0.0, sigma: 5.0e-4}}"
+    data = to_session(read_trial(shared_data / "broad" / "01_undisturbed_slow_rotation_A.mat"), 0, 0.0)
+    session = alidade.open(data, "head", config=load_config(known))
+    faults = session.method.faults
+    start, stop = (np.array([[0.4, 0.6], [0.1, 0.9]]) @ faults.span(data)).tolist()
+    found = replace(session, data=faults.segment(data, start, stop)).calibrate("batch", report=False)
+    assert found.estimate.error_map is not None
+    assert min(found.parameters[f"helmet_mount_{axis}"].sigma for axis in "xyz") > np.deg2rad(0.05)
