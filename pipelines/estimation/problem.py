@@ -423,6 +423,11 @@ class Problem:
         """All calibrated numbers, in reporting order."""
         return tuple(q for p in self.parameters for q in p.quantities)
 
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """Names of the calibrated numbers that are not fixed, in reporting order."""
+        return tuple(q.name for q in self.quantities if q.prior_sigma != 0.0)
+
     def prior_covariance(self, names: Sequence[str], sigmas: Array) -> Array:
         """Prior covariance (m, m) of named numbers, from sigmas (m,) and the correlations of `gaussian_priors`."""
         covariance = np.diag(np.square(sigmas))

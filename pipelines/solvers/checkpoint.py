@@ -29,7 +29,7 @@ from alidade.pipelines.solvers.gtsam_engine import undetermined
 from alidade.pipelines.solvers.smoother import ordering_of
 from alidade.pipelines.solvers.window import Keyframes, Window
 
-_SCHEMA = "alidade.checkpoint/6"
+_SCHEMA = "alidade.checkpoint/7"
 _ROWS = ("history", "attitudes", "moments")
 _INNOVATIONS, _SHARES = "innovations/", "shares/"
 
@@ -143,6 +143,7 @@ class RunState:
     Attributes:
         window: how long states are kept, s or Keyframes; None keeps all.
         levels: noise levels of the last batch solution.
+        estimated: names of the numbers that are not fixed.
         marginal: the Gaussian that the run continues from since everything else was marginalised out; None: never.
         current_keys: parameter key -> variable that holds its value now.
         keyframes: number added.
@@ -158,6 +159,7 @@ class RunState:
 
     window: Window
     levels: tuple[Level, ...]
+    estimated: tuple[str, ...]
     marginal: MarginalState | None = None
     current_keys: dict[int, int] = field(default_factory=dict)
     keyframes: int = 0
@@ -194,6 +196,7 @@ def save_checkpoint(path: Path, run: RunState, identity: Mapping[str, str]) -> N
         "current_keys": list(run.current_keys.items()),
         "keyframes": run.keyframes,
         "walked": sorted(run.walked),
+        "estimated": run.estimated,
         "levels": [asdict(level) for level in run.levels],
         "trouble": run.trouble,
         "rejected_in_a_row": run.gate.rejected_in_a_row,
@@ -258,6 +261,7 @@ def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> RunState
         current_keys={int(key): int(held) for key, held in head["current_keys"]},
         keyframes=head["keyframes"],
         walked=set(head["walked"]),
+        estimated=tuple(head["estimated"]),
         levels=tuple(_level_of(**level) for level in head["levels"]),
         trouble=head["trouble"],
         gate=InnovationGate(families, head["unusable"], head["rejected_in_a_row"]),

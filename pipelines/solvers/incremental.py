@@ -125,7 +125,7 @@ class IncrementalSolver:
     def __init__(self, problem: Problem, window: Window) -> None:
         self.problem = problem
         window = window if window is None or isinstance(window, Keyframes) else float(window)
-        self.state = RunState(window, problem.noises)
+        self.state = RunState(window, problem.noises, problem.estimated)
         self.initialising = True
         self.steps_since: list[Step] = []
         self.moments = 0

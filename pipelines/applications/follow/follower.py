@@ -227,8 +227,8 @@ class Follower:
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """Yield the steps that the run has not processed; begin a new run if the past has changed."""
         belongs = self._identify(session)
-        # A sensor whose first message comes late may bring variables of its own.
-        if self._run is not None and _names(self._run.problem) != _names(problem):
+        # A sensor whose first message comes late may bring variables of its own, and a later motion fix one.
+        if self._run is not None and self._run.problem.estimated != problem.estimated:
             self._run = None
         if problem.steps_after is None or belongs != self._identity or session.epoch_ns != self._epoch_ns:
             self._run = None
@@ -289,7 +289,11 @@ class Follower:
         if not self._resumable or self.settings.checkpoint is None:
             return None
         self._resumable = False
-        run = IncrementalSolver.resumed(problem, load_checkpoint(self.settings.checkpoint, self._identity))
+        state = load_checkpoint(self.settings.checkpoint, self._identity)
+        if state.estimated != problem.estimated:
+            self._say(f"{self.settings.checkpoint}: of a run that estimated other parameters: beginning anew")
+            return None
+        run = IncrementalSolver.resumed(problem, state)
         self._say(f"resumed at {run.time:.1f} s from {self.settings.checkpoint}")
         return run
 
@@ -346,17 +350,12 @@ def _min_delay_ns(session: Session) -> int:
 
 def _is_misplaced(run: IncrementalSolver) -> bool:
     """Whether the estimated clock certainly places pictures of a run far from its keyframes."""
-    keyframes, names = run.problem.keyframes, _names(run.problem)
+    keyframes, names = run.problem.keyframes, [q.name for q in run.problem.quantities]
     if not run.started or keyframes is None or not set(_CLOCK) <= set(names):
         return False
     own = [names.index(name) for name in _CLOCK]
     clock = Clock(keyframes.clock.begun, *run.values()[own].tolist())
     return keyframes.are_far(clock, run.time, run.covariance()[np.ix_(own, own)])
-
-
-def _names(problem: Problem) -> list[str]:
-    """Return the names of all estimated quantities of a graph."""
-    return [quantity.name for quantity in problem.quantities]
 
 
 def _continuable(problem: Problem, session: Session) -> Problem:

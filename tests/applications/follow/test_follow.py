@@ -292,6 +292,15 @@ def test_a_checkpoint_of_another_config_is_refused(whole: Path, tmp_path: Path) 
         _follow(whole, Settings(config=config, checkpoint=checkpoint))
     _, _, said = _follow(whole, Settings(checkpoint=checkpoint))
     assert said[0].startswith("resumed at ")
+    # A parameter that the motion until then fixed: its variance in what was saved is 0.
+    with np.load(checkpoint) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    head = json.loads(str(arrays["head"]))
+    arrays["head"] = np.array(json.dumps({**head, "estimated": head["estimated"][1:]}))
+    with checkpoint.open("wb") as stream:
+        np.savez(stream, **arrays)
+    _, _, said = _follow(whole, Settings(checkpoint=checkpoint))
+    assert said[0].endswith("of a run that estimated other parameters: beginning anew")
 
 
 def test_without_websockets_serving_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
