@@ -234,7 +234,11 @@ def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
         if fall > _FALL * height and _off_quartic(around) > _MISSED * height:
             out[flat] = True
             longest = max(longest, len(flat))
-    return out & (longest >= _PLATEAU and out.sum() >= _LEAST_FLAT * near)
+    if longest < _PLATEAU or out.sum() < _LEAST_FLAT * near:
+        return np.zeros(len(x), dtype=bool)
+    # Nothing is read beyond the end of a range, farther than it wanders: else it was a motion that lingered.
+    beyond = float(np.nanmax(above) - above[out].max())
+    return out & (beyond <= max(float(np.ptp(above[out])), quantum))
 
 
 def _off_quartic(x: Array) -> float:

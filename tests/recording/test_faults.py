@@ -301,6 +301,18 @@ def test_a_coarse_accelerometer_at_rest_between_knocks_is_not_stuck() -> None:
     assert not np.isin(np.arange(stuck.start + 1, stuck.stop), kept).any()
 
 
+@pytest.mark.parametrize(("largest", "lost"), [(13.13, False), (12.97, True)])
+def test_a_motion_that_lingers_below_the_largest_reading_is_no_saturation(largest: float, lost: bool) -> None:
+    """As of a real gyro turned at 750 deg/s: ten readings within .4 %, 1.4 % below the largest one."""
+    t, rng = np.arange(2000) / 286.0, np.random.default_rng(3)
+    rate = 5.0 * np.sin(2.0 * np.pi * 0.7 * t) + 0.005 * rng.standard_normal(len(t))
+    rise = [6.0, 8.0, 9.5, 10.8, 11.7, 12.02, 12.38, 12.6]
+    rate[300:326] = [*rise, *(12.93 + 0.03 * np.sin(np.arange(10.0))), *rise[::-1]]
+    rate[900:917] = [*rise, largest, *rise[::-1]]
+    kept = drop_faults("/imu", t, np.column_stack([rate, rng.standard_normal((len(t), 2))]), {}, "rad/s")
+    assert (len(kept) < len(t)) == lost
+
+
 def test_the_top_of_coarse_readings_is_no_plateau() -> None:
     t = np.arange(0.0, 20.0, 0.01)
     rates = np.rint(8.0 * np.sin(2.0 * np.pi * 0.3 * t[:, None] + [0.0, 1.0, 2.0]))
