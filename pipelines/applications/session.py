@@ -299,7 +299,7 @@ class Session:
             elif report and estimate.solver == "incremental" and published is None:
                 with suppress(InputError):  # that solver needs more data
                     published = self._solve("published", None)
-            stable, change = self._change(estimate, quantities)
+            stable, change = self.change(estimate, quantities)
             conflicts = prior_conflicts(estimate, quantities)
             if estimate.converged and estimate.solver != "published":
                 estimate = with_conflicts(estimate, quantities, conflicts)
@@ -401,7 +401,7 @@ class Session:
         except InputError:  # the method has to have it fixed
             return None
 
-    def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
+    def change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
         """Test for a change; return the test's result, and if there is one a finding with the steps at it."""
         if estimate.solver == "published" or not estimate.converged:
             return None, None

@@ -13,10 +13,12 @@ from alidade.pipelines.config import Settings
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
+from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.reports.calibration import SavedCalibration, load_known, saved, with_covariance
 from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.sentences import sentence
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,6 +34,7 @@ class Validated:
         held: whether the calibration holds; None where the recording cannot say.
         device: what the method says of the calibration's device, bias and the like of this recording re-estimated.
         best: the same of the recording's own calibration: errors that are to be expected of one that holds.
+        within: a finding on a change of the device during the recording.
     """
 
     calibration: SavedCalibration
@@ -42,6 +45,7 @@ class Validated:
     held: CalibrationCheck | None = None
     device: Sequence[Validation] = ()
     best: Sequence[Validation] = ()
+    within: Finding | None = None
 
     def __repr__(self) -> str:
         return f"<Validated {self.calibration.method} on {self.recording}: {self.verdict}>"
@@ -56,7 +60,9 @@ class Validated:
         """Verdict on the calibration: holds, changed, unknown, or same for the recording that it was made of."""
         if self.same_recording:
             return "same"
-        return "unknown" if self.held is None else self.held.verdict
+        if self.held is None:
+            return "unknown"
+        return self.held.verdict if self.within is None else "changed"
 
     @property
     def sentence(self) -> str:
@@ -65,6 +71,8 @@ class Validated:
             return "This is the recording of the calibration, which always agrees with it."
         if self.held is None or self.verdict == "unknown":
             return "The recording does not determine whether the calibration holds."
+        if self.within is not None:
+            return f"The calibration does not hold: {sentence(self.within, self.held.quantities)}"
         steps = self.held.steps
         if self.verdict == "holds":
             return f"The calibration holds: {len(steps)} of {len(steps)} parameters unchanged, to {self._resolution}."
@@ -140,18 +148,23 @@ def validate(
         lost = (*opened.notes, *filter(None, [deadline.stopped()]))
     if found is None:
         return Validated(known, path.name, validations, False, lost)
-    held, estimate, own = found
+    held, estimate, own, within = found
     of_device = walks(chosen, settings, [name for name in own if name in known.parameters])
     fixed = {name: values[name] for name in of_device if name in values}
     others = GaussianPrior(estimate.names, estimate.values, estimate.covariance).given(fixed)
     conditional = dict(zip(others.names, others.mean.tolist(), strict=True))
     device = chosen.report.validate(data, settings, own | conditional | fixed)
     best = chosen.report.validate(data, settings, own)
-    return Validated(known, path.name, validations, False, lost, held, device, best)
+    return Validated(known, path.name, validations, False, lost, held, device, best, within)
 
 
-def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Estimate, dict[str, float]] | None:
-    """Test the calibration against the recording's own estimate; return both, and its values; None if not solved."""
+def _check(
+    session: Session, known: SavedCalibration
+) -> tuple[CalibrationCheck, Estimate, dict[str, float], Finding | None] | None:
+    """Test the calibration against the recording's own estimate, and that for a change; None if it is not solved.
+
+    Return the test, the estimate, its values and a finding on a material change.
+    """
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError
 
@@ -162,7 +175,7 @@ def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck,
     gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:
         with progress.doing("solving"), deadline.of_processor():
-            estimate = solve_batch(problem, device=device)
+            estimate = solve_batch(problem, device=device, steps=True, history=True)
     except IndeterminateError:
         return None
     own = problem.numbers(estimate)
@@ -170,4 +183,7 @@ def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck,
         deadline.passed("the solution of this recording")
         return None
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
-    return check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, inflations), estimate, own
+    held = check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, inflations)
+    _, change = session.change(estimate, problem.quantities)
+    is_found = change is not None and change.kind == "change" and change.severity == Severity.INCONSISTENT
+    return held, estimate, own, change if is_found else None

@@ -92,7 +92,7 @@ class Changes:
         level: p-value of any step.
         limit: from so many sigmas on the first step of a number is more than chance.
         found: the steps that are more than chance, in the order in which they were found.
-        steps: every number's step after every recording, with nothing else changed.
+        steps: every number's step after every recording, with the significant steps in the system.
         together: steps of all numbers at once.
         rates: kind of numbers -> how they walk.
     """
@@ -103,12 +103,6 @@ class Changes:
     steps: tuple[Change, ...] = ()
     together: tuple[Together, ...] = ()
     rates: Mapping[str, Rate] = field(default_factory=dict)
-
-    @property
-    def judged(self) -> tuple[Change, ...]:
-        """Each number's step after each recording; the significant steps are estimated jointly."""
-        found = {(step.name, step.after): step for step in self.found}
-        return tuple(found.get((step.name, step.after), step) for step in self.steps)
 
     @property
     def any(self) -> bool:
@@ -146,11 +140,12 @@ def changes(
         return Changes(level)
     columns, left = columns[:, determined], left[:, determined]
     grown = np.array([inflations.get(name, 1.0) for name, _, _ in questions])
-    steps, limit = _steps(questions, left, residual, grown), _limit(left, level)
+    limit = _limit(left, level)
+    found, steps = _significant_steps(A * joined.scales, b, columns, questions, grown, limit)
     return Changes(
         level,
         limit,
-        tuple(_significant_steps(A * joined.scales, b, columns, questions, grown, limit)),
+        tuple(found),
         tuple(steps),
         tuple(_together(left, residual, questions, grown, level)),
         _rates(left, residual, questions, days, grown),
@@ -185,26 +180,26 @@ def _steps(questions: Sequence[tuple[str, int, int]], left: Array, residual: Arr
 
 def _significant_steps(
     A: Array, b: Array, columns: Array, questions: Sequence[tuple[str, int, int]], grown: Array, limit: float
-) -> list[Change]:
-    """Find significant steps one by one, each estimated with the earlier ones in the system."""
+) -> tuple[list[Change], list[Change]]:
+    """Find significant steps one by one; return them, and all steps in order, each with the others found in the system.
+
+    Of the latter those are left out that no longer differ from what was found.
+    """
     taken: list[int] = []
-    while len(taken) < _MOST_STEPS:
+    while True:
         left, residual = _projected(np.hstack([A, columns[:, taken]]), columns, b)
         open_ = np.flatnonzero((left**2).sum(axis=0) > _ROUNDING * (columns**2).sum(axis=0)).tolist()
-        if not open_:
-            break
         some = _steps([questions[i] for i in open_], left[:, open_], residual, grown[open_])
-        best = int(np.argmax([abs(step.z) for step in some]))
-        if abs(some[best].z) < limit:
+        best = int(np.argmax([abs(step.z) for step in some])) if some else -1
+        if not some or len(taken) == _MOST_STEPS or abs(some[best].z) < limit:
             break
         taken.append(open_[best])
-    # Sizes and sigmas with all of them in the system.
-    found = []
+    each = dict(zip(open_, some, strict=True))
     for i in taken:
         others = [j for j in taken if j != i]
         left, residual = _projected(np.hstack([A, columns[:, others]]), columns[:, [i]], b)
-        found += _steps([questions[i]], left, residual, grown[[i]])
-    return found
+        each[i] = _steps([questions[i]], left, residual, grown[[i]])[0]
+    return [each[i] for i in taken], [each[i] for i in sorted(each)]
 
 
 def _limit(left: Array, level: float) -> float:
@@ -317,7 +312,7 @@ class CalibrationCheck:
     @property
     def steps(self) -> Sequence[Change]:
         """Change of every parameter, with all significant changes estimated jointly."""
-        return self.changes.judged
+        return self.changes.steps
 
     @property
     def matters(self) -> bool:
@@ -345,5 +340,5 @@ def check_calibration(
     rates = dict.fromkeys([*known.names, *of_device], 0.0)
     before = sqrt_information_of(known, [by_name[name].prior_scale for name in known.names])
     joined = join([before, sqrt_info], rates, [0.0, 1.0])
-    asked = {name for name in known.names if by_name[name].judged}
+    asked = {name for name in known.names if by_name[name].required}
     return CalibrationCheck(changes(joined, [0.0, 1.0], inflations, asked), by_name)

@@ -449,5 +449,5 @@ def _steps(changes: Changes, parts: Sequence[PartResult]) -> list[ChangeResult]:
             sigma=step.sigma,
             found=step in changes.found,
         )
-        for step in changes.judged
+        for step in changes.steps
     ]

@@ -97,7 +97,7 @@ def change_table(found: Sequence[History]) -> list[Row]:
             "changed": int(step in history.found),
         }
         for history in found
-        for step in history.changes.judged
+        for step in history.changes.steps
     ]
 
 
@@ -126,7 +126,7 @@ def _red(each: Sequence[History]) -> list[History]:
     """Return the histories without steps that most units make as well, of parameters that vary by nature."""
     made: dict[tuple[str, str], list[Change]] = {}
     for history in each:
-        for step in history.changes.judged:
+        for step in history.changes.steps:
             made.setdefault((history.method, step.name), []).append(step)
     usual = {}
     for key, steps in made.items():

@@ -15,7 +15,7 @@ from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.diagnose import misfits
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
-from alidade.pipelines.estimation.finding import Finding, Motion, by_severity, status
+from alidade.pipelines.estimation.finding import Finding, Motion, Severity, by_severity, status
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.solvers.incremental import IncrementalSolver
@@ -192,8 +192,11 @@ class Watch:
         if not run.started or now == self._seen:
             return
         self._seen = now
-        found = stability(run.estimate(), run.problem.quantities)
-        self.change = found if found is not None and found.changed else None
+        quantities = run.problem.quantities
+        found = stability(run.estimate(), quantities)
+        finding = None if found is None or not found.changed else change_finding(found, {}, quantities)
+        # What moves nothing that is required is a note of the result, and in its sigmas.
+        self.change = found if finding is not None and finding.severity > Severity.NOTE else None
 
 
 def _is_estimated(q: Quantity) -> bool:
