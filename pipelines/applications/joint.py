@@ -51,13 +51,15 @@ from alidade.pipelines.reports.joint_report import recording_blocks
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import PartParameter, PartResult
 from alidade.pipelines.solvers.freed import information_at
-from alidade.pipelines.solvers.joint import Joined, grown, join
+from alidade.pipelines.solvers.joint import LEAST_DAYS, Joined, grown, join
 
 # The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
 # square), and those that were not tried are foreseen to; so many times they are tried.
 _STAYS, _MOST_PASSES = 1e-2, 6
 # Where chi-square between the recordings is so many times its freedoms the device is not one: no need to be exact.
 _FAR_APART = 10.0
+# A number that stepped walks from recording to recording by so many times the step.
+_OWN = 10.0
 # So many recordings are named in a sentence.
 _MOST_NAMED = 3
 _NO_SOLUTION = "linearised at the joint estimate the recordings lead elsewhere again and again"
@@ -162,9 +164,13 @@ def calibrate_together(
         known = _walks(alone, rates)
         rates = {name: known[kind(name)].rate if kind(name) in known else rate for name, rate in rates.items()}
         joined, step = _joined(method, alone, rates)
+        changed = _changes(alone, joined)
+        if changed.found:
+            joined, step = _joined(method, alone, {**rates, **_freed(changed, alone)})
         newest = alone[-1]
         problem = method.graph(newest.loaded(), newest.calibration.config)
-        return _calibration(problem, method, alone, joined, step, known)
+        changed = replace(changed, rates={**changed.rates, **known})
+        return _calibration(problem, method, alone, joined, step, changed)
 
 
 def _one_device(alone: Sequence[Alone]) -> Method:
@@ -236,6 +242,15 @@ def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
     return changes(joined, [each.day for each in alone], inflations)
 
 
+def _freed(changed: Changes, alone: Sequence[Alone]) -> dict[str, float]:
+    """Return the numbers that stepped -> a random-walk rate, SI per root day, that leaves each recording its own.
+
+    About what did not change: a mean of both sides would be made up for by all other numbers.
+    """
+    days = min(max(after.day - before.day, LEAST_DAYS) for before, after in pairwise(alone))
+    return {step.name: _OWN * abs(step.size) / days**0.5 for step in changed.found}
+
+
 def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
     """Return the joint estimate, and by how many sigmas its last iteration moved it."""
     sqrt_info, days = [each.sqrt_info for each in alone], [each.day for each in alone]
@@ -282,7 +297,7 @@ def _calibration(
     alone: Sequence[Alone],
     joined: Joined,
     step: float,
-    known: Mapping[str, Rate],
+    changed: Changes,
 ) -> Calibration:
     """Return the joint estimate as a calibration of the device at the last recording, with that one's parameters."""
     last = len(alone) - 1
@@ -316,8 +331,6 @@ def _calibration(
         budget={name: _with_extra(shares[name], names.index(name), covariance, extra) for name in shares},
     )
     parts = [_part(each, joined, i) for i, each in enumerate(alone)]
-    changed = _changes(alone, joined)
-    changed = replace(changed, rates={**changed.rates, **known})
     return Calibration(
         method=method,
         problem=problem,
@@ -373,9 +386,8 @@ def _findings(
     if not estimate.converged:
         return diagnose(replace(estimate, message=_NO_SOLUTION), quantities)
     own = (_of_recording(each.calibration) for each in alone)
-    found = [*diagnose(estimate, quantities, problem.advice), *(each for each in own if each is not None)]
     steps = list(_device_changes(changed, alone))
-    found += steps
+    found = [*steps, *diagnose(estimate, quantities, problem.advice), *(each for each in own if each is not None)]
     value, dof = joined.disagreement
     if not steps and dof >= 1 and value > Fit.of(value, float(dof)).high:
         found.append(_disagreement([each.name for each in alone], (), value, dof))

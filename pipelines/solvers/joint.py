@@ -21,7 +21,7 @@ from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.solvers.posterior import fewest
 
 # Two dates are never nearer than this, days.
-_LEAST_DAYS = 1e-6
+LEAST_DAYS = 1e-6
 # Of what recordings say of the device, directions with a sigma beyond so many times the priors' are not compared.
 _FAINT = 1e4
 
@@ -226,7 +226,7 @@ def _walks(places: Mapping[Unknown, int], rates: Mapping[str, float], days: Sequ
     for name, rate in rates.items():
         for before, after in pairwise([i for i in range(len(days)) if rate and (name, i) in places]):
             row = np.zeros((1, len(places)))
-            sigma = rate * max(abs(days[after] - days[before]), _LEAST_DAYS) ** 0.5
+            sigma = rate * max(abs(days[after] - days[before]), LEAST_DAYS) ** 0.5
             row[0, [places[name, before], places[name, after]]] = -1.0 / sigma, 1.0 / sigma
             rows.append(row)
     A = np.concatenate(rows)

@@ -47,7 +47,7 @@ from alidade.pipelines.recording.container import combined_sha256, file_sha256
 from alidade.pipelines.reports.calibration import load_known
 
 if TYPE_CHECKING:
-    from alidade.pipelines.estimation.problem import SqrtInformation
+    from alidade.pipelines.estimation.problem import Quantity, SqrtInformation
     from alidade.pipelines.reports.result import Calibration
 
 
@@ -301,12 +301,17 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
                 "sigma": p.sigma,
                 "unit": p.unit,
                 "require": p.require,
-                "verdict": p.observability,
+                "verdict": p.observability or _up_to_factor(calibration.quantities[p.name], p.sigma),
                 "inflation": p.inflation,
             }
             for p in calibration.parameters.values()
         },
     }
+
+
+def _up_to_factor(quantity: Quantity, sigma: float) -> str | None:
+    """Verdict on a number that is judged with others, up to their common factor; None of what has no requirement."""
+    return "observable" if quantity.required and quantity.determined(sigma) else None
 
 
 def _sqrt_information(calibration: Calibration) -> SqrtInformation:
