@@ -295,6 +295,13 @@ def test_recordings_that_are_of_another_device_are_told() -> None:
     assert step["parameter"] == "theta_y"
     assert step["step"] < -4.0 * step["sigma"]
     assert "Change of the device between arrays and arrays: theta_y by -" in found.headline
+    # What is reported is the device at the last recording, not a mean of both sides.
+    last = opened[-1].calibrate("batch", report=False).parameters
+    for axis in "xyz":
+        p = found.parameters[f"theta_{axis}"]
+        assert abs(p.value - last[p.name].value) < 3.0 * last[p.name].sigma
+    assert found.parameters["theta_y"].sigma == pytest.approx(last["theta_y"].sigma, rel=0.05)
+    assert {finding.kind for finding in found.findings if finding.severity > Severity.NOTE} == {"device_change"}
 
 
 @pytest.mark.slow

@@ -70,6 +70,20 @@ def test_two_steps_are_two() -> None:
     assert found["arm_mount_y", 3].size == pytest.approx(8.0, abs=4.0 * found["arm_mount_y", 3].sigma)
 
 
+def test_what_did_not_change_is_estimated_beside_what_did() -> None:
+    """Where two numbers are known by their sum, a step of one would be most of a step of the other."""
+    rng, R = np.random.default_rng(4), np.eye(4)
+    R[0, 1] = 0.9
+    devices = [np.array([0.0, 40.0 * (i >= 4), 0.0, 0.0]) for i in range(8)]
+    told = [replace(one(rng, np.zeros(3)), R=R, d=R @ device) for device in devices]
+    found = of(told)
+    assert [(step.name, step.after) for step in found.found] == [("arm_mount_y", 3)]
+    others = [step.z for step in found.steps if step not in found.found]
+    assert len(others) > 10
+    assert np.abs(others).max() < 1e-3
+    assert found.found[0] in found.steps
+
+
 def test_coloured_noise_makes_steps_less_sure() -> None:
     sqrt_info = history(np.random.default_rng(2), 6, step=5.0)
     days = [float(i) for i in range(6)]

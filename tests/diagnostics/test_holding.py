@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 
 from alidade import calibrate, simulate
 from alidade import open as opened
+from alidade.factors import so3
 from alidade.pipelines.applications.sharing import device_prior, walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.device_changes import LEVEL, CalibrationCheck, check_calibration
@@ -94,6 +97,33 @@ def test_verdicts_are_as_sure_as_stated() -> None:
     assert np.mean(noticed) > 0.75
     surely = [one(0.01, 1e-3, 4.5 * step.sigma, rng).verdict == "changed" for _ in range(100)]
     assert np.mean(surely) > 0.97
+
+
+def test_numbers_judged_up_to_a_factor_are_tested() -> None:
+    """As a magnetometer's with `require: {mag_shape: ...}`: none has a verdict of its own, all may change."""
+    known = GaussianPrior(("b",), np.zeros(1), np.array([[1e-6]]), "march")
+    quantity = Quantity("b", "T", 0.1, 0.1, 1e-2, relative=True)
+    shifted = SqrtInformation(
+        ("b",), np.array([0.01]), np.eye(1) * 1e3, np.zeros(1), np.eye(1) * 10.0, np.array([-0.1]), np.ones(1)
+    )
+    assert check_calibration(known, shifted, (quantity,), {}).verdict == "changed"
+
+
+def test_it_does_not_hold_for_a_recording_in_which_it_slips(tmp_path: Path, alidade: Command) -> None:
+    """By three degrees at two thirds of it."""
+    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0, "duration_s": 30.0}
+    scenario = method("head").settings("head_mounts").model_dump() | rates
+    opened(simulate("head", scenario, seed=1)).calibrate("batch", report=False).write(tmp_path)
+    later = simulate("head", scenario, seed=2)
+    wxyz = later.data.vision_wxyz.copy()
+    wxyz[later.data.vision_t > 20.0] = so3.multiply(
+        wxyz[later.data.vision_t > 20.0], so3.exp(np.deg2rad([3.0, 0.0, 0.0]))
+    )
+    recording = tmp_path / "later.mcap"
+    method("head").write(recording, replace(later, data=replace(later.data, vision_wxyz=wxyz)))
+    done = alidade("validate", recording, "--calibration", tmp_path / "calibration.yaml", "--out", tmp_path / "v")
+    assert done.code == 4
+    assert re.search(r"does not hold: Change at (19|20) s: helmet_mount_x by ", done.out)
 
 
 def test_a_recording_that_says_nothing_gives_no_verdict() -> None:
