@@ -3,9 +3,8 @@
 Patent on joint calibration of an inertial measurement unit and a geomagnetic sensor with an AprilTag hexahedron: in
 every static pose the chain of reference, camera and tags gives the attitude, this the nominal specific force, earth
 rate and field in the body, and nominal = K raw + b is solved by least squares. The local-level frame is
-North-East-Down, and the earth rate is written (0, 0, 7.292115e-5 rad/s) in it, whatever the latitude; `as_published`
-False puts the right one in. At rest a gyro feels nothing but that, so that K of a gyro with noise comes out near 0.
-Mounts are taken as exact.
+North-East-Down, and the earth rate is written (0, 0, 7.292115e-5 rad/s) in it, whatever the latitude. At rest a
+gyro feels nothing but that, so that K of a gyro with noise comes out near 0. Mounts are taken as exact.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.array import Array, Index
-from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
+from alidade.factors.earth import EARTH_RATE, gravity
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem, Residuals
 from alidade.pipelines.methods.cube.recording import CubeConfig, CubeData, local_field, recorded
@@ -79,7 +78,7 @@ def regression(raw: Array, nominal: Array) -> TriadRegression:
     return TriadRegression(solution[:3].T, solution[3], residual_covariance, covariance)
 
 
-def nominal_vectors(data: CubeData, config: Config, nRb: Array, as_published: bool = True) -> dict[str, Array]:
+def nominal_vectors(data: CubeData, config: Config, nRb: Array) -> dict[str, Array]:
     """Nominal specific force, earth rate and field (if its place is known) in the body at the attitudes nRb (P, 4).
 
     Computed in North-East-Down, as published.
@@ -90,10 +89,9 @@ def nominal_vectors(data: CubeData, config: Config, nRb: Array, as_published: bo
     if data.latitude is None:
         raise InputError("the place on the earth is unknown: record /reference/fix, or give latitude_deg in the config")
     body_from_ned = so3.matrix(so3.inverse(nRb)) @ _NED_FROM_ENU.T
-    earth = np.array([0.0, 0.0, EARTH_RATE]) if as_published else _NED_FROM_ENU @ earth_rate(data.latitude)
     vectors = {
         "accel": np.array([0.0, 0.0, -float(gravity(data.latitude, data.height))]),
-        "gyro": earth,
+        "gyro": np.array([0.0, 0.0, EARTH_RATE]),
     }
     if data.longitude is not None and data.mag is not None:
         vectors["mag"] = _NED_FROM_ENU @ local_field(data, config)
