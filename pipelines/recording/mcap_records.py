@@ -142,9 +142,9 @@ def decompress(packed: bytes | memoryview, compression: str, size: int) -> bytes
     return packed
 
 
-def iter_records(data: memoryview, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, int, int]]:
-    """Yield records in [start, stop) as (opcode, start, end). Raises DamagedError if records do not fill that range."""
-    stop = len(data) if stop is None else stop
+def iter_records(data: memoryview) -> Iterator[tuple[int, int, int]]:
+    """Yield records as (opcode, start, end). Raises DamagedError if they do not fill the data."""
+    start, stop = 0, len(data)
     while start < stop:
         opcode, length = HEAD.unpack_from(data, start) if start + HEAD.size <= stop else (0, stop)
         end = start + HEAD.size + length
