@@ -10,6 +10,7 @@ import numpy as np
 
 from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
+from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise, Source
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.noises import NOISES, NoiseSpec
@@ -66,6 +67,15 @@ def stated(
     known = config.noise_known if given is not None or config.noise_known == 0.0 else ROUGHLY
     of = None if rows is None else tuple(rows)
     return Noise(own.name, figure, source, known, tuple(families), of, own=None if own.name in NOISES else own)
+
+
+def refuse_gyro_scale(method: str, config: Config) -> None:
+    """Raise InputError for noise.gyro_scale, of a method that estimates the gyro's scale."""
+    if figure := config.noise.gyro_scale:
+        raise InputError(
+            f"noise.gyro_scale: {method} estimates the gyro's scale; write sensors: {{gyro: {{scale: {figure:g}, "
+            f"skew: {figure:g}}}}} instead"
+        )
 
 
 def repeatability(sensor: str, config: Config, family: str) -> Level:

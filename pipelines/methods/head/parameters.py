@@ -9,7 +9,6 @@ import gtsam
 
 from alidade.factors.attitude import PICTURE_ERRORS
 from alidade.factors.earth import EARTH_RATE
-from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.parameters import (
     CLOCK_SKEW,
     DEAD_BAND,
@@ -27,6 +26,7 @@ from alidade.pipelines.estimation.parameters import (
 )
 from alidade.pipelines.estimation.problem import Parameter, rotation_vector_coordinates
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.methods.noise import refuse_gyro_scale
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.settings import Config
 
@@ -117,13 +117,7 @@ class HeadParameters:
             all_around: whether vision shows the helmet turned by half a turn: no scale of its angles but 1 is
                 continuous there, so that it is fixed unless the config says something of it.
         """
-        if config.noise.gyro_scale:
-            figure = config.noise.gyro_scale
-            raise InputError(
-                f"noise.gyro_scale: head estimates the gyro's scale; write sensors: {{gyro: {{scale: {figure:g}, "
-                f"skew: {figure:g}}}}} instead"
-            )
-
+        refuse_gyro_scale("head", config)
         unscaled = all_around or config.vision.kind == "mocap"
         if unscaled and "scale" not in config.sensors.camera.model_fields_set:
             config = config.model_copy(update={"priors": {"vision_scale": 0.0, **config.priors}})

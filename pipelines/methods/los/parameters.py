@@ -28,6 +28,7 @@ from alidade.pipelines.estimation.parameters import (
 from alidade.pipelines.estimation.problem import Parameter
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods.los.recording import JOINTS
+from alidade.pipelines.methods.noise import refuse_gyro_scale
 from alidade.pipelines.methods.temperature import GYRO_SLOPE
 from alidade.pipelines.settings import Config
 
@@ -115,12 +116,7 @@ class LosParameters:
             drivers: SENSITIVITY, GYRO_SLOPE and DEAD_BAND, in this order, where the gyro's IMU has their causes.
             stamp_sigma: s, how well the stamps are known.
         """
-        if config.noise.gyro_scale:
-            figure = config.noise.gyro_scale
-            raise InputError(
-                f"noise.gyro_scale: los estimates the gyro's scale; write sensors: {{gyro: {{scale: {figure:g}, "
-                f"skew: {figure:g}}}}} instead"
-            )
+        refuse_gyro_scale("los", config)
         check_parameters(PARAMETERS, config)
         given = [each.name for each in AZIMUTH_ZEROS if each.name in config.priors]
         if len(given) == 1:
