@@ -52,10 +52,8 @@ def _pictures(camera: Camera, case: tuple[float, float, float]) -> list[tuple[Pi
     return out
 
 
-def corner_errors() -> Iterator[Ratio]:
+def corner_errors(camera: Camera) -> Iterator[Ratio]:
     """RMS error, px per axis, over that of OpenCV's best way to find corners."""
-    K = np.array([[600.0, 0, 320.3], [0, 605.0, 239.1], [0, 0, 1]])
-    camera = Camera(640, 480, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))
     methods = (cv2.aruco.CORNER_REFINE_NONE, cv2.aruco.CORNER_REFINE_SUBPIX, cv2.aruco.CORNER_REFINE_APRILTAG)
     detectors = [_aruco(method) for method in methods]
     for name, case in _CASES.items():
@@ -66,10 +64,8 @@ def corner_errors() -> Iterator[Ratio]:
         yield Ratio(f"detection.error.{name}", compared, ours / best)
 
 
-def hard_tags() -> Ratio:
+def hard_tags(camera: Camera) -> Ratio:
     """Small, dark, blurred and noisy tags found, over those that OpenCV finds by three windows, its default."""
-    K = np.array([[600.0, 0, 320.3], [0, 605.0, 239.1], [0, 0, 1]])
-    camera = Camera(640, 480, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))
     renderer, plain, ours, theirs = Renderer(camera), _aruco(cv2.aruco.CORNER_REFINE_NONE), 0, 0
     for k in range(_HARD):
         rng = np.random.default_rng(k)
@@ -132,5 +128,7 @@ def run() -> Iterator[Ratio]:
         tolerance=0.02,
         wanted=1.02,
     )
-    yield from corner_errors()
-    yield hard_tags()
+    K = np.array([[600.0, 0, 320.3], [0, 605.0, 239.1], [0, 0, 1]])
+    camera = Camera(640, 480, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))
+    yield from corner_errors(camera)
+    yield hard_tags(camera)
