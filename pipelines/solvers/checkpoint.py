@@ -240,7 +240,7 @@ def load_checkpoint(path: Path, identity: Mapping[str, str]) -> RunState:
     except OSError as error:
         raise InputError(f"{path}: the checkpoint cannot be read ({error.strerror or error}); delete it") from error
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError, RuntimeError) as error:
-        raise InputError(f"{path}: no checkpoint, or a damaged one ({error}); delete it") from error
+        raise InputError(f"{path}: no checkpoint, or a damaged one; delete it") from error
 
 
 def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> RunState:
