@@ -142,7 +142,8 @@ def _check_one_device(topic: str, values: Array, unit: str) -> None:
 def _alternation(values: Array) -> tuple[Array, Array, Array]:
     """Alternating part a + B x of readings (N, k) in p places: chi-square (p,), its rms (p, k), that of x (p,).
 
-    What alternates with the rate of x alone is the stamps.
+    The rms is of what the first half of a place predicts for the second, as it does not of a vibration at nearly half
+    the sampling rate. What alternates with the rate of x alone is the stamps.
     """
     n = min(_IN_A_ROW, len(values) - 2)
     first = np.linspace(0, len(values) - 2 - n, min(_PLACES, (len(values) - 2) // n)).astype(np.intp)
@@ -158,8 +159,11 @@ def _alternation(values: Array) -> tuple[Array, Array, Array]:
     explained = (parts[:, change.shape[2] :] ** 2).sum(axis=1)
     left = ((turned**2).sum(axis=1) - (parts**2).sum(axis=1)) / max(n - columns.shape[2], 1)
     squares = (_OF_WHITE * explained / np.maximum(left, 1e-300)).sum(axis=1)
+    half, own = n // 2, slice(change.shape[2], None)
+    known = (np.linalg.pinv(columns[:, :half]) @ turned[:, :half])[:, own]
+    predicted = (turned[:, half:] * (columns[:, half:, own] @ known)).mean(axis=1)
     size = np.sqrt((level**2).mean(axis=1)).max(axis=1)
-    return squares, np.sqrt(explained / n), np.maximum(size, 1e-300)
+    return squares, np.sqrt(np.maximum(predicted, 0.0)), np.maximum(size, 1e-300)
 
 
 def _spikes(x: Array) -> Mask:

@@ -142,6 +142,10 @@ def test_readings_of_two_devices_in_turn_are_refused_when_only_their_mounts_diff
     rates = np.sin(2.0 * np.pi * swings + rng.uniform(0.0, 6.0, (3, 1, 3))).sum(axis=0)
     noisy = rates + np.where(t % 20.0 < 2.0, 0.5, 0.01)[:, None] * rng.standard_normal((n, 3))
     assert len(drop_faults("/imu", t, noisy, {}, "rad/s")) == n
+    # Motors at nearly half the sampling rate, from 0 to 3 Hz beside it.
+    phase = np.pi * np.arange(n) + 2.0 * np.pi * np.cumsum(0.01 * (1.5 + 1.5 * np.sin(0.4 * t)))
+    shaken = noisy + 0.3 * np.sin(phase[:, None] + [0.0, 1.0, 2.0])
+    assert len(drop_faults("/imu", t, shaken, {}, "rad/s")) == n
     turned = noisy @ so3.matrix(so3.exp(np.deg2rad([[0.0, 2.0, 0.0]])))[0].T
     with pytest.raises(InputError, match=r"alternates between two levels .*two devices"):
         drop_faults("/imu", t, np.where(np.arange(n)[:, None] % 2, turned, noisy), {}, "rad/s")
