@@ -31,6 +31,7 @@ from alidade.pipelines.recording.checks import (
     clean,
     nanoseconds,
     take_rows,
+    unit_quaternions,
 )
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.shapes import Rows, as_dates, rows_by_name
@@ -326,6 +327,9 @@ def _checked(method: Method, data: Any) -> Any:
             if len(lost):
                 more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
                 raise InputError(f"arrays: {name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
+            if rows[name].are_quaternions:
+                with _naming_arrays():
+                    arrays[name] = unit_quaternions(name, t, values)
         if not (np.diff(t) > 0.0).all():  # the rows are sorted, and some dropped, as those of a file are
             each = (np.nan_to_num(arrays[name]).reshape(len(t), -1) for name in names)
             with _naming_arrays():

@@ -395,17 +395,16 @@ def _findings(
     return by_severity(found)
 
 
-# Notes on one recording that the joint estimate, which has no residuals, cannot have.
-_OWN_NOTES = ("rejection", "change")
+# Findings on one recording that the joint estimate, which has no residuals, cannot have.
+_OWN_NOTES = ("rejection", "change", "jump")
 
 
 def _of_recording(calibration: Calibration) -> Finding | None:
-    """Return a finding on what is inconsistent in one recording by itself, and on its residuals; None without any."""
+    """Return a finding on what one recording finds by itself: inconsistent, or on its residuals; None without any."""
     own = [
         finding
         for finding in calibration.findings
-        if finding.severity == Severity.INCONSISTENT
-        or (finding.severity == Severity.NOTE and finding.kind in _OWN_NOTES)
+        if finding.severity == Severity.INCONSISTENT or finding.kind in _OWN_NOTES
     ]
     if not own:
         return None

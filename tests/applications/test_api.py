@@ -178,6 +178,8 @@ def _spoilt(values: Any, *at: int) -> Any:
 @pytest.mark.parametrize(
     ("name", "spoil", "message"),
     [
+        ("vision_wxyz", lambda q: 1.5 * q, r"vision_wxyz: the quaternion at 0\.\d+ s has norm 1.5 \(and \d+ more\)"),
+        ("vision_wxyz", np.zeros_like, r"vision_wxyz: the quaternion at 0\.\d+ s is zero \(and \d+ more\)"),
         ("head_gyro", lambda w: _spoilt(w, 3, 1), "head_gyro is not finite at 0.030000 s; leave out such rows"),
         (
             "head_gyro",
