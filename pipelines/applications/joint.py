@@ -59,7 +59,7 @@ _STAYS, _MOST_PASSES = 1e-2, 6
 # Where chi-square between the recordings is so many times its freedoms the device is not one: no need to be exact.
 _FAR_APART = 10.0
 # A number that stepped walks from recording to recording by so many times the step.
-_OWN = 10.0
+_FREELY = 10.0
 # So many recordings are named in a sentence.
 _MOST_NAMED = 3
 _NO_SOLUTION = "linearised at the joint estimate the recordings lead elsewhere again and again"
@@ -166,7 +166,7 @@ def calibrate_together(
         joined, step = _joined(method, alone, rates)
         changed = _changes(alone, joined)
         if changed.found:
-            joined, step = _joined(method, alone, {**rates, **_freed(changed, alone)})
+            joined, step = _joined(method, alone, {**rates, **_rates_of_stepped(changed, alone)})
         newest = alone[-1]
         problem = method.graph(newest.loaded(), newest.calibration.config)
         changed = replace(changed, rates={**changed.rates, **known})
@@ -242,13 +242,13 @@ def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
     return changes(joined, [each.day for each in alone], inflations)
 
 
-def _freed(changed: Changes, alone: Sequence[Alone]) -> dict[str, float]:
-    """Return the numbers that stepped -> a random-walk rate, SI per root day, that leaves each recording its own.
+def _rates_of_stepped(changed: Changes, alone: Sequence[Alone]) -> dict[str, float]:
+    """Return random-walk rates, SI per root day, that let each number that stepped differ freely between recordings.
 
     About what did not change: a mean of both sides would be made up for by all other numbers.
     """
     days = min(max(after.day - before.day, LEAST_DAYS) for before, after in pairwise(alone))
-    return {step.name: _OWN * abs(step.size) / days**0.5 for step in changed.found}
+    return {step.name: _FREELY * abs(step.size) / days**0.5 for step in changed.found}
 
 
 def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
@@ -396,7 +396,7 @@ def _findings(
 
 
 # Findings on one recording that the joint estimate, which has no residuals, cannot have.
-_OWN_NOTES = ("rejection", "change", "jump")
+_OWN_KINDS = ("rejection", "change", "jump")
 
 
 def _of_recording(calibration: Calibration) -> Finding | None:
@@ -404,7 +404,7 @@ def _of_recording(calibration: Calibration) -> Finding | None:
     own = [
         finding
         for finding in calibration.findings
-        if finding.severity == Severity.INCONSISTENT or finding.kind in _OWN_NOTES
+        if finding.severity == Severity.INCONSISTENT or finding.kind in _OWN_KINDS
     ]
     if not own:
         return None

@@ -161,7 +161,7 @@ def validate(
 def _check(
     session: Session, known: SavedCalibration
 ) -> tuple[CalibrationCheck, Estimate, dict[str, float], Finding | None] | None:
-    """Test the calibration against the recording's own estimate, and that for a change; None if it is not solved.
+    """Test an earlier calibration on a recording, and that for a change of the device; None if it is not solved.
 
     Return the test, the estimate, its values and a finding on a material change.
     """

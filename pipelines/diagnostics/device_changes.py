@@ -181,9 +181,10 @@ def _steps(questions: Sequence[tuple[str, int, int]], left: Array, residual: Arr
 def _significant_steps(
     A: Array, b: Array, columns: Array, questions: Sequence[tuple[str, int, int]], grown: Array, limit: float
 ) -> tuple[list[Change], list[Change]]:
-    """Find significant steps one by one; return them, and all steps in order, each with the others found in the system.
+    """Find the significant steps of a device between recordings, one by one; return these, and all steps by date.
 
-    Of the latter those are left out that no longer differ from what was found.
+    Each is estimated with the others found in the system. Of all steps those are left out that no longer differ from
+    what was found.
     """
     taken: list[int] = []
     while True:

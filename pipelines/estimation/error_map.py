@@ -227,6 +227,6 @@ class FoundMap:
         return replace(out, values=out.values + self.shift, sqrt_info=sqrt_info)
 
     def moved(self, sqrt_info: SqrtInformation) -> SqrtInformation:
-        """Shift a recording's information, made without the map."""
+        """Shift a recording's square-root information, made without the map, by the map's correction of its numbers."""
         shift = dict(zip(self.names, self.shift.tolist(), strict=True))
         return replace(sqrt_info, at=sqrt_info.at + [shift[name] for name in sqrt_info.names])

@@ -74,7 +74,9 @@ def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[
 
 
 def marginalised(sqrt_info: SqrtInformation, columns: Array) -> SqrtInformation:
-    """Marginalise a unit normal a (m,) out of R (x - S a - at) = d, with S `columns` (n, m).
+    """Add errors S a, a (m,) unit normal, S `columns` (n, m), to square-root information R (x - at) = d on numbers x.
+
+    They are marginalised out of R (x - S a - at) = d.
 
     Column by column: rows whitened by (I + r r')^-1/2, r = R s.
     """

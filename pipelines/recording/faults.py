@@ -36,9 +36,8 @@ _NEAR_END, _BRIEFLY, _FALL, _MISSED, _PLATEAU, _LEAST_FLAT = 0.02, 1.0, 8.0, 2.0
 _SMALLEST_RANGE = {"m/s^2": 15.0, "T": 8e-5}
 # Readings of two devices in turn: x_k + (-1)^k (a + B x_k), at rest by their biases, in motion by their mounts. So many
 # readings in a row are looked at, in so many places; in most of them a + B x is no noise (of twelve numbers chi-square
-# is above 64 once in 1e8) and, rms, more than this share of the readings: devices a degree apart. Real sensors, 17: at
-# most 19 and .005; the same with their like in turn, 2 deg apart: 158 and more, .01 to .016 but for gyros mostly at
-# rest, whose accelerometers do.
+# is above 64 once in 1e8) and, rms, more than this share of the readings: devices a degree apart. Of the
+# sensors of BROAD, 12: at most 13 and .0013; the same with their like in turn, 2 deg apart: above 9,000 and .0127.
 _IN_A_ROW, _PLACES, _ALTERNATING, _APART = 512, 64, 64.0, 0.007
 # Variance of a reading less the mean of its neighbours, over 2, as a share of what the mean of many in turn has.
 _ALTERNATE_SAMPLES, _OF_WHITE = 100, 0.375
@@ -140,7 +139,9 @@ def _check_one_device(topic: str, values: Array, unit: str) -> None:
 
 
 def _alternation(values: Array) -> tuple[Array, Array, Array]:
-    """Alternating part a + B x of readings (N, k) in p places: chi-square (p,), its rms (p, k), that of x (p,).
+    """Return how far readings x (N, k) alternate by a + B x from one to the next, in p places of the record.
+
+    Of each place: chi-square (p,), the alternation's rms (p, k), and that of x (p,).
 
     The rms is of what the first half of a place predicts for the second, as it does not of a vibration at nearly half
     the sampling rate. What alternates with the rate of x alone is the stamps.
@@ -156,10 +157,11 @@ def _alternation(values: Array) -> tuple[Array, Array, Array]:
     most = _SPIKE * np.median(np.abs(turned), axis=1, keepdims=True)  # spikes and knocks alternate by themselves
     turned = np.clip(turned, -most, most)
     parts = np.swapaxes(np.linalg.qr(columns).Q, 1, 2) @ turned
-    explained = (parts[:, change.shape[2] :] ** 2).sum(axis=1)
+    own = slice(change.shape[2], None)
+    explained = (parts[:, own] ** 2).sum(axis=1)
     left = ((turned**2).sum(axis=1) - (parts**2).sum(axis=1)) / max(n - columns.shape[2], 1)
     squares = (_OF_WHITE * explained / np.maximum(left, 1e-300)).sum(axis=1)
-    half, own = n // 2, slice(change.shape[2], None)
+    half = n // 2
     known = (np.linalg.pinv(columns[:, :half]) @ turned[:, :half])[:, own]
     predicted = (turned[:, half:] * (columns[:, half:, own] @ known)).mean(axis=1)
     size = np.sqrt((level**2).mean(axis=1)).max(axis=1)

@@ -143,7 +143,7 @@ def decompress(packed: bytes | memoryview, compression: str, size: int) -> bytes
 
 
 def iter_records(data: memoryview) -> Iterator[tuple[int, int, int]]:
-    """Yield records as (opcode, start, end). Raises DamagedError if they do not fill the data."""
+    """Yield the records of MCAP data as (opcode, start, end), in bytes. Raises DamagedError if they do not fill it."""
     start, stop = 0, len(data)
     while start < stop:
         opcode, length = HEAD.unpack_from(data, start) if start + HEAD.size <= stop else (0, stop)

@@ -96,10 +96,6 @@ class Joined:
     values: Array
     covariance: Array
 
-    def own(self, recording: int) -> GaussianPrior:
-        """Posterior of a recording's own numbers, by the joint estimate."""
-        return self.all(recording).of(self.parts[recording].own)
-
     def all(self, recording: int) -> GaussianPrior:
         """Posterior of all numbers as of a recording: the device's, known or last known, and the recording's own."""
         part = self.parts[recording]

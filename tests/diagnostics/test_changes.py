@@ -75,8 +75,8 @@ def test_what_did_not_change_is_estimated_beside_what_did() -> None:
     rng, R = np.random.default_rng(4), np.eye(4)
     R[0, 1] = 0.9
     devices = [np.array([0.0, 40.0 * (i >= 4), 0.0, 0.0]) for i in range(8)]
-    told = [replace(one(rng, np.zeros(3)), R=R, d=R @ device) for device in devices]
-    found = of(told)
+    each = [replace(one(rng, np.zeros(3)), R=R, d=R @ device) for device in devices]
+    found = of(each)
     assert [(step.name, step.after) for step in found.found] == [("arm_mount_y", 3)]
     others = [step.z for step in found.steps if step not in found.found]
     assert len(others) > 10

@@ -21,8 +21,8 @@ from alidade.pipelines.solvers.batch import solve, solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver, solve_incremental
 from alidade.pipelines.solvers.weak_directions import at_prior
+from benchmarks.batch import solve as minimum
 from benchmarks.initialisation import CASES, beginning, drawn_los, followed, made, nees, report, run
-from tests.support.solved import minimum
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35

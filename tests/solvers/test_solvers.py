@@ -26,10 +26,10 @@ from alidade.pipelines.solvers.incremental import solve_incremental
 from alidade.pipelines.solvers.layout import Tangent
 from alidade.pipelines.solvers.posterior import Reported
 from alidade.pipelines.solvers.window import Keyframes
+from benchmarks.batch import solve as minimum
 from tests.support import chain
 from tests.support.chain import INTERVAL, PARAMETER, PRIOR, Walk
 from tests.support.judged import judge
-from tests.support.solved import minimum
 
 # Slopes of a gyro's bias, rad/s/K.
 WARMING = (1.5e-4, -2e-4, 2.5e-4)

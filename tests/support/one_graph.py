@@ -13,7 +13,7 @@ from alidade.pipelines.estimation.problem import Factor, Parameter, Problem, Ste
 from alidade.pipelines.solvers.engines import ALL, Compiled
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
 from alidade.pipelines.solvers.posterior import Reported
-from tests.support.solved import minimum
+from benchmarks.batch import solve as minimum
 
 # Indices of one recording's variables stay below this.
 _APART = 10_000_000
