@@ -24,12 +24,14 @@ class GaussianPrior:
         mean: (n,) SI.
         covariance: (n, n); a number whose row is zero is exactly its mean.
         source: where it is from, for people; empty: the config.
+        recordings: SHA-256 of each recording behind it, if it is an earlier calibration.
     """
 
     names: tuple[str, ...]
     mean: Array
     covariance: Array
     source: str = ""
+    recordings: tuple[str, ...] = ()
 
     def of(self, names: Collection[str]) -> GaussianPrior:
         """Return the marginal distribution of those of the named parameters that the prior has."""

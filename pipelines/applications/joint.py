@@ -24,7 +24,7 @@ import numpy as np
 from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.applications.sharing import DAY_S, stated_walks, walks
+from alidade.pipelines.applications.sharing import DAY_S, finding_of_recording, stated_walks, walks
 from alidade.pipelines.diagnostics.device_changes import Changes, Rate, changes
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
@@ -385,7 +385,7 @@ def _findings(
     """The findings on the joint estimate, on recordings by themselves, and on changes of the device between them."""
     if not estimate.converged:
         return diagnose(replace(estimate, message=_NO_SOLUTION), quantities)
-    own = (_of_recording(each.calibration) for each in alone)
+    own = (finding_of_recording(each.calibration) for each in alone)
     steps = list(_device_changes(changed, alone))
     found = [*steps, *diagnose(estimate, quantities, problem.advice), *(each for each in own if each is not None)]
     value, dof = joined.disagreement
@@ -393,23 +393,6 @@ def _findings(
         found.append(_disagreement([each.name for each in alone], (), value, dof))
     found.append(remark(f"{len(alone)} recordings of one device"))
     return by_severity(found)
-
-
-# Findings on one recording that the joint estimate, which has no residuals, cannot have.
-_OWN_KINDS = ("rejection", "change", "jump")
-
-
-def _of_recording(calibration: Calibration) -> Finding | None:
-    """Return a finding on what one recording finds by itself: inconsistent, or on its residuals; None without any."""
-    own = [
-        finding
-        for finding in calibration.findings
-        if finding.severity == Severity.INCONSISTENT or finding.kind in _OWN_KINDS
-    ]
-    if not own:
-        return None
-    evidence = {"recording": calibration.recording, "findings": tuple(own)}
-    return Finding("recording", max(finding.severity for finding in own), evidence)
 
 
 def _device_changes(changed: Changes, alone: Sequence[Alone]) -> Iterator[Finding]:

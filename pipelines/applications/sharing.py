@@ -1,4 +1,4 @@
-"""Parameters that several recordings of one device share: those that are constant, and those that walk.
+"""What several recordings of one device share, parameters that are constant and that walk, and what one says by itself.
 
 The method says which parameters belong to a recording, as a gyro's turn-on bias does; the config's `share` goes before
 that, by names or patterns ("camera_mount_*").
@@ -15,12 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
 from alidade.pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 
 DAY_S = 86_400.0
+# Findings on a recording's residuals, which an estimate of several recordings does not have.
+_ON_RESIDUALS = ("rejection", "change", "jump")
 
 
 def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, float]:
@@ -64,7 +68,7 @@ def device_prior(known: SavedCalibration, method: Method, config: Config, sha256
     source = every.source
     if known.solver == "published":
         raise InputError(f"{source}: is of the published solver, whose sigmas make no prior; use batch's")
-    if known.recording.sha256 == sha256:
+    if known.includes(sha256):
         raise InputError(f"{source}: was made of this very recording, which would count twice; name another one's")
     rates = walks(method, config, every.names)
     for name in stated_walks(config, every.names):
@@ -80,4 +84,18 @@ def device_prior(known: SavedCalibration, method: Method, config: Config, sha256
         gaussian_prior,
         covariance=gaussian_prior.covariance + walked.reshape(gaussian_prior.covariance.shape),
         source=said,
+        recordings=tuple(known.sources or [known.recording.sha256]),
     )
+
+
+def finding_of_recording(calibration: Calibration) -> Finding | None:
+    """Return a finding on what one recording says by itself: inconsistent, or on its residuals; None without any."""
+    own = [
+        finding
+        for finding in calibration.findings
+        if finding.severity == Severity.INCONSISTENT or finding.kind in _ON_RESIDUALS
+    ]
+    if not own:
+        return None
+    evidence = {"recording": calibration.recording, "findings": tuple(own)}
+    return Finding("recording", max(finding.severity for finding in own), evidence)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from alidade.pipelines import deadline, progress
+from alidade.pipelines import deadline
 from alidade.pipelines.applications.session import Session, open_session
-from alidade.pipelines.applications.sharing import device_prior, walks
+from alidade.pipelines.applications.sharing import device_prior, finding_of_recording, walks
 from alidade.pipelines.config import Settings
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.reports.calibration import SavedCalibration, load_known, saved, with_covariance
 from alidade.pipelines.reports.result import Calibration
@@ -29,12 +28,12 @@ class Validated:
         calibration: the one validated.
         recording: name of the file.
         validations: what the method says.
-        same_recording: it was calibrated on the very recording.
+        same_recording: the calibration was made of this recording, alone or with others.
         lost: sentences about what of the recording cannot be used.
         held: whether the calibration holds; None where the recording cannot say.
         device: what the method says of the calibration's device, bias and the like of this recording re-estimated.
         best: the same of the recording's own calibration: errors that are to be expected of one that holds.
-        within: a finding on a change of the device during the recording.
+        own: what the recording says by itself, where that is inconsistent or on its residuals.
     """
 
     calibration: SavedCalibration
@@ -45,10 +44,16 @@ class Validated:
     held: CalibrationCheck | None = None
     device: Sequence[Validation] = ()
     best: Sequence[Validation] = ()
-    within: Finding | None = None
+    own: Finding | None = None
 
     def __repr__(self) -> str:
         return f"<Validated {self.calibration.method} on {self.recording}: {self.verdict}>"
+
+    @property
+    def within(self) -> Finding | None:
+        """Finding on a material change of the device during the recording; None without one."""
+        found = self.own.evidence["findings"] if self.own else ()
+        return next((each for each in found if each.kind == "change" and each.severity == Severity.INCONSISTENT), None)
 
     @property
     def applied(self) -> Sequence[Validation]:
@@ -65,10 +70,15 @@ class Validated:
         return self.held.verdict if self.within is None else "changed"
 
     @property
+    def serves(self) -> bool:
+        """Whether the parameters changed, but by less than the required accuracy."""
+        return self.verdict == "changed" and self.within is None and self.held is not None and not self.held.matters
+
+    @property
     def sentence(self) -> str:
         """The verdict in words."""
         if self.same_recording:
-            return "This is the recording of the calibration, which always agrees with it."
+            return "The calibration was made of this recording, and always agrees with it."
         if self.held is None or self.verdict == "unknown":
             return "The recording does not determine whether the calibration holds."
         if self.within is not None:
@@ -82,7 +92,7 @@ class Validated:
             if step in self.held.changes.found
         ]
         what = "; ".join(found) or "all parameters together, none by more than chance for itself"
-        small = "" if self.held.matters or not found else " That is less than what is required of them."
+        small = " That is less than what is required of them." if self.serves and found else ""
         return f"The calibration does not hold: {what}.{small}"
 
     @property
@@ -101,6 +111,8 @@ class Validated:
         out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note and not self.device)]
         if self.calibration.status != "calibrated":
             out.append(f"the calibration's own verdict is {self.calibration.status}")
+        if self.own is not None and self.held is not None and self.within is None:
+            out.append(sentence(self.own, self.held.quantities))
         return out
 
 
@@ -141,49 +153,41 @@ def validate(
     known.of_method(chosen.name)
     values = known.values
     validations = chosen.report.validate(data, settings, values)
-    if known.recording.sha256 == opened.sha256():
+    if known.includes(opened.sha256()):
         return Validated(known, path.name, validations, True, opened.notes)
     with session.usual_time():
         found = _check(session, known)
         lost = (*opened.notes, *filter(None, [deadline.stopped()]))
     if found is None:
         return Validated(known, path.name, validations, False, lost)
-    held, estimate, own, within = found
-    of_device = walks(chosen, settings, [name for name in own if name in known.parameters])
+    held, own = found
+    numbers = own.problem.numbers(own.estimate)
+    of_device = walks(chosen, settings, [name for name in numbers if name in known.parameters])
     fixed = {name: values[name] for name in of_device if name in values}
-    others = GaussianPrior(estimate.names, estimate.values, estimate.covariance).given(fixed)
+    others = GaussianPrior(own.estimate.names, own.estimate.values, own.estimate.covariance).given(fixed)
     conditional = dict(zip(others.names, others.mean.tolist(), strict=True))
-    device = chosen.report.validate(data, settings, own | conditional | fixed)
-    best = chosen.report.validate(data, settings, own)
-    return Validated(known, path.name, validations, False, lost, held, device, best, within)
+    device = chosen.report.validate(data, settings, numbers | conditional | fixed)
+    best = chosen.report.validate(data, settings, numbers)
+    return Validated(known, path.name, validations, False, lost, held, device, best, finding_of_recording(own))
 
 
-def _check(
-    session: Session, known: SavedCalibration
-) -> tuple[CalibrationCheck, Estimate, dict[str, float], Finding | None] | None:
-    """Test an earlier calibration on a recording, and that for a change of the device; None if it is not solved.
+def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Calibration] | None:
+    """Test an earlier calibration on a recording by the recording's own calibration, which is returned too.
 
-    Return the test, the estimate, its values and a finding on a material change.
+    None where the recording has no solution.
     """
-    from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.chain import IndeterminateError
 
     if known.solver == "published":
         return None
-    problem = session.problem().near({name: p.value for name, p in known.parameters.items()})
-    device = walks(session.method, session.config, [q.name for q in problem.quantities])
     gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:
-        with progress.doing("solving"), deadline.of_processor():
-            estimate = solve_batch(problem, device=device, steps=True, history=True)
+        own = replace(session, near=known.values).calibrate(report=False)
     except IndeterminateError:
         return None
-    own = problem.numbers(estimate)
+    estimate = own.estimate
     if not estimate.converged or estimate.sqrt_info is None:
         deadline.passed("the solution of this recording")
         return None
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
-    held = check_calibration(gaussian_prior, estimate.sqrt_info, problem.quantities, inflations)
-    _, change = session.change(estimate, problem.quantities)
-    is_found = change is not None and change.kind == "change" and change.severity == Severity.INCONSISTENT
-    return held, estimate, own, change if is_found else None
+    return check_calibration(gaussian_prior, estimate.sqrt_info, own.problem.quantities, inflations), own

@@ -113,9 +113,10 @@ def _from_priors(quantities: Sequence[Quantity], values: Array) -> list[float]:
     return [((x - q.prior_mean) / q.prior_sigma) ** 2 for q, x in found if q.prior_sigma]
 
 
-def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> TrialFit | None:
+def solve_trial(build: Build, data: Any, config: Config, label: str = "", error_map: bool = False) -> TrialFit | None:
     """Solve changed data in batch; None if there is no solution.
 
+    With `error_map` also for errors of measurements that depend on where they are made, as a recording is.
     A trial has data and noise that nobody recorded: what it raises ends the trial alone, and is logged. A worker
     process that is lost says nothing of the trial, and is raised.
     """
@@ -123,7 +124,7 @@ def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> Tri
 
     def solution() -> TrialFit | None:
         problem = build(data, config)
-        return TrialFit.of(problem, solve_batch(problem, _MAX_ITERATIONS))
+        return TrialFit.of(problem, solve_batch(problem, _MAX_ITERATIONS, error_map=error_map))
 
     return _tried(label, solution)
 
@@ -306,7 +307,9 @@ def _solved(
     build: Build, faults: FaultModel, data: Any, config: Config, start: float, stop: float
 ) -> dict[str, _Number]:
     """Solve the segment [start, stop), s, of a recording by itself; empty if there is no solution."""
-    found = solve_trial(build, faults.segment(data, start, stop), config, f"{start:.0f} to {stop:.0f} s")
+    found = solve_trial(
+        build, faults.segment(data, start, stop), config, f"{start:.0f} to {stop:.0f} s", error_map=True
+    )
     if found is None or not found.estimate.converged:
         return {}
     numbers = zip(found.quantities, found.estimate.values.tolist(), found.estimate.sigmas.tolist(), strict=True)

@@ -317,8 +317,9 @@ class CalibrationCheck:
 
     @property
     def matters(self) -> bool:
-        """Whether a significant change exceeds the parameter's required accuracy."""
-        return any(abs(step.size) > self.quantities[step.name].require for step in self.changes.found)
+        """Whether a change exceeds the parameter's required accuracy: a significant one, or any if all are together."""
+        found = self.changes.found or self.steps
+        return any(abs(step.size) > self.quantities[step.name].require for step in found)
 
 
 def check_calibration(

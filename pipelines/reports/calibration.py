@@ -102,6 +102,8 @@ class SavedCalibration(_Record, SensorValues):
     solver: str
     status: Status
     recording: SavedRecording
+    # SHA-256 of each recording behind the values, where there are several.
+    sources: list[str] = []
     parameters: dict[str, SavedParameter]
     rotations: dict[str, SavedRotation] = {}
     transforms: dict[str, SavedTransform] = {}
@@ -120,6 +122,10 @@ class SavedCalibration(_Record, SensorValues):
         known = self.model_copy()
         known._joint_prior = gaussian_prior
         return known
+
+    def includes(self, sha256: str) -> bool:
+        """Whether the values come from the recording of this SHA-256, alone or among others."""
+        return sha256 in (self.recording.sha256, *self.sources)
 
     @property
     def gaussian_prior(self) -> GaussianPrior:
@@ -210,8 +216,9 @@ def calibration_yaml(calibration: Calibration) -> str:
     for section in ("parameters", "rotations", "transforms"):
         content[section] = {name: one_line(entry) for name, entry in content[section].items()}
     content["findings"] = {name: [one_line(row) for row in rows] for name, rows in content["findings"].items()}
-    if not content["constants"]:
-        del content["constants"]
+    for key in ("constants", "sources"):
+        if not content[key]:
+            del content[key]
     yaml = YAML()
     yaml.Representer = Representer
     yaml.width = 200
@@ -238,6 +245,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         solver=calibration.estimate.solver,
         status=calibration.status,
         recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=calibration.start),
+        sources=calibration.sources if len(calibration.sources) > 1 else [],
         parameters=parameters,
         rotations=rotations_of(calibration),
         transforms=_transforms(calibration),
@@ -315,6 +323,7 @@ def _of_result(path: Path, text: str) -> SavedCalibration:
             for p, sigma in zip(result.parameters, sigmas, strict=True)
         },
         constants=result.constants or {},
+        sources=result.sources or [part.sha256 for part in result.recordings or ()],
     )
     return known.with_joint(GaussianPrior(names, np.array([p.value for p in result.parameters]), covariance, str(path)))
 

@@ -60,8 +60,8 @@ def _solvers(
 ) -> tuple[Block, ...]:
     """Return the verdict of each solver, a table of required parameters, and a collapsed one of nuisance parameters."""
     verdicts = [(c, summary_of(c, result_cards(c))) for c in calibrations]
-    required = [q for q in quantities if q.judged]
-    others = [q for q in quantities if not q.judged]
+    required = [q for q in quantities if q.required]
+    others = [q for q in quantities if not q.required]
     known = any(truth_errors(c) for c in calibrations)
     what = "error over sigma" if known else "difference from batch, in batch's sigmas"
     caption = (

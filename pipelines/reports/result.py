@@ -103,6 +103,13 @@ class Calibration(SensorValues):
     recordings: Sequence[PartResult] = ()
     changes: Changes | None = None
 
+    @property
+    def sources(self) -> list[str]:
+        """SHA-256 of each recording that the values come from, those of an earlier calibration as prior included."""
+        prior = self.config.gaussian_prior
+        own = [part.sha256 for part in self.recordings] or [self.sha256]
+        return [*own, *(prior.recordings if prior else ())]
+
     @cached_property
     def parameters(self) -> dict[str, ParameterResult]:
         """Parameters by name, as result.json lists them."""

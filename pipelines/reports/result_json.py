@@ -294,6 +294,7 @@ class Result(_Record):
     applied: list[str] = []  # parameters that the formulas apply
     second_best: SecondResult | None = None  # where there is another solution that is nearly as likely
     constants: dict[str, float] | None = None  # that formulas need beside the parameters
+    sources: list[str] | None = None  # SHA-256 of each recording behind the values, where there are several
     recordings: list[PartResult] | None = None  # of a joint calibration
     changes: ChangesResult | None = None  # of a joint calibration
     truth: dict[str, TruthResult] | None = None  # where the recording brings it
@@ -370,6 +371,7 @@ def result(calibration: Calibration) -> Result:
                 "parameters": dict(zip(c.estimate.names, second.values.tolist(), strict=True)),
             },
             "constants": c.problem.constants or None,
+            "sources": c.sources if len(c.sources) > 1 else None,
             "recordings": c.recordings or None,
             "changes": c.changes
             and {"level": c.changes.level, "steps": _steps(c.changes, c.recordings), "rates": c.changes.rates},
@@ -413,7 +415,7 @@ def _json(value: Any) -> object:
 def result_json(calibration: Calibration) -> str:
     """Return the text of result.json without the keys that apply to some calibrations only, where they are empty."""
     model = result(calibration)
-    seldom = ("truth", "second_best", "constants", "recordings", "changes")
+    seldom = ("truth", "second_best", "constants", "sources", "recordings", "changes")
     left_out = {name for name in seldom if getattr(model, name) is None}
     return model.model_dump_json(by_alias=True, indent=1, exclude=left_out) + "\n"
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 # Angles smaller than this, rad, are shown in arc seconds.
 _FINE_RAD = 2e-4
-# Verdict -> answer, tone and next steps.
+# Verdict, or "within" for a change within the required accuracy -> answer, tone and next steps.
 _ANSWERS: Mapping[str, tuple[str, Tone, tuple[str, ...]]] = {
     "holds": ("yes", "good", ("Continue to use it.",)),
     "changed": (
@@ -31,6 +31,14 @@ _ANSWERS: Mapping[str, tuple[str, Tone, tuple[str, ...]]] = {
         (
             "Do not use it any longer: run `alidade calibrate` on this recording, and apply the result.",
             "If the change is larger than wear explains, look at mounts and screws first.",
+        ),
+    ),
+    "within": (
+        "no, but it serves",
+        "warn",
+        (
+            "It may be used: the change is within the required accuracy. `alidade calibrate` on this recording has the "
+            "values of today.",
         ),
     ),
     "unknown": ("cannot say", "warn", ("Record a motion as for a calibration, so that the parameters can be seen.",)),
@@ -71,7 +79,7 @@ def validation_report(validated: Validated) -> Report:
     """The report of a validation."""
     calibration = validated.calibration
     source, title = calibration.recording, method(calibration.method).title
-    answer, tone, steps = _ANSWERS[validated.verdict]
+    answer, tone, steps = _ANSWERS["within" if validated.serves else validated.verdict]
     notes = tuple(note.removesuffix(".") for note in validated.notes)
     return Report(
         title=f"{title} validation ({validated.recording})",

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alidade import calibrate, simulate
+from alidade import calibrate, simulate, validate
 from alidade import open as opened
 from alidade.factors import so3
 from alidade.pipelines.applications.sharing import device_prior, walks
@@ -64,6 +64,7 @@ def test_it_does_not_hold_after_a_knock(calibrated: Path, tmp_path: Path, alidad
     assert done.code == 4
     assert "The calibration does not hold: theta_y changed by 0." in done.out
     assert "That is less than what is required of them." in done.out
+    assert "It may be used: the change is within the required accuracy." in done.out
     page = (tmp_path / "june-validation" / "validation.html").read_text()
     fits(page, tmp_path)
     assert "The calibration does not hold" in page
@@ -124,6 +125,33 @@ def test_it_does_not_hold_for_a_recording_in_which_it_slips(tmp_path: Path, alid
     done = alidade("validate", recording, "--calibration", tmp_path / "calibration.yaml", "--out", tmp_path / "v")
     assert done.code == 4
     assert re.search(r"does not hold: Change at (19|20) s: helmet_mount_x by ", done.out)
+
+
+def test_errors_of_vision_by_attitude_are_no_change(tmp_path: Path) -> None:
+    """A change has the sigmas of the recording's own calibration, which these errors widen."""
+    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0, "duration_s": 20.0}
+    scenario = method("head").settings("head_mounts").model_dump() | rates | {"vision_map": 5e-3}
+    opened(simulate("head", scenario, seed=2)).calibrate("batch", report=False).write(tmp_path)
+    method("head").write(tmp_path / "later.mcap", simulate("head", scenario, seed=3))
+    known, later = tmp_path / "calibration.yaml", tmp_path / "later.mcap"
+    found = [validate(later, known, config=config) for config in (None, {"sensors": {"camera": {"map": 0.0}}})]
+    sigmas = [np.array([step.sigma for step in each.held.steps]) for each in found if each.held]
+    assert found[0].verdict == "holds"
+    assert (sigmas[0] > 1.02 * sigmas[1]).all()
+
+
+def test_a_recording_among_those_of_the_calibration_says_nothing_of_it(tmp_path: Path, alidade: Command) -> None:
+    """Jointly with another, or behind the calibration that was a prior: it would count twice."""
+    seeds = (1, 2, 3)
+    first, second, third = (written(tmp_path / f"{k}.mcap", simulate("indexer", COARSE, seed=k)) for k in seeds)
+    assert alidade("calibrate", first, second, "--out", tmp_path / "joint").code == 0
+    prior = tmp_path / "joint" / "recordings" / "1" / "calibration.yaml"
+    assert alidade("calibrate", second, "--prior", prior, "--out", tmp_path / "chain").code == 0
+    for known in (tmp_path / "joint" / "calibration.yaml", tmp_path / "chain" / "result.json"):
+        assert json.loads(alidade("validate", first, "--calibration", known, "--json").out)["verdict"] == "same"
+        again = alidade("calibrate", first, "--prior", known, "--out", tmp_path / "twice")
+        assert (again.code, "would count twice" in again.err) == (2, True)
+    assert alidade("calibrate", third, "--prior", tmp_path / "joint" / "result.json", "--out", tmp_path / "c").code == 0
 
 
 def test_a_recording_that_says_nothing_gives_no_verdict() -> None:

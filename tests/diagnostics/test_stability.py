@@ -13,7 +13,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.applications.follow.guidance import View, Watch
 from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
-from alidade.pipelines.estimation.finding import Severity
+from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.parameters import prior_z_score
 from alidade.pipelines.estimation.problem import Estimate, History, PosteriorHistory, Quantity, SqrtInformation
 from alidade.pipelines.estimation.widening import by_wider_priors
@@ -42,7 +42,7 @@ def watched(session: alidade.Session) -> tuple[IncrementalSolver, list[tuple[flo
         run.add_step(step)
         watch.look(run)
         if watch.change is not None:
-            alarms.append((step.time, watch.change.time_s))
+            alarms.append((step.time, watch.change.evidence["time_s"]))
     return run, alarms
 
 
@@ -255,7 +255,8 @@ def test_a_slip_is_seen_while_it_is_recorded() -> None:
 
 
 def test_the_person_is_told_what_moved_and_when() -> None:
-    change = Stability(7.0, 0.0, 31.0, {"helmet_mount_x": (8e-3, 1e-3)})
+    steps = {"helmet_mount_x": (8e-3, 1e-3)}
+    change = Finding("change", Severity.INCONSISTENT, {"since_s": 31.0, "time_s": 31.0, "steps": steps})
     quantities = (Quantity("helmet_mount_x", "rad", 0.1, 0.1, 1e-3),)
     view = View(40.0, 43_200 * 10**9, quantities, np.zeros(1), np.eye(1) * 1e-8, (), change)
     assert not view.done

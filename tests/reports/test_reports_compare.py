@@ -71,7 +71,7 @@ def test_a_half_without_a_solution_is_not_compared(monkeypatch: pytest.MonkeyPat
     assert solution is not None
     lost = replace(solution, estimate=replace(solution.estimate, converged=False))
     trials = {"0 to 5 s": solution, "5 to 11 s": lost}
-    monkeypatch.setattr(cross_validation, "solve_trial", lambda *given: trials[given[-1]])
+    monkeypatch.setattr(cross_validation, "solve_trial", lambda *given, **_: trials[given[-1]])
     faults = FaultModel(streams={"t": ()}, signs={})
     halves, unsolved = split_halves(lambda *_: make_problem(), faults, Stamps(np.linspace(0.0, 10.0, 5)), Config())
     assert (halves, unsolved) == ({}, ("second",))

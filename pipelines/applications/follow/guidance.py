@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from alidade.factors.array import Array
-from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability
+from alidade.pipelines.diagnostics.change_test import change_finding, stability
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.diagnose import misfits
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
@@ -40,7 +40,7 @@ class View:
         values: (n,) of them, as estimated by now; None while there is too little.
         covariance: (n, n) of them; None while there is too little.
         checklist: what there is of what the method needs.
-        change: in what is calibrated, since the recording began; None: none was found.
+        change: finding on a material change of what is calibrated, since the recording began; None: none was found.
         findings: on the estimate, the most severe first.
         advise: weights of a direction -> motion that would determine it.
     """
@@ -51,7 +51,7 @@ class View:
     values: Array | None
     covariance: Array | None
     checklist: tuple[ChecklistItem, ...]
-    change: Stability | None = None
+    change: Finding | None = None
     findings: tuple[Finding, ...] = ()
     advise: Advise | None = None
 
@@ -158,9 +158,8 @@ class View:
         if self.covariance is None:
             return "not enough yet for an estimate"
         if self.change is not None:
-            when = datetime.fromtimestamp(self.epoch_ns * 1e-9 + self.change.time_s, UTC)
-            found = change_finding(self.change, {}, self.quantities)
-            text = sentences.sentence(found, {q.name: q for q in self.quantities}) if found else "Something changed."
+            when = datetime.fromtimestamp(self.epoch_ns * 1e-9 + self.change.evidence["time_s"], UTC)
+            text = sentences.sentence(self.change, {q.name: q for q in self.quantities})
             return f"{text} It was {when:%H:%M:%S} UTC: {_BEGIN_ANEW.words}"
         if self.done:
             return "the accuracy wanted is reached: recording may end"
@@ -179,12 +178,12 @@ class Watch:
     """Watches whether the parameters that a run calibrates stay constant.
 
     Attributes:
-        change: as of the last look; None: none was found.
+        change: finding on a material change, as of the last look; None: none was found.
     """
 
     def __init__(self) -> None:
         self._seen: tuple[IncrementalSolver, int] | None = None  # the run, and its moments at the last look
-        self.change: Stability | None = None
+        self.change: Finding | None = None
 
     def look(self, run: IncrementalSolver) -> None:
         """Test for a change of the parameters, if the run has advanced since the last test."""
@@ -196,7 +195,7 @@ class Watch:
         found = stability(run.estimate(), quantities)
         finding = None if found is None or not found.changed else change_finding(found, {}, quantities)
         # What moves nothing that is required is a note of the result, and in its sigmas.
-        self.change = found if finding is not None and finding.severity > Severity.NOTE else None
+        self.change = finding if finding is not None and finding.severity > Severity.NOTE else None
 
 
 def _is_estimated(q: Quantity) -> bool:
@@ -204,7 +203,7 @@ def _is_estimated(q: Quantity) -> bool:
 
 
 def view_of(
-    epoch_ns: int, run: IncrementalSolver, checklist: tuple[ChecklistItem, ...], change: Stability | None = None
+    epoch_ns: int, run: IncrementalSolver, checklist: tuple[ChecklistItem, ...], change: Finding | None = None
 ) -> View:
     """Return the current view of an incremental run."""
     quantities, advise = run.problem.quantities, run.problem.advice

@@ -28,12 +28,11 @@ from alidade.pipelines.applications.follow.follower import Follower, Settings
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.page import LivePage
 from alidade.pipelines.applications.follow.sources import Source
-from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.display.drawing import covered, swaying
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.finding import Motion
+from alidade.pipelines.estimation.finding import Finding, Motion, Severity
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import simulate
 from tests.support.browser import DESKTOP, PHONE, needs_browser
@@ -87,8 +86,8 @@ def test_it_says_what_to_do_until_enough_is_there_and_comes_back_by_itself(tmp_p
         with LivePage(print, port=port, name="s.mcap") as page:
             page.show(_view(3.0, 1e-4))
             tab.wait(f"!({LOST}) && {WORDS} === 'You may stop'")
-            moved = replace(_view(4.0, 1e-4), change=Stability(7.0, 0.0, 31.0, {"delta_px": (8e-3, 1e-3)}))
-            page.show(moved)
+            evidence = {"since_s": 31.0, "time_s": 31.0, "steps": {"delta_px": (8e-3, 1e-3)}}
+            page.show(replace(_view(4.0, 1e-4), change=Finding("change", Severity.INCONSISTENT, evidence)))
             tab.wait(f"{WORDS} === 'Look what moved, and begin anew'")
             assert "00:00:31 UTC" in tab.value("document.getElementById('alarms').textContent")
         # Only that the server was away is complained of.
