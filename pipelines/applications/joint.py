@@ -11,7 +11,7 @@ from __future__ import annotations
 import datetime
 import hashlib
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
@@ -386,7 +386,7 @@ def _findings(
     if not estimate.converged:
         return diagnose(replace(estimate, message=_NO_SOLUTION), quantities)
     own = (finding_of_recording(each.calibration) for each in alone)
-    steps = list(_device_changes(changed, alone))
+    steps = list(_device_changes(changed, alone, {q.name for q in quantities if q.required}))
     found = [*steps, *diagnose(estimate, quantities, problem.advice), *(each for each in own if each is not None)]
     value, dof = joined.disagreement
     if not steps and dof >= 1 and value > Fit.of(value, float(dof)).high:
@@ -395,13 +395,17 @@ def _findings(
     return by_severity(found)
 
 
-def _device_changes(changed: Changes, alone: Sequence[Alone]) -> Iterator[Finding]:
-    """Yield findings on steps of the device between recordings, most significant first; else of all parameters."""
+def _device_changes(changed: Changes, alone: Sequence[Alone], required: Collection[str]) -> Iterator[Finding]:
+    """Yield findings on steps of the device between recordings, most significant first; else of all parameters.
+
+    A step of a number without a required accuracy is a NOTE: the others are estimated beside it.
+    """
     places = [(each.name, each.calibration.start) for each in alone]
     for step in sorted(changed.found, key=lambda step: -abs(step.z)):
         names, dates = zip(*places[step.after : step.after + 2], strict=True)
         numbers = {"parameter": step.name, "step": step.size, "sigma": step.sigma}
-        yield Finding("device_change", Severity.INCONSISTENT, {**numbers, "recordings": names, "dates": dates})
+        severity = Severity.INCONSISTENT if step.name in required else Severity.NOTE
+        yield Finding("device_change", severity, {**numbers, "recordings": names, "dates": dates})
     for each in changed.together if not changed.found else ():
         if each.significant:
             names, dates = zip(*places[each.after : each.after + 2], strict=True)

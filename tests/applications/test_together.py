@@ -29,6 +29,7 @@ from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import SqrtInformation
+from alidade.pipelines.methods import method
 from alidade.pipelines.recording.opening import group_recordings
 from alidade.pipelines.reports.joint_report import forecasts, recording_blocks
 from alidade.pipelines.reports.result import Calibration
@@ -302,6 +303,21 @@ def test_recordings_that_are_of_another_device_are_told() -> None:
         assert abs(p.value - last[p.name].value) < 3.0 * last[p.name].sigma
     assert found.parameters["theta_y"].sigma == pytest.approx(last["theta_y"].sigma, rel=0.05)
     assert {finding.kind for finding in found.findings if finding.severity > Severity.NOTE} == {"device_change"}
+
+
+def test_a_step_of_what_is_not_required_is_a_note() -> None:
+    """A gyro's scale that changed by 2 %: mounts and bias are estimated beside it."""
+    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0, "duration_s": 30.0}
+    scenario = method("head").settings("head_mounts").model_dump() | rates
+    first, second = (alidade.simulate("head", scenario, seed=seed) for seed in (1, 2))
+    scaled = replace(second.data, head_gyro=second.data.head_gyro * [1.02, 1.0, 1.0])
+    found = jointly([alidade.open(first), alidade.open(replace(second, data=scaled))])
+    assert found.status == "calibrated"
+    assert any("Change of the device between arrays and arrays: gyro_scale_x by 1." in note for note in found.notes)
+    truth = first.truth
+    mounts = [p for name, p in found.parameters.items() if "mount" in name and p.sigma > 0.0]
+    assert mounts
+    assert all(abs(p.value - float(str(truth[p.name]))) < 3.5 * p.sigma for p in mounts)
 
 
 @pytest.mark.slow
