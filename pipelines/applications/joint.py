@@ -406,10 +406,9 @@ def _device_changes(changed: Changes, alone: Sequence[Alone], required: Collecti
         numbers = {"parameter": step.name, "step": step.size, "sigma": step.sigma}
         severity = Severity.INCONSISTENT if step.name in required else Severity.NOTE
         yield Finding("device_change", severity, {**numbers, "recordings": names, "dates": dates})
-    for each in changed.together if not changed.found else ():
-        if each.significant:
-            names, dates = zip(*places[each.after : each.after + 2], strict=True)
-            yield _disagreement(names, dates, each.chi_square, each.dof)
+    for each in changed.jointly:
+        names, dates = zip(*places[each.after : each.after + 2], strict=True)
+        yield _disagreement(names, dates, each.chi_square, each.dof)
 
 
 def _disagreement(names: Sequence[str], dates: Sequence[str], chi_square: float, dof: int) -> Finding:

@@ -11,7 +11,7 @@ from alidade.pipelines.applications.session import Session, open_session
 from alidade.pipelines.applications.sharing import device_prior, finding_of_recording, walks
 from alidade.pipelines.config import Settings
 from alidade.pipelines.diagnostics.cross_validation import Validation
-from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
+from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Change, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.gaussian_prior import GaussianPrior
@@ -86,14 +86,15 @@ class Validated:
         steps = self.held.steps
         if self.verdict == "holds":
             return f"The calibration holds: {len(steps)} of {len(steps)} parameters unchanged, to {self._resolution}."
-        found = [
-            f"{step.name} changed by {format_estimate(self.held.quantities[step.name], step.size, step.sigma)}"
-            for step in steps
-            if step in self.held.changes.found
-        ]
+        found = self._changes(self.held.changes.found)
         what = "; ".join(found) or "all parameters together, none by more than chance for itself"
         small = " That is less than what is required of them." if self.serves and found else ""
         return f"The calibration does not hold: {what}.{small}"
+
+    def _changes(self, steps: Sequence[Change]) -> list[str]:
+        """Phrases with the number that changed and by how much."""
+        known = self.held.quantities if self.held else {}
+        return [f"{step.name} changed by {format_estimate(known[step.name], step.size, step.sigma)}" for step in steps]
 
     @property
     def _resolution(self) -> str:
@@ -111,6 +112,8 @@ class Validated:
         out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note and not self.device)]
         if self.calibration.status != "calibrated":
             out.append(f"the calibration's own verdict is {self.calibration.status}")
+        if self.held is not None:
+            out += [f"{what}: no accuracy is required of it" for what in self._changes(self.held.changes.others)]
         if self.own is not None and self.held is not None and self.within is None:
             out.append(sentence(self.own, self.held.quantities))
         return out

@@ -91,23 +91,30 @@ class Changes:
     Attributes:
         level: p-value of any step.
         limit: from so many sigmas on the first step of a number is more than chance.
-        found: the steps that are more than chance, in the order in which they were found.
-        steps: every number's step after every recording, with the significant steps in the system.
-        together: steps of all numbers at once.
+        found: the steps that are more than chance, of what was asked for, in the order in which they were found.
+        others: the same of what was not asked for, and might be taken for a step of what was.
+        steps: every step that was asked for, with the significant steps in the system.
+        together: steps of all that was asked for at once, without any step in the system.
         rates: kind of numbers -> how they walk.
     """
 
     level: float
     limit: float = math.inf
     found: tuple[Change, ...] = ()
+    others: tuple[Change, ...] = ()
     steps: tuple[Change, ...] = ()
     together: tuple[Together, ...] = ()
     rates: Mapping[str, Rate] = field(default_factory=dict)
 
     @property
+    def jointly(self) -> tuple[Together, ...]:
+        """Significant steps of all numbers at once, where no number's step is significant by itself."""
+        return () if self.found or self.others else tuple(each for each in self.together if each.significant)
+
+    @property
     def any(self) -> bool:
-        """Whether any change is significant."""
-        return bool(self.found) or any(each.significant for each in self.together)
+        """Whether any change of what was asked for is significant."""
+        return bool(self.found or self.jointly)
 
 
 def changes(
@@ -123,30 +130,34 @@ def changes(
         joined: the recordings, in the order of their dates.
         days: of these.
         inflations: by what sigmas of the numbers are larger because noise is coloured; 1 where not given.
-        asked: the numbers whose steps are looked for; None: all.
+        asked: the numbers that a change matters of; None: all.
         level: how often chance alone may make any step in such a history.
     """
     if len(joined.parts) < 2:
         return Changes(level)
     A, b = (np.concatenate(each) for each in zip(*joined.rows, strict=True))
     steady = [(name, k) for k, (name, recording) in enumerate(joined.unknowns) if recording is None]
-    steady = [(name, k) for name, k in steady if asked is None or name in asked]
     questions = [(name, k, after) for after in range(len(joined.parts) - 1) for name, k in steady]
     columns = _columns(joined, questions)
     left, residual = _projected(A * joined.scales, columns, b)
     determined = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _DETERMINED
     questions = [question for question, yes in zip(questions, determined, strict=True) if yes]
-    if not questions:
+    wanted = np.array([asked is None or name in asked for name, _, _ in questions], dtype=bool)
+    if not wanted.any():
         return Changes(level)
     columns, left = columns[:, determined], left[:, determined]
     grown = np.array([inflations.get(name, 1.0) for name, _, _ in questions])
     limit = _limit(left, level)
     found, steps = _significant_steps(A * joined.scales, b, columns, questions, grown, limit)
+    names = {name for (name, _, _), yes in zip(questions, wanted, strict=True) if yes}
+    questions = [question for question in questions if question[0] in names]
+    left, grown = left[:, wanted], grown[wanted]
     return Changes(
         level,
         limit,
-        tuple(found),
-        tuple(steps),
+        tuple(step for step in found if step.name in names),
+        tuple(step for step in found if step.name not in names),
+        tuple(step for step in steps if step.name in names),
         tuple(_together(left, residual, questions, grown, level)),
         _rates(left, residual, questions, days, grown),
     )

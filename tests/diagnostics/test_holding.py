@@ -140,6 +140,19 @@ def test_errors_of_vision_by_attitude_are_no_change(tmp_path: Path) -> None:
     assert (sigmas[0] > 1.02 * sigmas[1]).all()
 
 
+def test_a_gyro_whose_scale_changed_is_no_mount_that_moved(tmp_path: Path) -> None:
+    """By 3 %: both camera mounts were 4 and 7 sigmas off, and the scale was not mentioned."""
+    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0, "duration_s": 30.0}
+    scenario = method("head").settings("head_mounts").model_dump() | rates
+    opened(simulate("head", scenario, seed=1)).calibrate("batch", report=False).write(tmp_path)
+    later = simulate("head", scenario, seed=2)
+    scaled = replace(later.data, head_gyro=later.data.head_gyro * [1.03, 1.0, 1.0])
+    method("head").write(tmp_path / "later.mcap", replace(later, data=scaled))
+    found = validate(tmp_path / "later.mcap", tmp_path / "calibration.yaml")
+    assert found.verdict == "holds"
+    assert any(note.startswith("gyro_scale_x changed by 2.9") for note in found.notes)
+
+
 def test_a_recording_among_those_of_the_calibration_says_nothing_of_it(tmp_path: Path, alidade: Command) -> None:
     """Jointly with another, or behind the calibration that was a prior: it would count twice."""
     seeds = (1, 2, 3)

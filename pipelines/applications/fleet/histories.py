@@ -48,7 +48,7 @@ class History:
     @property
     def together(self) -> tuple[int, ...]:
         """Indexes of recordings after which all parameters together changed, if none changed by itself."""
-        return () if self.changes.found else tuple(each.after for each in self.changes.together if each.significant)
+        return tuple(each.after for each in self.changes.jointly)
 
 
 def packed(sqrt_info: SqrtInformation) -> str:
