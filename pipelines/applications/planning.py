@@ -144,7 +144,7 @@ def plan(
 
     Args:
         method: los, indexer, ...
-        scenario: YAML file or name; None is the method's nominal one.
+        scenario: YAML file or name; None: the method's nominal motion, without the priors of that scenario.
         config: overrides key by key the config that the simulated recording brings.
         require: parameter -> sigma wanted, over those of the config.
         most_steps: changes at most.
@@ -154,6 +154,8 @@ def plan(
     """
     chosen = methods.method(method)
     settings = chosen.settings(None if scenario is None else str(scenario)).model_dump()
+    if scenario is None and "priors" in settings:
+        settings["priors"] = {}
     predicted = partial(predict, method, config_file=config, require=dict(require or {}), made={})
     with progress.doing("predicting"):
         now = predicted(settings)

@@ -106,7 +106,10 @@ def _parameter_table(plan: Plan) -> Table:
 def _summary(plan: Plan) -> Summary:
     question, duration = "Does the planned motion determine what is wanted?", plan.now.duration
     if not plan.now.missing:
-        text = f"This motion, {duration:.0f} s of it, determines everything as accurately as required."
+        fixed = [q.name for q in plan.now.quantities if q.judged and q.prior_sigma == 0.0]
+        what = "all free parameters" if fixed else "everything"
+        rest = f"; fixed are {', '.join(fixed)}" if fixed else ""
+        text = f"This motion, {duration:.0f} s of it, determines {what} as accurately as required{rest}."
         return Summary(question, "yes", "good", text, (), ("Record it.",))
     short = ", ".join(f"{name} by a factor of {rounded(ratio)}" for name, ratio in plan.now.missing.items())
     steps = [f"{capital(step.change)} ({step.gain:.1f} nats of what is missing)." for step in plan.steps]

@@ -113,6 +113,16 @@ def test_a_motion_that_tells_everything_is_left_as_it_is(tmp_path: Path) -> None
     assert plan.best is plan.now
 
 
+def test_plan_without_scenario_predicts_mounts_and_names_what_a_scenario_fixes() -> None:
+    """The nominal scenario of head fixes the mounts, and the plan once determined everything."""
+    assert set(alidade.plan("head", most_steps=0).now.verdicts.values()) == {"observable"}
+    fixed = alidade.plan("head", "head_nominal", most_steps=0)
+    assert fixed.now.verdicts["helmet_mount_x"] == "fixed"
+    assert "determines all free parameters as accurately as required; fixed are helmet_mount_x, " in str(
+        plan_report(fixed).summary
+    )
+
+
 @pytest.mark.slow
 def test_what_no_motion_can_tell_gets_no_change(tmp_path: Path) -> None:
     """delta_pz and delta_gz asked for apart: only their difference is ever known."""
