@@ -318,6 +318,8 @@ def follow(
         Path | None, typer.Option(help="Folder that keeps what arrives by ws:// or -; a later run appends.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results [default: SOURCE-incremental].")] = None,
+    auto_topics: _AutoTopics = False,
+    auto_columns: _AutoColumns = False,
     no_check: _NoCheck = False,
     as_json: _Json = False,
 ) -> None:
@@ -335,7 +337,8 @@ def follow(
     folder = out or _default_folder(Path(_file_name(source)), "incremental")
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
-    settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
+    auto = {"auto_topics": auto_topics, "auto_columns": auto_columns}
+    settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior, **auto)
     page_at = (host, page_port) if page else None
     pace = None if replay is None else speed
     calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or (), pace)

@@ -66,6 +66,7 @@ class Settings:
         checkpoint: file the run is saved in from time to time, and resumed from.
         check: end with the solution of all measurements by batch.
         prior: an earlier calibration of the device to begin from.
+        auto_topics, auto_columns: use what `alidade info` proposes of what has been recorded so far.
     """
 
     method: str | None = None
@@ -75,6 +76,8 @@ class Settings:
     checkpoint: Path | None = None
     check: bool = False
     prior: Path | None = None
+    auto_topics: bool = False
+    auto_columns: bool = False
 
 
 class Follower:
@@ -187,7 +190,9 @@ class Follower:
 
     def _read(self, recording: Recording) -> Session:
         settings = self.settings
-        return Session.read(recording, settings.method, settings.config, prior=settings.prior)
+        return Session.read(
+            recording, settings.method, settings.config, settings.auto_topics, settings.prior, settings.auto_columns
+        )
 
     def _guessed_before(self, session: Session) -> Problem | None:
         """Return the graph with the initial values of a recent look, which take most of the time; None without one."""

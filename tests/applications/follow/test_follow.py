@@ -265,6 +265,17 @@ def test_json_is_all_that_is_printed(whole: Path, tmp_path: Path, alidade: Comma
     assert json.loads(done.out) == json.loads((tmp_path / "out" / "result.json").read_text())
 
 
+@pytest.mark.usefixtures("early")
+def test_follow_uses_the_topics_that_its_message_proposes(whole: Path, tmp_path: Path, alidade: Command) -> None:
+    """It once recommended --auto-topics, an option that follow lacked."""
+    renamed = tmp_path / "renamed.mcap"
+    renamed.write_bytes(whole.read_bytes().replace(b"/imu", b"/omu"))
+    refused = alidade("follow", renamed, "--out", tmp_path / "out")
+    assert (refused.code, refused.err.count("\n"), "--auto-topics" in refused.err) == (2, 1, True)
+    done = alidade("follow", renamed, "--auto-topics", "--no-check", "--out", tmp_path / "out")
+    assert "topics chosen automatically (los): /omu" in done.out, done.err
+
+
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"s\.mcap: nothing there, or nothing in it, after 0\.3 s of waiting"):
         _follow(tmp_path / "s.mcap", Settings(patience=0.3))
