@@ -220,7 +220,8 @@ def calibrate_fleet(
         else:
             fresh[name] = result
 
-    interrupted = work_off(calibrate_recording, tasks, take, "calibrating", scheduler, jobs)
+    with store:
+        interrupted = work_off(calibrate_recording, tasks, take, "calibrating", scheduler, jobs)
     known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}
     results = {name: _placed(name, known[name], named[name]) for name in recordings if name in known}
     return Outcome(results, len(recordings), len(unchanged), interrupted)

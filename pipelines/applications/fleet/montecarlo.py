@@ -159,7 +159,8 @@ def run_study(
         else:
             store.add(name, result)
 
-    interrupted = work_off(simulate_and_solve, tasks, take, "simulating and solving", scheduler, jobs)
+    with store:
+        interrupted = work_off(simulate_and_solve, tasks, take, "simulating and solving", scheduler, jobs)
     known = {**store.results, **killed}
     results = {seed: known[str(seed)] for seed in seeds if str(seed) in known}
     name = Path(scenario or chosen.default_scenario()).stem

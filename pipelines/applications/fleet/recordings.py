@@ -58,8 +58,10 @@ def find(patterns: Sequence[str]) -> dict[str, Recording]:
             fs, path = url_to_fs(pattern)
             fs.invalidate_cache()  # what was listed before may have changed
             bags, files = _bags_and_files(fs, fs.glob(path, detail=True))
+            is_folder = not bags and not files and fs.isdir(path)
         if not bags and not files:
-            raise InputError(f"no recording matches {pattern}")
+            inside = f": that is a folder; give what is in it, '{pattern.rstrip('/')}/*.mcap'" if is_folder else ""
+            raise InputError(f"no recording matches {pattern}{inside}")
         for address in (*bags, *files):
             file, info = OpenFile(fs, address), files.get(address, {})
             name = file.path if _is_local(file) else file.full_name

@@ -16,9 +16,10 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, Required, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, Required, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import TypedDict  # pydantic needs it below Python 3.12, and brings it
@@ -110,12 +111,15 @@ def settings_key(*settings: Any) -> str:
 class Store(Generic[Result]):
     """Results of one kind by name, in `results.jsonl` of a folder; those of other settings are ignored.
 
+    A context manager: without any result it leaves neither the file nor a folder that it made.
+
     Raises InputError when the folder cannot be written to, or another process keeps its results there.
     """
 
     def __init__(self, folder: Path, settings: str, kind: type[Result]) -> None:
         self._path, self._settings, self._kind = folder / FILE, settings, TypeAdapter(kind)
         self.results: dict[str, Result] = {}
+        self._makes_folder = not folder.exists()
         require_writable(folder)
         try:
             self._stream = self._path.open("a+b")
@@ -125,6 +129,17 @@ class Store(Generic[Result]):
         except OSError as error:
             raise InputError(f"{self._path}: cannot be written ({error.strerror})") from error
         self._load()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if os.fstat(self._stream.fileno()).st_size:
+            return
+        with suppress(OSError):  # another has put something there, or taken it away
+            self._path.unlink()
+            if self._makes_folder:
+                self._path.parent.rmdir()
 
     def add(self, name: str, result: Result) -> None:
         """Append a result to the file, and flush the file before returning."""

@@ -167,6 +167,7 @@ def test_bad_input_is_one_line(
     assert code == 2
     assert len(error.splitlines()) == 1
     assert said in error
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("words", [("montecarlo", "head"), ("fleet", "*.mcap")])

@@ -334,6 +334,7 @@ def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]
     ("arguments", "said"),
     [
         (["nowhere/*.mcap"], "no recording matches nowhere/*.mcap"),
+        (["{recordings}/"], "/*.mcap'"),
         (["{recordings}/*.mcap", "--names", "{unit}-{date}"], "does not fit --names {unit}-{date}"),
         (["{recordings}/*.mcap", "--names", "unit"], "needs {unit}, {date} or both"),
         (["{recordings}/*.mcap", "--method", "gyro"], "no method 'gyro'"),
@@ -370,4 +371,4 @@ def test_bad_input_is_one_line(
     assert code == 2
     assert len(error.splitlines()) == 1
     assert said in error
-    assert not (tmp_path / "alidade-fleet" / "fleet.csv").exists()
+    assert not (tmp_path / "alidade-fleet").exists()
