@@ -6,15 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from alidade.pipelines import deadline
-from alidade.pipelines.applications.session import Session, open_session
+from alidade.pipelines import deadline, methods
+from alidade.pipelines.applications.session import Session, open_session, resolve_method
 from alidade.pipelines.applications.sharing import device_prior, finding_of_recording, walks
-from alidade.pipelines.config import Settings
+from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Change, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
+from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.gaussian_prior import GaussianPrior
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration, load_known, saved, with_covariance
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.sentences import sentence
@@ -144,16 +146,17 @@ def validate(
         InputError: recording, config or calibration cannot be used, or the calibration is another method's.
     """
     path = Path(recording)
-    if isinstance(calibration, Calibration):
-        known = saved(calibration)
-    else:
-        known = with_covariance(load_known(Path(calibration)), Path(calibration))
-    session = open_session(
-        path, method or known.method, config, strict, auto_topics=auto_topics, auto_columns=auto_columns
-    )
+    known = saved(calibration) if isinstance(calibration, Calibration) else load_known(Path(calibration))
+    known.of_method(known.method if method is None else methods.method(method).name)
+    try:
+        session = open_session(path, known.method, config, strict, auto_topics=auto_topics, auto_columns=auto_columns)
+    except InputError:
+        known.of_method(_method_of(path, config) or known.method)
+        raise
+    if not isinstance(calibration, Calibration):
+        known = with_covariance(known, Path(calibration))
     chosen, data, settings, opened = session.method, session.data, session.config, session.recording
     assert opened is not None
-    known.of_method(chosen.name)
     values = known.values
     validations = chosen.report.validate(data, settings, values)
     if known.includes(opened.sha256()):
@@ -172,6 +175,14 @@ def validate(
     device = chosen.report.validate(data, settings, numbers | conditional | fixed)
     best = chosen.report.validate(data, settings, numbers)
     return Validated(known, path.name, validations, False, lost, held, device, best, finding_of_recording(own))
+
+
+def _method_of(path: Path, config: Settings) -> str:
+    """Return the method that a recording selects by itself; empty where it selects none."""
+    try:
+        return resolve_method(None, *configured(open_recording(path), config))
+    except InputError:
+        return ""
 
 
 def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Calibration] | None:

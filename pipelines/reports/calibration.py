@@ -146,7 +146,10 @@ class SavedCalibration(_Record, SensorValues):
     def of_method(self, name: str) -> SavedCalibration:
         """Return this calibration. Raises InputError when it is another method's."""
         if self.method != name:
-            raise InputError(f"{self.gaussian_prior.source}: is a calibration of {self.method}, not of {name}")
+            raise InputError(
+                f"{self.gaussian_prior.source}: is a calibration of {self.method}, not of {name}; give one that "
+                f"`calibrate --method {name}` wrote"
+            )
         return self
 
     @property

@@ -153,10 +153,12 @@ def test_calibration_of_another_method_is_refused(tmp_path: Path) -> None:
         "schema: alidade.calibration/1\nmethod: los\nsolver: batch\nstatus: calibrated\n"
         "recording: {file: x, sha256: x, start: '2026-01-01T00:00:00+00:00'}\nparameters: {}\n"
     )
-    command = ["validate", str(tmp_path / "s.mcap"), "--method", "head", "--calibration", str(tmp_path / "c.yaml")]
-    result = CliRunner().invoke(app, command)
-    assert isinstance(result.exception, InputError)
-    assert "is a calibration of los, not of head" in str(result.exception)
+    command = ["validate", str(tmp_path / "s.mcap"), "--calibration", str(tmp_path / "c.yaml")]
+    said = "is a calibration of los, not of head; give one that `calibrate --method head` wrote"
+    for more in ([], ["--method", "head"]):
+        result = CliRunner().invoke(app, [*command, *more])
+        assert isinstance(result.exception, InputError)
+        assert str(result.exception) == f"{tmp_path / 'c.yaml'}: {said}"
 
 
 def test_without_platform_topic_the_camera_mount_is_fixed() -> None:
