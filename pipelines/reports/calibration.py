@@ -267,7 +267,10 @@ def load_calibration(path: Path, config: Config | None = None) -> SavedCalibrati
     """Read calibration.yaml, with the config that its formulas are for. Raises InputError when it cannot be used."""
     data = read_bytes(path, MAX_YAML_BYTES)
     try:
-        read = SavedCalibration.model_validate(load_yaml(data, str(path)))
+        content = load_yaml(data, str(path))
+        if isinstance(content, dict) and content.get("schema") == "alidade.result/1":
+            raise InputError(f"{path}: is a result.json, which has no formulas")
+        read = SavedCalibration.model_validate(content)
         read._config, read._source = config or Config(), str(path)
         return read
     except InputError as error:

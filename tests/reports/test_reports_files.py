@@ -159,13 +159,14 @@ def test_calibration_yaml_has_floats_that_older_yaml_readers_take_for_floats() -
     assert "value: 5.0e-05" in calibration_yaml(make_calibration())
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2", "method: head\n", "a: \x00", "- 1\n"])
+@pytest.mark.parametrize("text", ["", "[1, 2", "method: head\n", "a: \x00", "- 1\n", "schema: alidade.result/1"])
 def test_a_file_that_is_no_calibration_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "calibration.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"calibration\.yaml: ") as caught:
         load_calibration(path)
     assert "\n" not in str(caught.value)
+    assert ("is a result.json" in str(caught.value)) == ("result" in text)
     with pytest.raises(InputError, match="cannot be opened"):
         load_calibration(tmp_path / "none.yaml")
 
