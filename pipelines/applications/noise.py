@@ -186,8 +186,8 @@ def _check_units(name: str, t: Array, samples: Mapping[str, Array]) -> None:
         density = float(np.median(steps)) * float(np.median(np.diff(t))) ** 0.5
         if density > _MOST_GYRO_DENSITY:
             wrong.append(
-                f"rates scatter by {density:.2g} rad/s/sqrt(Hz), more than any gyro's ({_MOST_GYRO_DENSITY:g}); is it "
-                "in deg/s?"
+                f"rates scatter by {density:.2g} rad/s/sqrt(Hz), more than any gyro's at rest "
+                f"({_MOST_GYRO_DENSITY:g}): record it lying still; if it did, is it in deg/s?"
             )
     if wrong:
         raise InputError(

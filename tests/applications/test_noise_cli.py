@@ -169,6 +169,10 @@ def test_a_recording_that_never_rests_is_told_so(motion: str, alidade: Command, 
 @pytest.mark.parametrize(
     ("topics", "words"),
     [
+        (
+            {"/imu": series.ImuSeries(stamps(grid(900, 0.01)), 8.0 * moving(grid(900, 0.05)))},
+            "more than any gyro's at rest (0.003): record it lying still; if it did, is it in deg/s?",
+        ),
         ({"/truth": series.QuaternionSeries(stamps(np.arange(3.0)), np.eye(4)[:3])}, "no messages of an inertial"),
         ({"/imu": series.ImuSeries(stamps(np.arange(300.0)), np.zeros((300, 3)))}, "no sensor, all values are zero"),
         ({"/imu": series.ImuSeries(stamps(grid(40, 0.01)), np.ones((40, 3)))}, "nowhere at rest"),
