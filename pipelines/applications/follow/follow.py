@@ -65,7 +65,8 @@ def follow(
         if server is not None:
             screen.say(f"estimates live at {server.url} (Foxglove: open connection)")
 
-        page = None if page_at is None else stack.enter_context(LivePage(screen.say, *page_at, name=what))
+        name = "standard input" if what == "-" else what
+        page = None if page_at is None else stack.enter_context(LivePage(screen.say, *page_at, name=name))
         if page is not None:
             screen.say(f"page at {page.url}")
             if page.is_open:

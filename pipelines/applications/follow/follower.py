@@ -127,6 +127,13 @@ class Follower:
         """
         # What is there by now stays: to look through it for garbage takes as long as dozens of updates, every minute.
         gc.freeze()
+        try:
+            calibration = self._followed()
+        except InputError as error:
+            raise type(error)(self.source.named(str(error))) from error
+        return calibration if self.source.is_kept else replace(calibration, recording=self.source.name)
+
+    def _followed(self) -> Calibration:
         source, patience = self.source, self.settings.patience
         size, grown, due = -1, time.monotonic(), 0.0
         while True:

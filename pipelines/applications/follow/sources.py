@@ -35,7 +35,10 @@ class Source(AbstractContextManager["Source"]):
     Attributes:
         path: of the file or the folder.
         name: what it is called in sentences.
+        is_kept: whether its files stay: results name the file, else the source.
     """
+
+    is_kept = True
 
     def __init__(self, path: Path, name: str | None = None) -> None:
         self.path, self.name = path, name or str(path)
@@ -67,6 +70,12 @@ class Source(AbstractContextManager["Source"]):
             return False
         return closed and (not self.path.is_dir() or (self.path / "metadata.yaml").is_file())
 
+    def named(self, sentence: str) -> str:
+        """Return a sentence with the source's name in place of those of its temporary files."""
+        for file in () if self.is_kept else self.parts:
+            sentence = sentence.replace(str(file), self.name)
+        return sentence
+
     def __exit__(self, *_: object) -> None:
         """Do nothing: another process writes the recording."""
 
@@ -85,6 +94,7 @@ class Stream(Source):
     def __init__(self, name: str, folder: Path | None, say: Callable[[str], None]) -> None:
         self._stack, self._say = ExitStack(), say
         self._ended = threading.Event()
+        self.is_kept = folder is not None
         try:
             if folder is None:
                 folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="alidade-")))

@@ -129,6 +129,7 @@ def test_standard_input(whole: Path, batch: Calibration, tmp_path: Path) -> None
     calibration, _, _ = follow(StandardInput(kept, io.BytesIO(whole.read_bytes())), Settings())
     agree(calibration, batch, 1e-9)
     assert [p.read_bytes() for p in kept.iterdir()] == [whole.read_bytes()]
+    assert calibration.recording == "live_0000.mcap"
     with StandardInput(None, io.BytesIO(b"what comes"), lambda _: None) as source:
         assert source._ended.wait(5.0)
     assert not source.path.exists()
@@ -149,10 +150,11 @@ def test_a_pipe_that_ends_early_gives_what_came(whole: Path) -> None:
     calibration, _, _ = follow(StandardInput(None, half), Settings(method="los"))
     assert 2.0 < calibration.facts.duration_s < 6.0
     assert any("truncated" in note for note in calibration.facts.notes)
+    assert calibration.recording == "standard input"
 
 
 def test_a_pipe_of_something_else_is_one_line() -> None:
-    with pytest.raises(InputError, match="not an MCAP file"):
+    with pytest.raises(InputError, match=r"^standard input: not an MCAP file"):
         follow(StandardInput(None, io.BytesIO(b"%PDF-1.7" + bytes(100))), Settings())
     with pytest.raises(InputError, match=r"standard input: nothing there, or nothing in it$"):
         follow(StandardInput(None, io.BytesIO(b"")), Settings())
