@@ -331,8 +331,12 @@ def follow(
     from alidade.pipelines.applications.follow.follower import Settings
     from alidade.pipelines.reports.write import write_results
 
-    if (source is None) == (replay is None):
+    if source is not None and replay is not None:
+        raise InputError(f"follow: --replay {replay} stands in place of SOURCE; leave out {source}")
+    if source is None and replay is None:
         raise InputError("follow: give a SOURCE, or a finished recording with --replay")
+    if replay is None and speed != 1.0:
+        raise InputError(f"--speed {speed:g}: is that of --replay; {source} is followed as fast as it is written")
     source = source or str(replay)
     folder = out or _default_folder(Path(_file_name(source)), "incremental")
     for place in (folder, checkpoint and checkpoint.parent):

@@ -365,6 +365,11 @@ def test_errors_name_what_is_missing_where_and_what_there_is(alidade: Command, s
     assert run.code == 2
     assert "t.mcap: method los lacks /gimbal/joint_states (sensor_msgs/msg/JointState)" in run.err
     assert "dead" not in run.err
-    run = alidade("follow")
-    assert (run.code, run.err.count("\n")) == (2, 1)
-    assert "--replay" in run.err
+    for words, said in (
+        ((), "with --replay"),
+        ((session, "--replay", session), f"stands in place of SOURCE; leave out {session}"),
+        ((session, "--speed", "2"), "--speed 2: is that of --replay"),
+    ):
+        run = alidade("follow", *words, "--out", tmp_path / "out")
+        assert (run.code, run.err.count("\n")) == (2, 1)
+        assert said in run.err
