@@ -173,7 +173,8 @@ def test_a_sensor_that_is_there_but_not_used_is_told(simulated: Path, tmp_path: 
     assert session.facts.notes == (told,)
     config = load_config(b"topics: {platform_imu: /vehicle/imu}")
     assert Session.read(open_recording(tmp_path / "s.mcap"), "head", config).facts.notes == ()
-    write_session(tmp_path / "t.mcap", topics)
+    # What `apply` adds is no other sensor.
+    write_session(tmp_path / "t.mcap", {**topics, "/head/imu_calibrated": topics["/head/imu"]})
     assert Session.read(open_recording(tmp_path / "t.mcap"), "head", None).facts.notes == ()
 
 
