@@ -590,13 +590,15 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     }
     if absent:
         raise InputError(f"{recording.path}: {'; '.join(sorted(absent))}; {recording.there()}")
-    nearest = nearest_suggestion(suggestions(recording, config))
+    found = suggestions(recording, config)
+    nearest = nearest_suggestion(found)
     by_name = [
         name for name in methods.names() if not missing_for(name, recording, config.model_copy(update={"method": name}))
     ]
     if by_name:
-        options = " or ".join(f"--method {name}" for name in by_name)
-        raise InputError(f"{recording.path}: these topics alone do not select a method; use {options}")
+        options = [f"--method {name}" for name in by_name]
+        options += [f"--method {each.method} --auto-topics" for each in found if not each.missing]
+        raise InputError(f"{recording.path}: these topics alone do not select a method; use {' or '.join(options)}")
     columns = propose_columns(recording)
     if columns is not None and columns.columns:
         kind = NotARecordingError if tables_of(recording.container) else InputError

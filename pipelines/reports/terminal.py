@@ -190,7 +190,7 @@ def print_facts(
     """Print what a recording can calibrate and with which topics, what each method lacks, then its topics."""
     say(f"{name}, {facts.duration_s:.1f} s")
     _print_columns(columns)
-    _print_methods(facts, found)
+    _print_methods(facts, found, columns)
     proposed = {str(name) for each in found for source in each.topics.values() for _, name in source}
     if left := [name for name in unused if name not in proposed]:
         _paragraph(f"not used: {', '.join(left)}")
@@ -222,7 +222,7 @@ def _print_columns(columns: Columns | None) -> None:
         _paragraph(f"  {sentence}")
 
 
-def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
+def _print_methods(facts: SessionFacts, found: Sequence[Suggestion], columns: Columns | None) -> None:
     """Print the methods that a recording serves, those it could with other topics, and what the others lack."""
     for method, missing in facts.missing.items():
         if not missing:
@@ -232,7 +232,8 @@ def _print_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
     for suggestion in found:
         if not suggestion.missing:
             name = f"--method {suggestion.method} " if suggestion.has_to_be_asked_for else ""
-            how = f"use `calibrate {name}--auto-topics` or paste them into the config"
+            tables = "--auto-columns " if columns is not None and columns.columns else ""
+            how = f"use `calibrate {name}{tables}--auto-topics` or paste them into the config"
             console.print(f"[yellow]{suggestion.method}: yes, with these topics ({how}):[/]")
             for reason in suggestion.reasons:
                 _paragraph(f"  {reason}")

@@ -571,6 +571,10 @@ def test_the_parts_of_an_imu_are_no_gyros_beside_it(tmp_path: Path, alidade: Com
     assert "head_imu: {gyro: /imu/gyro, accel: /imu/accel}" in out
     assert "an attitude made of it is no reference" in " ".join(out.split())
     assert "vision_attitude: /attitude" in out
+    # Topics that are found in tables take both options.
+    assert "use `calibrate --auto-columns --auto-topics` or paste" in " ".join(out.split())
+    refused = alidade("calibrate", str(folder), "--auto-columns", "--out", str(tmp_path / "out"))
+    assert (refused.code, "--method head --auto-topics" in refused.err) == (2, True)
 
 
 def test_one_command_calibrates_a_phones_table(tmp_path: Path, alidade: Command) -> None:
