@@ -78,7 +78,8 @@ def open_binary(path: Path, named: Path | None = None) -> BinaryIO:
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Yield a temporary file that replaces `path` when the block ends without an error; InputError if it cannot."""
-    if not path.name or (path.exists() and not path.is_file()):
+    require_place(path)
+    if path.exists() and not path.is_file():
         raise InputError(f"{path}: there is no file to be written, it is something else")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -311,10 +312,21 @@ def require_room(out_dir: Path | None) -> None:
         raise InputError(f"{out_dir}: no folder to write results to ({there} may not be written to)")
 
 
+def require_place(path: Path | None) -> None:
+    """Raise InputError before the work whose result is written to a file, if there is no place for the file."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file in it")
+    is_special = path.exists() and not path.is_file()
+    if not is_special and not (path.parent.is_dir() and os.access(path.parent, os.W_OK)):
+        raise InputError(f"{path}: cannot be written ({path.parent} is no folder that may be written to)")
+
+
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a single file, whole or not at all. Raises InputError when it cannot be written."""
     data = content if isinstance(content, bytes) else content.encode()
-    if path.exists() and not path.is_file():  # a pipe, a terminal
+    if path.exists() and not path.is_file() and not path.is_dir():  # a pipe, a terminal
         try:
             path.write_bytes(data)
         except OSError as error:

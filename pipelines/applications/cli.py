@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 
 from alidade.pipelines import deadline, errors, parallel, progress
 from alidade.pipelines.errors import InputError, nearest_three, printable
-from alidade.pipelines.files import plain_json, require_room, write_file, write_whole
+from alidade.pipelines.files import plain_json, require_place, require_room, write_file, write_whole
 from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
@@ -400,6 +400,7 @@ def simulate(
     """Simulate a recording, with its truth."""
     from alidade.pipelines.methods import simulate as run
 
+    require_place(out)
     with progress.shown(quiet), progress.doing("simulating"):
         run(method, scenario, seed, out, images)
     _say(f"Wrote {out}")
@@ -462,6 +463,8 @@ def plan(
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plan_report import plan_json, plan_report
 
+    for place in (out, page):
+        require_place(place)
     with progress.shown(quiet or as_json):
         planned = planned_motion(method, scenario, config=config, require=requirements(require or []))
     lines = []
@@ -526,6 +529,7 @@ def noise(
     from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.noise_report import noise_json, noise_report
 
+    require_room(out)
     with progress.shown(quiet), deadline.within(time_limit):
         study = measured(session, config=config, strict=strict, auto_columns=auto_columns)
     lines, report, text = list[str](), noise_report(study), noise_json(study)
@@ -681,6 +685,7 @@ def apply(
     from alidade.pipelines.applications.apply import applied_json
     from alidade.pipelines.applications.apply import apply as run
 
+    require_place(out)
     with progress.shown(quiet or as_json):
         applied = run(
             recording, calibration, out, config=config, suffix=suffix, strict=strict, auto_columns=auto_columns
@@ -737,6 +742,8 @@ def cube_layout(
     page = out.with_suffix(".html")
     if page == out:
         raise InputError(f"{out}: --out names the config, and its page takes the name with .html; call it .yaml")
+    for place in (out, page):
+        require_place(place)
     with progress.shown(quiet), progress.doing("finding where the tags are"):
         layout = estimate([configured(open_recording(session), config) for session in sessions], refine_camera)
     write_file(out, layout_yaml(layout))

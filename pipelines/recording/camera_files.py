@@ -20,6 +20,8 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 
 SUFFIXES = (".yaml", ".yml", ".cameramodel")
+# Of a result in place of a recording.
+IS_RESULT = "that is a result, no recording; `--prior` and `--calibration` take it"
 # ROS's name of Kalibr's and EuRoC's models.
 _ROS = {"radtan": "plumb_bob", "radial-tangential": "plumb_bob", "none": "plumb_bob"}
 # Their distortion coefficients are OpenCV's, after fx fy cx cy.
@@ -51,7 +53,7 @@ def _why_own_file(content: object) -> str:
     """Return why a result or a config of alidade is no camera calibration, as a phrase; empty for other content."""
     keys = set(content) if isinstance(content, dict) else set()
     if isinstance(content, dict) and str(content.get("schema", "")).startswith("alidade."):
-        return "that is a result, no recording; `--prior` and `--calibration` take it"
+        return IS_RESULT
     if keys & {"method", "topics", "columns", "noise", "priors", "require", "sensors"}:
         return "that is a config, no recording; `--config` takes it, beside a recording"
     return ""

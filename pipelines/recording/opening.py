@@ -18,7 +18,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, open_binary, read_bytes, require_regular
 from alidade.pipelines.recording import ros1_bag
 from alidade.pipelines.recording.array_container import ArrayContainer
-from alidade.pipelines.recording.camera_files import SUFFIXES, CameraFile, read_cameras
+from alidade.pipelines.recording.camera_files import IS_RESULT, SUFFIXES, CameraFile, read_cameras
 from alidade.pipelines.recording.container import Container, MultiPartContainer
 from alidade.pipelines.recording.images import is_video
 from alidade.pipelines.recording.mcap_file import McapFile
@@ -164,6 +164,8 @@ def _by_content(path: Path, data: Path) -> Container:
 
     if path.suffix in SUFFIXES and looks_like_text(start):
         return read_cameras(path, data)
+    if re.match(rb'\s*\{\s*"schema": "alidade\.', start):
+        raise InputError(f"{path}: {IS_RESULT}")
     is_table = looks_like_text(start) and not start.startswith(MAGIC)
     return read_table(path, data) if is_table else McapFile(path, data)
 

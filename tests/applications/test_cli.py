@@ -248,14 +248,26 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
             "alidade.pipelines.applications.follow.follow.follow",
             "alidade.pipelines.applications.validate.validate",
             "alidade.pipelines.applications.session.open_session",
+            "alidade.pipelines.applications.noise.noise",
+            "alidade.pipelines.applications.planning.plan",
+            "alidade.pipelines.applications.apply.apply",
+            "alidade.pipelines.methods.simulate",
         ):
             patched.setattr(name, worked)
-        for command in ("calibrate", "compare", "follow"):
+        for command in ("calibrate", "compare", "follow", "noise"):
             _refused(alidade(command, session, "--out", out), out, ("no folder to write results to", "file"))
         validate = ("validate", session, "--calibration", tmp_path / "file", "--out", out)
         _refused(alidade(*validate), out, ("no folder to write results to", "file"))
         _refused(alidade("demo", "--out", tmp_path / "file"), out, ("no folder to write results to",))
         _refused(alidade("follow", session, "--checkpoint", out / "run.npz"), out, ("no folder to write",))
+        for words in (
+            ("plan", "head", "--out"),
+            ("plan", "head", "--page"),
+            ("apply", session, session, "--out"),
+            ("simulate", "head", "--out"),
+        ):
+            _refused(alidade(*words, out), out, ("out: cannot be written", "file is no folder"))
+            _refused(alidade(*words, tmp_path), out, ("is a folder; name a file in it",))
     for path in (out, tmp_path / "none" / "s.mcap", tmp_path):
         run = alidade("simulate", "tumble", "--out", path)
         assert (run.code, run.err.count("\n")) == (2, 1)

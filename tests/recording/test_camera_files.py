@@ -105,6 +105,7 @@ def test_beside_a_recording_it_is_one_of_its_topics_and_does_not_begin_it(tmp_pa
         ("a.yml", "[1, 2]", "no camera calibration"),
         ("c.yaml", "method: cube", "that is a config, no recording; `--config` takes it"),
         ("c.yaml", "schema: alidade.calibration/1", "that is a result, no recording"),
+        ("result.json", '{\n "schema": "alidade.result/1",\n "method": "los"\n}', "that is a result, no recording"),
         ("a.yaml", "a: [", "unreadable YAML"),
     ],
 )

@@ -166,6 +166,7 @@ def test_a_file_that_is_no_calibration_is_refused_in_one_line(tmp_path: Path, te
     with pytest.raises(InputError, match=r"calibration\.yaml: ") as caught:
         load_calibration(path)
     assert "\n" not in str(caught.value)
+    assert "Input should be a valid dict" not in str(caught.value)
     assert ("is a result.json" in str(caught.value)) == ("result" in text)
     with pytest.raises(InputError, match="cannot be opened"):
         load_calibration(tmp_path / "none.yaml")
