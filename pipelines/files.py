@@ -221,6 +221,8 @@ def _nodes(node: Any, known: dict[int, float]) -> float:
 
 
 def _cannot_open(path: Path, error: Exception) -> InputError:
+    if isinstance(error, IsADirectoryError):
+        return InputError(f"{path}: is a folder; name a file in it")
     return InputError(f"{path}: cannot be opened ({getattr(error, 'strerror', None) or error})")
 
 

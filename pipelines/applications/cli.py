@@ -591,6 +591,7 @@ def montecarlo(
     folder = out or Path(f"{method}-montecarlo")
     chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
     seeds = range(seed, seed + runs)
+    require_room(folder)
     with progress.shown(quiet or as_json):
         study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, parse_window(window))
     written, report = write_study(folder, study), study_report(study)
@@ -625,6 +626,7 @@ def fleet(
     from alidade.pipelines.applications.fleet.fleet import fleet as run
     from alidade.pipelines.applications.fleet.fleet import fleet_json
 
+    require_room(out)
     work = partial(run, recordings, out, method=method, config=config, solver=solver, window=parse_window(window))
     with progress.shown(quiet or as_json):
         found = work(names=names, prior=prior, scheduler=scheduler, jobs=jobs)
@@ -711,6 +713,7 @@ def certificate(
     """
     from alidade.pipelines.reports.certificate import certificate as write
 
+    require_room(out)
     written, missing = write(results, fields, before=before, out=out, pdf=pdf, dcc=digital)
     _say(f"Wrote {', '.join(map(str, written))}", *([f"not stated: {', '.join(missing)}"] if missing else []))
 

@@ -325,9 +325,8 @@ def read_result(path: Path, text: str | bytes | None = None) -> Result:
 def invalid(path: Path, what: str, error: ValidationError) -> InputError:
     """Return an InputError with the first error that pydantic found in a file."""
     first: Any = error.errors()[0]
-    where = ".".join(map(str, first["loc"]))
-    said = f"{where}: {first['msg']}" if where else "it has no keys and values"
-    return InputError(f"{path}: not {what}: {said}")
+    said = "it has no keys and values" if first["type"] in ("model_type", "dict_type") else first["msg"]
+    return InputError(f"{path}: not {what}: {': '.join(filter(None, ['.'.join(map(str, first['loc'])), said]))}")
 
 
 # Keys that a calibration has by the same name.

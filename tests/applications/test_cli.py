@@ -258,7 +258,9 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
             _refused(alidade(command, session, "--out", out), out, ("no folder to write results to", "file"))
         validate = ("validate", session, "--calibration", tmp_path / "file", "--out", out)
         _refused(alidade(*validate), out, ("no folder to write results to", "file"))
-        _refused(alidade("demo", "--out", tmp_path / "file"), out, ("no folder to write results to",))
+        for folders in (("demo",), ("certificate", tmp_path), ("fleet", session), ("montecarlo", "head")):
+            run = alidade(*folders, "--out", tmp_path / "file")
+            _refused(run, out, ("no folder to write results to", "file is no folder"))
         _refused(alidade("follow", session, "--checkpoint", out / "run.npz"), out, ("no folder to write",))
         for words in (
             ("plan", "head", "--out"),

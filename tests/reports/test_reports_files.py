@@ -168,6 +168,8 @@ def test_a_file_that_is_no_calibration_is_refused_in_one_line(tmp_path: Path, te
     assert "\n" not in str(caught.value)
     assert "Input should be a valid dict" not in str(caught.value)
     assert ("is a result.json" in str(caught.value)) == ("result" in text)
+    with pytest.raises(InputError, match="is a folder; name a file in it"):
+        load_calibration(tmp_path)
     with pytest.raises(InputError, match="cannot be opened"):
         load_calibration(tmp_path / "none.yaml")
 

@@ -210,6 +210,8 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
         from alidade.pipelines.applications.follow.bridge import Bridge
 
         return Bridge(what, folder, say)
+    if "://" in what:
+        raise InputError(f"{what}: only ws:// and wss:// addresses are followed")
     path = Path(what)
     if path.exists() and not path.is_dir():
         require_regular(path)

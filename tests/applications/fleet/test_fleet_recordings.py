@@ -341,7 +341,7 @@ def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]
         (["{recordings}/*.mcap", "--config", "nowhere.yaml"], "nowhere.yaml"),
         (
             ["{recordings}/*.mcap", "--out", "{recordings}/U00_20260301.mcap/out"],
-            "no folder to write results to (Not a directory)",
+            "U00_20260301.mcap is no folder)",
         ),
         (
             ["{recordings}/*.mcap", "--out", "s3://bucket/out"],

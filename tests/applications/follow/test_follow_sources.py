@@ -153,6 +153,11 @@ def test_a_pipe_that_ends_early_gives_what_came(whole: Path) -> None:
     assert calibration.recording == "standard input"
 
 
+def test_only_web_sockets_are_followed_of_addresses() -> None:
+    with pytest.raises(InputError, match=r"^http://robot:8765: only ws:// and wss:// addresses are followed$"):
+        source_of("http://robot:8765")
+
+
 def test_a_pipe_of_something_else_is_one_line() -> None:
     with pytest.raises(InputError, match=r"^standard input: not an MCAP file"):
         follow(StandardInput(None, io.BytesIO(b"%PDF-1.7" + bytes(100))), Settings())
