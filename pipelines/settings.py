@@ -264,7 +264,7 @@ def _ideal(kind: type[Sensors], value: object) -> object:
         sheets = {name: type(sheet).model_fields.keys() for name, sheet in kind() if name != "field"}
         return {name: dict.fromkeys(figures - {"rotation"}, 0.0) for name, figures in sheets.items()}
     if isinstance(value, str):
-        raise ValueError(f"must be data sheets by sensor, or ideal, not {value!r}")
+        raise ValueError("must be data sheets by sensor, or ideal")
     return value
 
 

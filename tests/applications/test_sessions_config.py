@@ -108,6 +108,7 @@ def test_the_file_overrides_key_by_key(tmp_path: Path) -> None:
         ("noise: {gyro_density: true}", r"noise\.gyro_density: must be a valid number, not True"),
         ("noise: {gyro_density: .inf}", r"noise\.gyro_density: must be a finite number"),
         ("noise: 3", "noise: must be"),
+        ("sensors: perfect", "sensors: must be data sheets by sensor, or ideal, not 'perfect'$"),
         ("priors: {x: -0.1}", r"priors\.x: must be greater than or equal to 0, not -0.1"),
         ("require: {x: 0}", r"require\.x: must be greater than 0, not 0"),
         ("method: loss", "method: must be 'los', 'indexer', 'head', 'cube' or 'tumble', not 'loss'"),
