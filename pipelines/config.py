@@ -80,7 +80,7 @@ def _override(given: object) -> tuple[str, Mapping[Any, Any]]:
         raise InputError(f"config: a file, an alidade.Config or its keys are needed, not {type(given).__name__}")
     content = _read(read_bytes(Path(given), MAX_YAML_BYTES), str(given))
     if str(content.get("schema", "")).startswith("alidade."):
-        raise InputError(f"{given}: that is a result, not a config; `--prior` takes it")
+        raise InputError(f"{given}: that is a result, not a config; `calibrate --prior` takes it")
     return str(given), content
 
 

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -832,6 +833,8 @@ def main() -> None:
     """Run the command; known trouble is one line on stderr."""
     # The matrices are small: threads that wait for each other cost more than they bring, most on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if isinstance(sys.stdout, TextIOWrapper):  # characters that the terminal's encoding lacks are question marks
+        sys.stdout.reconfigure(errors="replace")
     try:
         app(prog_name="alidade")
     except BaseException as error:
@@ -847,7 +850,8 @@ def main() -> None:
 
 def _os_error_line(error: OSError) -> str:
     """Describe in one line a file or folder that the system refuses, such as a full TMPDIR."""
-    where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
+    unnamed = f"standard output, or temporary files in {os.environ.get('TMPDIR', '/tmp')}"
+    where = error.filename if isinstance(error.filename, str) else unnamed
     return f"{printable(where)}: {error.strerror or printable(str(error))}"
 
 

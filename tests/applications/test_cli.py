@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -361,6 +362,19 @@ main()
     assert run.returncode == 0
     assert run.stdout.startswith("Usage: alidade")
     assert run.stderr.strip() == "[]"
+
+
+def test_output_fits_any_encoding_and_a_full_disk_is_one_line(brief: Path, tmp_path: Path) -> None:
+    """A name outside ASCII once ended in a traceback; a full disk behind > was called /tmp."""
+    (tmp_path / "é.mcap").write_bytes(brief.read_bytes())
+    command = [sys.executable, "-m", "alidade", "info", str(tmp_path / "é.mcap")]
+    env, root = {**os.environ, "PYTHONIOENCODING": "ascii"}, Path(__file__).parents[2]
+    run = subprocess.run(command, capture_output=True, text=True, cwd=root, env=env)
+    assert (run.returncode, run.stderr, run.stdout.partition(",")[0]) == (0, "", "?.mcap")
+    with Path("/dev/full").open("w") as full:
+        run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=root)
+    assert (run.returncode, run.stderr.count("\n")) == (2, 1)
+    assert run.stderr.startswith("alidade: standard output, or temporary files in ")
 
 
 def test_errors_name_what_is_missing_where_and_what_there_is(alidade: Command, session: Path, tmp_path: Path) -> None:

@@ -155,7 +155,9 @@ def test_what_is_of_another_method_is_named() -> None:
 
 def test_a_result_given_as_the_config_is_named(tmp_path: Path) -> None:
     (tmp_path / "calibration.yaml").write_text("schema: alidade.calibration/1\nmethod: head\n")
-    with pytest.raises(InputError, match=r"calibration\.yaml: that is a result, not a config; `--prior` takes it"):
+    with pytest.raises(
+        InputError, match=r"calibration\.yaml: that is a result, not a config; `calibrate --prior` takes it"
+    ):
         load_config(None, tmp_path / "calibration.yaml")
 
 
