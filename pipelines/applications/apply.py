@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from alidade.pipelines import methods, progress
+from alidade.pipelines.applications.discovery import CALIBRATED
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.errors import InputError
@@ -78,7 +79,7 @@ def apply(
     out: str | Path,
     *,
     config: Settings = None,
-    suffix: str = "_calibrated",
+    suffix: str = CALIBRATED,
     strict: bool = False,
     auto_columns: bool = False,
 ) -> Applied:

@@ -55,7 +55,8 @@ class Comparison:
             return None
         if not (other.estimate.converged and batch.estimate.converged):
             return None
-        return solver_difference(other.estimate, batch.estimate)
+        required = [q.name for q in batch.problem.quantities if q.required]
+        return solver_difference(other.estimate, batch.estimate, required)
 
     @property
     def limit(self) -> float:

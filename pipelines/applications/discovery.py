@@ -23,6 +23,8 @@ from alidade.pipelines.recording.series import ImuSeries
 from alidade.pipelines.recording.topics import Setting, Topic, TopicSource, lacking, wanted
 from alidade.pipelines.settings import Config
 
+# Added by `apply` to the name of a topic for that of the corrected one.
+CALIBRATED = "_calibrated"
 # Correlations are compared up to this one.
 _HIGHEST = 1.0 - 1e-9
 # Names are alike above this ratio of difflib.
@@ -129,7 +131,7 @@ def unused(recording: Recording, config: Config) -> tuple[str, ...]:
 def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     """Return sentences about topics that a method does not read, but could read as another of its sensors.
 
-    Not about those that `apply` added: one message for each of a topic that is read, under its name with a suffix.
+    Not about those that `apply` made of topics that are read.
     """
     chosen = methods.method(method)
     sources = (config.topics.get(topic.key, TopicSource(topic=topic.name)) for topic in chosen.topics)
@@ -139,14 +141,9 @@ def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     for topic in chosen.topics:
         if _is_attitude(topic) or wanted(recording, config, topic):
             continue
-        there = recording.topics
-        own = [(name, there[name].count) for name in read if name in there]
-        free = [
-            name
-            for name, found in there.items()
-            if found.type == topic.types[0] and found.count and found.is_readable and name not in read
-            if not any(name.startswith(other) and found.count == count for other, count in own)
-        ]
+        there = recording.topics.items()
+        free = [n for n, t in there if t.type == topic.types[0] and t.count and t.is_readable]
+        free = [name for name in free if name.removesuffix(CALIBRATED) not in read]
         if free:
             sentences.append(
                 f"{' and '.join(free)} ({topic.types[0].rpartition('/')[2]}): not used; is it the {topic.key}? "

@@ -437,7 +437,8 @@ class Session:
         if not batch.converged:
             return estimate, None
         batch = replace(batch, covariance=finite_covariance(quantities, batch.covariance))
-        return _concluded(estimate, batch), solver_difference(estimate, batch)
+        difference = solver_difference(estimate, batch, [q.name for q in quantities if q.required])
+        return _concluded(estimate, batch), difference
 
     def _solve(
         self,

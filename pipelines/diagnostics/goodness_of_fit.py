@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -94,9 +95,10 @@ class SolverDifference:
     sigma_ratio: float
 
 
-def solver_difference(estimate: Estimate, reference: Estimate) -> SolverDifference | None:
-    """Compare with a reference solution of the same problem; None if unconverged or without free numbers."""
-    free = np.flatnonzero((estimate.sigmas > 0.0) & (reference.sigmas > 0.0))
+def solver_difference(estimate: Estimate, reference: Estimate, required: Collection[str]) -> SolverDifference | None:
+    """Compare the required numbers with those of a reference solution; None if unconverged or without free ones."""
+    known = (estimate.sigmas > 0.0) & (reference.sigmas > 0.0)
+    free = np.flatnonzero(known & np.isin(estimate.names, list(required)))
     if not len(free) or not reference.converged:
         return None
     z = (estimate.values - reference.values)[free] / estimate.sigmas[free]

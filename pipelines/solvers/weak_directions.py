@@ -181,7 +181,9 @@ class WeakDirections:
 
     def with_curvature(self, covariance: Array) -> WeakDirections:
         """Add second-order covariance (k, k) to the strong directions; directions that get too wide become weak."""
+        least = self.sigmas.min(initial=np.inf) ** 2  # which no eigenvalue of the sum is below, but by rounding
         variances, axes = np.linalg.eigh(np.diag(self.sigmas**2) + covariance)
+        variances = np.maximum(variances, least)
         axes, wide = self.strong @ axes, variances > MAX_SIGMA**2
         more = _calibrated(axes[:, wide], self.calibrated)
         if not more.shape[1]:
@@ -189,7 +191,9 @@ class WeakDirections:
         left = np.linalg.svd(axes.T @ more, full_matrices=True)[0][:, more.shape[1] :]
         root = axes @ left
         own, turn = np.linalg.eigh(left.T @ (variances[:, None] * left))
-        return replace(self, strong=root @ turn, weak=np.hstack([more, self.weak]), sigmas=np.sqrt(own))
+        return replace(
+            self, strong=root @ turn, weak=np.hstack([more, self.weak]), sigmas=np.sqrt(np.maximum(own, least))
+        )
 
 
 def _calibrated(wide: Array, calibrated: NDArray[np.bool_] | None, at_least: int = 0) -> Array:

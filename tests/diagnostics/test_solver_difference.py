@@ -26,12 +26,17 @@ def _estimate(values: list[float]) -> Estimate:
 
 def test_the_largest_difference_is_told() -> None:
     batch = _estimate([1.0, 2.0, 0.0])
-    found = solver_difference(replace(_estimate([1.1, 3.0, 0.0]), covariance=np.diag([0.04, 0.16, 0.0])), batch)
+    found = solver_difference(
+        replace(_estimate([1.1, 3.0, 0.0]), covariance=np.diag([0.04, 0.16, 0.0])), batch, ["a", "b"]
+    )
     assert found is not None
     assert found.parameter == "b"
     assert found.z == pytest.approx(2.5)
     assert found.sigma_ratio == pytest.approx(0.8)
-    assert solver_difference(batch, replace(batch, converged=False)) is None
+    assert solver_difference(batch, replace(batch, converged=False), ["a", "b"]) is None
+    only = solver_difference(_estimate([1.1, 3.0, 0.0]), batch, ["a"])
+    assert only is not None
+    assert only.parameter == "a"
 
 
 @pytest.mark.usefixtures("few_solutions")

@@ -131,6 +131,15 @@ def test_curvature_is_the_variance_of_what_follows_a_weak_direction() -> None:
     assert directions.with_curvature(100.0 * found).weak.shape[1] == 2
 
 
+def test_curvature_makes_no_direction_better_known() -> None:
+    """Eigenvalues that are rounding beside others were negative, their sigmas NaN: tables of random numbers crashed."""
+    sigmas = np.geomspace(1e-11, 1e-2, 12)
+    directions = WeakDirections.of(np.diag(1.0 / sigmas), np.eye(12))
+    for seed in range(10):
+        way = np.random.default_rng(seed).standard_normal(12)
+        assert directions.with_curvature(1e-3 * np.outer(way, way)).sigmas.min() >= 0.99e-11
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_curvature_does_not_depend_on_the_signs_of_axes(sign: float) -> None:
     """With s - w w / 20 - w w w / 100 measured, slopes on one side differ from those on the other."""
