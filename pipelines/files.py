@@ -325,6 +325,12 @@ def require_place(path: Path | None) -> None:
         raise InputError(f"{path}: cannot be written ({path.parent} is no folder that may be written to)")
 
 
+def require_mcap_name(path: Path) -> None:
+    """Raise InputError for a name that promises another format than MCAP."""
+    if path.suffix.lower() not in ("", ".mcap"):
+        raise InputError(f"{path}: an MCAP file is written: name it {path.stem}.mcap")
+
+
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a single file, whole or not at all. Raises InputError when it cannot be written."""
     data = content if isinstance(content, bytes) else content.encode()

@@ -23,7 +23,7 @@ from alidade.pipelines.applications.discovery import CALIBRATED
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.files import plain_json, replacing
+from alidade.pipelines.files import plain_json, replacing, require_mcap_name
 from alidade.pipelines.methods.formula import Value, results
 from alidade.pipelines.methods.triads import numeric_jacobian
 from alidade.pipelines.recording import messages, series
@@ -105,8 +105,7 @@ def apply(
     if auto_columns:
         opened, settings = with_columns(opened, settings)
     known, path = as_saved(calibration, settings), Path(out)
-    if path.suffix.lower() not in ("", ".mcap"):
-        raise InputError(f"{path}: an MCAP file is written, whatever was read: name it {path.stem}.mcap")
+    require_mcap_name(path)
     parts = [opened.container, *getattr(opened.container, "parts", ())]
     if path.exists() and any(
         file.exists() and path.samefile(file) for part in parts for file in (part.path, part.data)

@@ -35,7 +35,8 @@ def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, flo
     """
     for pattern in config.share:
         if not any(fnmatchcase(name, pattern) for name in names):
-            raise InputError(f"unknown key share.{pattern}{nearest(pattern, names)}")
+            where = f"{config.origin}: " if config.origin else ""
+            raise InputError(f"{where}unknown key share.{pattern}{nearest(pattern, names)}")
     rates = {}
     for name in names:
         share = _share(config, name) or ("recording" if method.is_per_recording(name) else "device")

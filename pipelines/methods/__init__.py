@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import require_mcap_name
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -361,6 +362,7 @@ def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool
 
     Raises InputError when there is no such method or scenario, or when the recording cannot be written.
     """
+    require_mcap_name(out)
     chosen = method(name)
     chosen.write(out, chosen.simulate(chosen.settings(scenario, images), seed, images))
 

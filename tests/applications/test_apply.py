@@ -289,7 +289,7 @@ def test_what_cannot_be_corrected_is_one_line_and_leaves_nothing(tmp_path: Path)
         ("bare.mcap", saved("tumble", [*triad("accel"), *GYRO, *SLOPES]), "d.mcap", "takes temperature too"),
         ("s.mcap", tumble.model_copy(update={"formulas": ["x = y"]}), "d.mcap", "formulas in the calibration are not"),
         ("s.mcap", tumble, "no/d.mcap", "cannot be written"),
-        ("s.mcap", tumble, "d.csv", "an MCAP file is written, whatever was read: name it d.mcap"),
+        ("s.mcap", tumble, "d.csv", "an MCAP file is written: name it d.mcap"),
     ]
     for recording, calibration, out, message in cases:
         with pytest.raises(InputError, match=message):

@@ -276,6 +276,8 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
         assert (run.code, run.err.count("\n")) == (2, 1)
     assert (tmp_path / "file").read_text() == "mine"
     assert alidade("simulate", "tumble", "--seed", "-1", "--out", tmp_path / "s.mcap").code == 2
+    named = alidade("simulate", "tumble", "--out", tmp_path / "s.csv")
+    assert (named.code, "an MCAP file is written: name it s.mcap" in named.err) == (2, True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 

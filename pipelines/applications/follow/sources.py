@@ -212,6 +212,8 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
         return Bridge(what, folder, say)
     if "://" in what:
         raise InputError(f"{what}: only ws:// and wss:// addresses are followed")
+    if folder is not None:
+        raise InputError(f"--record {folder}: {what} is kept as it is; what arrives by ws:// or - is recorded")
     path = Path(what)
     if path.exists() and not path.is_dir():
         require_regular(path)

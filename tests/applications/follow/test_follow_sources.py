@@ -158,6 +158,11 @@ def test_only_web_sockets_are_followed_of_addresses() -> None:
         source_of("http://robot:8765")
 
 
+def test_a_file_is_not_recorded_anew(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"s.mcap is kept as it is; what arrives by ws:// or - is recorded$"):
+        source_of(str(tmp_path / "s.mcap"), tmp_path / "kept")
+
+
 def test_a_pipe_of_something_else_is_one_line() -> None:
     with pytest.raises(InputError, match=r"^standard input: not an MCAP file"):
         follow(StandardInput(None, io.BytesIO(b"%PDF-1.7" + bytes(100))), Settings())
