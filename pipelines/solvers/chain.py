@@ -227,14 +227,19 @@ class _Level:
         Without rows the level serves no back-substitution.
         """
         lasts, d = chain.segments(), chain.d
-        shape, begin, left = (d, 3 * d + chain.border), 0, list[tuple[Array, Array, Array]]()
+        shape, begin, left = (d, 3 * d + chain.border), 0, list[Array]()
         rows = np.zeros((len(chain) if with_rows else 0, *shape))
-        for some in _together(lasts):
+        # States of a coarse chain have more rows.
+        more = chain.beside.shape[1] if isinstance(chain, ChainSystem) else 0
+        for some in _together(lasts, max(1, PART_STATES // (1 + more))):
             end = int(lasts[some][-1]) + 1
             own = rows[begin:end] if with_rows else np.zeros((end - begin, *shape))
-            left.append(_inner(chain.part(begin, end), lasts[some] - begin, own))
+            found = _inner(chain.part(begin, end), lasts[some] - begin, own)
+            left = left or [np.empty((len(lasts), *each.shape[1:])) for each in found]
+            for whole, each in zip(left, found, strict=True):
+                whole[some] = each
             begin = end
-        measured, between, beside = (np.concatenate(each) for each in zip(*left, strict=True))
+        measured, between, beside = left
         piece = None if chain.piece is None else chain.piece[lasts]
         coarse = ChainSystem(measured, between, beside, chain.shared, d, piece, chain.walk)
         return cls.of(lasts, rows, piece), coarse, lasts
@@ -249,7 +254,7 @@ class _Level:
         """Yield consecutive segments in parts: slice of the states, slice of the segments, level of the part."""
         in_time, begin = np.argsort(self.order), 0
         lasts = self.ends[in_time]
-        for some in _together(lasts):
+        for some in _together(lasts, PART_STATES):
             end = int(lasts[some][-1]) + 1
             piece = None if self.piece is None else self.piece[in_time][some]
             yield slice(begin, end), some, _Level.of(lasts[some] - begin, self.rows[begin:end], piece)
@@ -599,9 +604,9 @@ def _longest_first(lasts: Index) -> tuple[Index, Index]:
     return np.argsort(-lengths, kind="stable"), active
 
 
-def _together(lasts: Index) -> list[slice]:
-    """Group consecutive segments into parts of about `PART_STATES` states, or one longer segment."""
-    cuts = np.flatnonzero(np.diff(lasts // PART_STATES)) + 1
+def _together(lasts: Index, states: int) -> list[slice]:
+    """Group consecutive segments into parts of about so many states, or one longer segment."""
+    cuts = np.flatnonzero(np.diff(lasts // states)) + 1
     return [slice(int(a), int(b)) for a, b in zip([0, *cuts], [*cuts, len(lasts)], strict=True)]
 
 
