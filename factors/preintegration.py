@@ -120,6 +120,10 @@ class GyroPath:
         """Return the same stream with other rates (N, 3), rad/s."""
         return GyroPath(self.t, rate, self.bias_hat, self._driving, self._density, self._hidden)
 
+    def forget_blocks(self) -> None:
+        """Free the memory of the integrated blocks; they are integrated anew when they are needed."""
+        self._kept.clear()
+
     def _block(self, number: int) -> _Block:
         """Return one integrated block of sample intervals, by its number."""
         if number not in self._kept:

@@ -134,9 +134,11 @@ class GyroChain:
             trunk: of a recording that grows, where the first keyframe is known already; None: the whole is there.
         """
         turns = gyro.increments(time[:-1], time[1:], scale=errors is not None)
+        gyro.forget_blocks()
         unseen, platform_turns = turns.unseen, None
         if platform is not None:
             platform_turns = platform.increments(time[:-1], time[1:], scale=platform_errors is not None)
+            platform.forget_blocks()
             unseen = unseen + platform_turns.unseen
         middles = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
         begun = None if trunk is None else time[:1]
