@@ -99,6 +99,10 @@ class Point:
         """Square-root factorization R of the whitened rows. Raises IndeterminateStateError."""
         return self.system.eliminate()
 
+    def forget_factorization(self) -> None:
+        """Free the memory of R, the largest array of a long recording; `factorization` makes it anew."""
+        vars(self).pop("factorization", None)
+
 
 @dataclass(frozen=True, eq=False)
 class Solution(Point):
@@ -118,6 +122,7 @@ class Solution(Point):
         engine = self.engine.counting(self.engine.inliers(self.values))
         out = replace(self, engine=engine, cost=engine.cost(self.values))
         vars(out).update(factorization=self.factorization)
+        self.forget_factorization()
         return out
 
 

@@ -76,6 +76,7 @@ def estimate_noise(
         levels, steady = refine(levels, solution.engine, values, expected, levels is first)
         if steady:
             break
+        solution.forget_factorization()
         weighted = apply_levels(engine, levels)
         if loss is None:
             again = minimize(weighted, values, config)

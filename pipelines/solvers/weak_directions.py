@@ -426,9 +426,11 @@ def _constrained(compiled: Compiled, start: Point, fixed: WeakDirections | None 
 
     `start` is a minimum without constraints.
     """
-    weak, values, engine = 0, start.values, start.engine
+    weak, at, values, engine = 0, start, start.values, start.engine
     for step in range(MAX_STEPS):
-        at = Point.of(engine, values) if step else start
+        if step:
+            at.forget_factorization()
+            at = Point.of(engine, values)
         reported = Reported.of(compiled, values)
         found = reported.root(at.factorization.root)
         directions = (
@@ -467,4 +469,4 @@ def moved_roots(compiled: Compiled, found: Posterior, moves: Array) -> Iterator[
     for i in range(moves.shape[1]):
         move = Tangent(states[..., i], nodes[..., i], last[at.factorization.c :, i])
         there = Point.of(at.engine, at.engine.layout.retract(at.values, move))
-        yield Reported.of(compiled, there.values).root(there.factorization.root).R
+        yield Reported.of(compiled, there.values).root(there.system.root()).R
