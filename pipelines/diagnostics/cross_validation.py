@@ -199,7 +199,7 @@ def held_out_residuals(problem: Problem) -> dict[str, float]:
     if not solution.converged:
         return {}
     found: dict[str, list[Array]] = {}
-    drawn = compiled.layout.tangents(draws(solution.factorization, DRAWS, np.random.default_rng(1)))
+    drawn = draws(solution.factorization, DRAWS, np.random.default_rng(1))
     for group in measurements:
         predicted, right = compiled.engine.products(replace(group, loss=None), solution.values, drawn)
         held = out[group.factors]

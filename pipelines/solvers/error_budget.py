@@ -40,7 +40,7 @@ from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.estimation.noise import CORRELATED_ERROR
 from alidade.pipelines.estimation.problem import InfluentialMeasurement
-from alidade.pipelines.solvers.layout import Values
+from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.posterior import Reported, responses
@@ -77,14 +77,14 @@ class Influence:
     Attributes:
         at: the estimate; the engine of all factors.
         reported: the numbers there.
-        step: (unknowns + 1, m) columns B (B'N B)^-1 B'J', laid flat.
+        step: m columns B (B'N B)^-1 B'J'.
         from_priors: (m, 2 m) square root of what the priors of the weak directions add to the covariance of these and
             of the others, columns for each number's prior.
     """
 
     at: Point
     reported: Reported
-    step: Array
+    step: Tangent
     from_priors: Array
 
     @classmethod
@@ -98,7 +98,7 @@ class Influence:
         found, scale, weak = reported.root(at.factorization.root), reported.scale, directions.weak
         p, strong = found.unseen, directions.strong
         basis = np.hstack([found.basis[:, :p], found.basis[:, p:] @ strong])
-        step = at.engine.layout.tangents(responses(at.factorization, reported.jacobian[reported.free], basis))
+        step = responses(at.factorization, reported.jacobian[reported.free], basis)
         slope = np.linalg.lstsq(found.R @ strong, -found.R @ weak, rcond=None)[0]
         root = np.linalg.cholesky(reported.prior)
         roots = [

@@ -140,33 +140,26 @@ class Layout:
         of = zip(columns, self.keyframe[at] >= 0, self.node[at] >= 0, strict=True)
         return tuple((isinstance(column, int), bool(state), bool(node)) for column, state, node in of)
 
-    def flat(self, some: Index) -> tuple[Index, Index]:
-        """Columns of variables of one kind in a flat tangent, twice: of a node's b_0, then of the node's own part.
-
-        What is not there is the zero at the end.
-        """
-        N, d, J, c, s = self.sizes
-        span, end = np.arange(dimension(self.blocks[self.block[some[0]]])), N * d + J * c + s
-        at_state = (self.keyframe[some] * d + self.offset[some])[:, None] + span
-        at_shared = (N * d + J * c + self.shared[some])[:, None] + span
-        at_node = (N * d + self.node[some] * c + self.part[some])[:, None] + span
-        one = np.where((self.keyframe[some] >= 0)[:, None], at_state, at_shared)
-        return one, np.where((self.node[some] > 0)[:, None], at_node, end)
-
-    def tangents(self, step: Tangent) -> Array:
-        """Flatten a step to (unknowns + 1, ...), with a zero at the end for absent parts."""
-        tail = step.shared.shape[1:]
-        parts = [step.states.reshape(-1, *tail), step.nodes.reshape(-1, *tail), step.shared, np.zeros((1, *tail))]
-        return np.concatenate(parts)
+    def moves(self, some: Index, step: Tangent) -> Array:
+        """Moves (len(some), dim, ...) of variables of one kind along a tangent, a node's own added to those of b_0."""
+        span, keyframe, node = np.arange(dimension(self.blocks[self.block[some[0]]])), self.keyframe, self.node
+        out = np.zeros((len(some), len(span), *step.shared.shape[1:]))
+        for own, of, rows, columns in (
+            (keyframe[some] >= 0, step.states, keyframe, self.offset),
+            (keyframe[some] < 0, step.shared[None], np.zeros_like(node), self.shared),
+            (node[some] > 0, step.nodes, node, self.part),
+        ):
+            at = some[own]
+            out[own] += of[rows[at][:, None], columns[at][:, None] + span]
+        return out
 
     def retract(self, values: Values, step: Tangent) -> Values:
         """Retract values along a step."""
-        flat, moved = self.tangents(step), {}
+        moved = {}
         for i, block in enumerate(self.blocks):
             some = np.flatnonzero(self.block == i)
-            one, two = self.flat(some)
-            delta = np.empty((len(some), one.shape[1]))
-            delta[self.row[some]] = flat[one] + flat[two]
+            delta = np.empty((len(some), dimension(block)))
+            delta[self.row[some]] = self.moves(some, step)
             moved[block] = retract(values.arrays[block], block, delta)
         return Values(moved)
 

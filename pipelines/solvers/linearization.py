@@ -32,7 +32,7 @@ from alidade.factors.model import TOGETHER, Block, Model, Residuals, dimension, 
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import PART_STATES, Chain, ChainSystem, Index
 from alidade.pipelines.solvers.gtsam_engine import GtsamSystem
-from alidade.pipelines.solvers.layout import Layout, NotAChainError, Values, insert_value
+from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Values, insert_value
 
 if TYPE_CHECKING:
     import gtsam
@@ -359,13 +359,12 @@ class Linearization:
         """Give the measurements of the masks (n,) full weight and exclude all others, without robust losses."""
         return self.with_groups([group.counting(own) for group, own in zip(self.groups, used, strict=True)])
 
-    def products(self, group: Group, values: Values, flat: Array) -> tuple[Array, Array]:
-        """Product A x (n, m, k) of a group's whitened rows and k flat tangents, and the right side (n, m)."""
+    def products(self, group: Group, values: Values, step: Tangent) -> tuple[Array, Array]:
+        """Product A x (n, m, k) of a group's whitened rows and k tangents, and the right side (n, m)."""
         right, jacobians, _ = group.whitened(values)
-        out = np.zeros((*right.shape, flat.shape[1]))
+        out = np.zeros((*right.shape, step.shared.shape[1]))
         for at, J in zip(group.at, jacobians, strict=True):
-            one, two = self.layout.flat(at)
-            out += J @ (flat[one] + flat[two])
+            out += J @ self.layout.moves(at, step)
         return out, right
 
     @property

@@ -233,7 +233,7 @@ def leverages(engine: Linearization, system: System, factorization: Factorizatio
         values: the estimate.
     """
     if not (isinstance(system, Chain) and isinstance(factorization, ChainFactorization)):
-        drawn, found = engine.layout.tangents(draws(factorization, DRAWS, np.random.default_rng(1))), []
+        drawn, found = draws(factorization, DRAWS, np.random.default_rng(1)), []
         for group in engine.groups:
             moves, right = engine.products(group, values, drawn)
             h = np.square(moves).mean(axis=2)

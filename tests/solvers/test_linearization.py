@@ -47,11 +47,8 @@ def test_step_covariance_and_minimum_are_those_of_gtsams_linearisation(name: str
     inverse = np.linalg.inv(R[:-1, :-1])
     sigma, step = np.linalg.norm(inverse, axis=1), inverse @ R[:-1, -1]
 
-    flat = layout.tangents(Tangent(*found.solve()))
-    moves = []
-    for key in [*others, *reported]:
-        one, two = layout.flat(layout.at([key]))
-        moves.append(flat[one[0]] + flat[two[0]])
+    tangent = Tangent(*found.solve())
+    moves = [layout.moves(layout.at([key]), tangent)[0] for key in [*others, *reported]]
     assert np.abs((np.concatenate(moves) - step) / sigma).max() < 1e-8
     to_reported = np.vstack([layout.root_columns(key) for key in reported])
     root = np.linalg.inv(found.root[:-1, :-1])
@@ -76,9 +73,9 @@ def test_gtsam_engine_gives_what_the_chain_gives(name: str) -> None:
     scale = np.append(sigma, 1.0 / np.sqrt(information[-1, -1]))
     assert theirs.minimum == pytest.approx(found.minimum, rel=1e-9)
     assert np.abs((theirs.root.T @ theirs.root - information) * np.outer(scale, scale)).max() < 1e-7
-    flat, other_flat = (layout.tangents(Tangent(*each.solve())) for each in (found, theirs))
-    draws = layout.tangents(Tangent(*found.sample(50, np.random.default_rng(0)))).std(axis=1)
-    assert (np.abs(flat - other_flat) <= 1e-7 * draws).all()
+    draws = found.sample(50, np.random.default_rng(0))
+    for own, other_own, drawn in zip(found.solve(), theirs.solve(), draws, strict=True):
+        assert (np.abs(own - other_own) <= 1e-7 * drawn.std(axis=-1)).all()
     if layout.sizes[3] == 0:  # the chain damps deviations of nodes, gtsam the nodes
         assert other.eliminate(0.1).minimum == pytest.approx(system.eliminate(0.1).minimum, rel=1e-9)
 
