@@ -70,6 +70,17 @@ def of_processor() -> AbstractContextManager[None]:
     return _set(replace(deadline, until=time.thread_time() + deadline.limit, clock=time.thread_time))
 
 
+def renewed() -> AbstractContextManager[None]:
+    """Context manager that gives the usual limit once more, where a solution that does not fit took all of it.
+
+    A limit that was set stays.
+    """
+    deadline = _deadline.get()
+    if deadline is None or not deadline.usual:
+        return nullcontext()
+    return _set(replace(deadline, until=deadline.clock() + deadline.limit))
+
+
 def passed(what: str = "") -> bool:
     """Whether the deadline has passed; if so, note `what` as stopped for that."""
     deadline = _deadline.get()

@@ -307,7 +307,8 @@ class Session:
                 estimate = with_change(estimate, change)
             tables = self.method.report.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(estimate)
-            findings = [*self._findings(estimate, quantities, change, conflicts)]
+            with deadline.renewed():
+                findings = [*self._findings(estimate, quantities, change, conflicts)]
             findings += [*_remarks(problem, estimate, difference), *carried]
             findings += map(remark, filter(None, [deadline.stopped()]))
             if not estimate.converged and estimate.solver != "published":  # curvature where no minimum is

@@ -60,6 +60,20 @@ def test_the_usual_time_follows_the_recording(duration: float, online: bool, lim
         assert deadline.passed()
 
 
+def test_the_usual_time_is_given_once_more_to_the_search_for_causes(clock: list[float]) -> None:
+    with deadline.usual(30.0):
+        clock[0] += 60.1
+        with deadline.renewed():
+            assert not deadline.passed()
+            clock[0] += 60.1
+            assert deadline.passed("the search")
+        assert deadline.stopped() == "The time limit of 60 s stopped the search; --time-limit gives more time."
+    with deadline.within(5.0):
+        clock[0] += 5.1
+        with deadline.renewed():
+            assert deadline.passed()
+
+
 def test_what_the_command_says_goes_before_the_usual(clock: list[float]) -> None:
     with deadline.within(1000.0), deadline.usual(1.0), deadline.within(None):
         clock[0] += 999.0
