@@ -71,9 +71,9 @@ def of_processor() -> AbstractContextManager[None]:
 
 
 def renewed() -> AbstractContextManager[None]:
-    """Context manager that gives the usual limit once more, where a solution that does not fit took all of it.
+    """Context manager that gives the usual limit once more; a limit that was set stays.
 
-    A limit that was set stays.
+    For the search for causes: the solution of a model that does not fit takes most of the first.
     """
     deadline = _deadline.get()
     if deadline is None or not deadline.usual:

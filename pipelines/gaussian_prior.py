@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,7 @@ class GaussianPrior:
         kept = [i for i, name in enumerate(self.names) if name in names]
         rows = np.array(kept, dtype=np.intp)
         known = tuple(self.names[i] for i in kept)
-        return GaussianPrior(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source)
+        return GaussianPrior(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source, self.recordings)
 
     def given(self, known: Mapping[str, float]) -> GaussianPrior:
         """Return the conditional distribution of the other parameters, given exact values of some."""
@@ -49,7 +49,7 @@ class GaussianPrior:
         gain = C[np.ix_(one, other)] @ np.linalg.pinv(C[np.ix_(other, other)], rtol=_RANK, hermitian=True)
         off = (np.array([known[name] for name in self.names if name in known]) - self.mean[other]) / scale[other]
         lost = np.outer(scale[one], scale[one]) * (gain @ C[np.ix_(other, one)])
-        return GaussianPrior(rest.names, rest.mean + scale[one] * (gain @ off), rest.covariance - lost, self.source)
+        return replace(rest, mean=rest.mean + scale[one] * (gain @ off), covariance=rest.covariance - lost)
 
     @property
     def sigmas(self) -> Array:

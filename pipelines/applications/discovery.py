@@ -131,19 +131,20 @@ def unused(recording: Recording, config: Config) -> tuple[str, ...]:
 def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     """Return sentences about topics that a method does not read, but could read as another of its sensors.
 
-    Not about those that `apply` made of topics that are read.
+    None about a topic and what `apply` made of it, where one of the two is read.
     """
     chosen = methods.method(method)
     sources = (config.topics.get(topic.key, TopicSource(topic=topic.name)) for topic in chosen.topics)
     read = {part for source in sources for part in source.parts}
     read |= {source.name for source in config.topics.values()}
+    own = {name.removesuffix(CALIBRATED) for name in read}
     sentences = []
     for topic in chosen.topics:
         if _is_attitude(topic) or wanted(recording, config, topic):
             continue
         there = recording.topics.items()
         free = [n for n, t in there if t.type == topic.types[0] and t.count and t.is_readable]
-        free = [name for name in free if name.removesuffix(CALIBRATED) not in read]
+        free = [name for name in free if name.removesuffix(CALIBRATED) not in own]
         if free:
             sentences.append(
                 f"{' and '.join(free)} ({topic.types[0].rpartition('/')[2]}): not used; is it the {topic.key}? "

@@ -389,7 +389,8 @@ def _findings(
     steps = list(_device_changes(changed, alone, {q.name for q in quantities if q.required}))
     found = [*steps, *diagnose(estimate, quantities, problem.advice), *(each for each in own if each is not None)]
     value, dof = joined.disagreement
-    if not steps and dof >= 1 and value > Fit.of(value, float(dof)).high:
+    is_severe = any(step.severity > Severity.NOTE for step in steps)
+    if not is_severe and dof >= 1 and value > Fit.of(value, float(dof)).high:
         found.append(_disagreement([each.name for each in alone], (), value, dof))
     found.append(remark(f"{len(alone)} recordings of one device"))
     return by_severity(found)

@@ -1,4 +1,4 @@
-"""What several recordings of one device share, parameters that are constant and that walk, and what one says by itself.
+"""Parameters that several recordings of one device share, and findings of one recording by itself.
 
 The method says which parameters belong to a recording, as a gyro's turn-on bias does; the config's `share` goes before
 that, by names or patterns ("camera_mount_*").

@@ -116,8 +116,10 @@ class Validated:
             out.append(f"the calibration's own verdict is {self.calibration.status}")
         if self.held is not None:
             out += [f"{what}: no accuracy is required of it" for what in self._changes(self.held.changes.others)]
-        if self.own is not None and self.held is not None and self.within is None:
-            out.append(sentence(self.own, self.held.quantities))
+        if self.own is not None and self.held is not None:
+            others = tuple(each for each in self.own.evidence["findings"] if each is not self.within)
+            own = replace(self.own, evidence={**self.own.evidence, "findings": others})
+            out += [sentence(own, self.held.quantities)] * bool(others)
         return out
 
 
@@ -136,7 +138,7 @@ def validate(
     Args:
         recording: the other one.
         calibration: a result.json, a calibration.yaml, or what `calibrate` returns.
-        method: overrides the config's.
+        method: of both, that of the calibration.
         config: overrides the recording's own config key by key.
         strict: refuse a recording of which anything is lost.
         auto_topics: use the topics that `alidade info` proposes where those of the method are absent.
@@ -151,7 +153,7 @@ def validate(
     try:
         session = open_session(path, known.method, config, strict, auto_topics=auto_topics, auto_columns=auto_columns)
     except InputError:
-        known.of_method(_method_of(path, config) or known.method)
+        known.of_method(known.method if method else _method_of(path, config) or known.method)
         raise
     if not isinstance(calibration, Calibration):
         known = with_covariance(known, Path(calibration))
@@ -188,11 +190,11 @@ def _method_of(path: Path, config: Settings) -> str:
 def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Calibration] | None:
     """Test an earlier calibration on a recording by the recording's own calibration, which is returned too.
 
-    None where the recording has no solution.
+    None where the recording has no solution, or everything is fixed.
     """
     from alidade.pipelines.solvers.chain import IndeterminateError
 
-    if known.solver == "published":
+    if known.solver == "published" or all(q.prior_sigma == 0.0 for q in session.problem().quantities):
         return None
     gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:

@@ -92,7 +92,7 @@ class Changes:
         level: p-value of any step.
         limit: from so many sigmas on the first step of a number is more than chance.
         found: the steps that are more than chance, of what was asked for, in the order in which they were found.
-        others: the same of what was not asked for, and might be taken for a step of what was.
+        others: significant steps of the numbers that were not asked for, estimated together with those found.
         steps: every step that was asked for, with the significant steps in the system.
         together: steps of all that was asked for at once, without any step in the system.
         rates: kind of numbers -> how they walk.
@@ -130,7 +130,7 @@ def changes(
         joined: the recordings, in the order of their dates.
         days: of these.
         inflations: by what sigmas of the numbers are larger because noise is coloured; 1 where not given.
-        asked: the numbers that a change matters of; None: all.
+        asked: the numbers whose changes matter; None: all. Steps are looked for in the others as well.
         level: how often chance alone may make any step in such a history.
     """
     if len(joined.parts) < 2:

@@ -62,14 +62,15 @@ def find_hypotheses(
 ) -> tuple[Finding, ...]:
     """Find faults whose correction makes a misfitting recording fit, the best fit first.
 
-    Tested is the segment where residuals are worst, the whole without an `estimate`. A fault has to explain more than
-    `freed` does, the config in which what the recording contradicts is free. Where the estimate has not converged, or
-    its noise is beyond what noise can be, that is explained by a fault without which there is a solution above
-    suspicion.
+    Tested is the segment where residuals are worst by the noise as stated, the whole without an `estimate`. A fault has
+    to explain more than `freed` does, the config in which what the recording contradicts is free. Where the estimate
+    has not converged, or its noise is beyond what noise can be, that is explained by a fault without which there is a
+    solution above suspicion.
     """
     if estimate is not None and model.cut and estimate.residuals:
         # Noise that was estimated to grow with the motion is largest where a fault shows.
-        stated = solve_trial(build, data, config.model_copy(update={"noise_known": 0.0}))
+        known = config.model_copy(update={"noise_known": 0.0})
+        stated = solve_trial(build, data, known) if config.noise_known else None
         residuals = estimate.residuals if stated is None else stated.estimate.residuals
         data = model.segment(data, *_worst_segment(residuals, _SEGMENT_S))
     found = _explaining_misfit(build, model, data, config, freed)

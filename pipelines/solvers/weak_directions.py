@@ -424,7 +424,7 @@ def _share(known: Array, missed: Array) -> float:
 def _constrained(compiled: Compiled, start: Point, fixed: WeakDirections | None = None) -> Posterior:
     """Find the minimum with the weak directions at their prior means; directions are re-found unless `fixed`.
 
-    `start` is a minimum without constraints.
+    `start` is a minimum without constraints; the memory of its factorization is freed.
     """
     weak, at, values, engine = 0, start, start.values, start.engine
     for step in range(MAX_STEPS):

@@ -115,7 +115,7 @@ def _history(
     days = [at[recording] / DAY_S for recording in order]
     joined = join([unpacked(results[recording]["told"]) for recording in order], results[order[-1]]["device"], days)
     names = {name for recording in order for name in asked[recording]}
-    known = {name: [each[name] for each in parameters if name in each] for name in names}
+    known = {name: [each[name] for each in parameters if name in each] for name in set().union(*parameters)}
     inflations = {name: grown([p["sigma"] for p in own], [p["inflation"] for p in own]) for name, own in known.items()}
     found = changes(joined, days, inflations, names, level)
     dates = tuple(at[recording] for recording in order)
