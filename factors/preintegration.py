@@ -121,7 +121,7 @@ class GyroPath:
         return GyroPath(self.t, rate, self.bias_hat, self._driving, self._density, self._hidden)
 
     def forget_blocks(self) -> None:
-        """Free the memory of the integrated blocks; they are integrated anew when they are needed."""
+        """Free the memory of the integrated blocks of the gyro's samples; they are integrated anew when needed."""
         self._kept.clear()
 
     def _block(self, number: int) -> _Block:

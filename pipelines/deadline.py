@@ -71,7 +71,7 @@ def of_processor() -> AbstractContextManager[None]:
 
 
 def renewed() -> AbstractContextManager[None]:
-    """Context manager that gives the usual limit once more; a limit that was set stays.
+    """Context manager that begins a calibration's default time limit anew; a limit that the user set goes on.
 
     For the search for causes: the solution of a model that does not fit takes most of the first.
     """

@@ -79,7 +79,7 @@ def open_binary(path: Path, named: Path | None = None) -> BinaryIO:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Yield a temporary file that replaces `path` when the block ends without an error; InputError if it cannot."""
     require_place(path)
-    if path.exists() and not path.is_file():
+    if _is_special(path):
         raise InputError(f"{path}: there is no file to be written, it is something else")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -315,14 +315,18 @@ def require_room(out_dir: Path | None) -> None:
 
 
 def require_place(path: Path | None) -> None:
-    """Raise InputError before the work whose result is written to a file, if there is no place for the file."""
+    """Raise InputError if no file can be written at a path: it is a folder, or its own folder cannot be written to."""
     if path is None:
         return
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
-    is_special = path.exists() and not path.is_file()
-    if not is_special and not (path.parent.is_dir() and os.access(path.parent, os.W_OK)):
+    if not _is_special(path) and not (path.parent.is_dir() and os.access(path.parent, os.W_OK)):
         raise InputError(f"{path}: cannot be written ({path.parent} is no folder that may be written to)")
+
+
+def _is_special(path: Path) -> bool:
+    """Whether something is there that is neither a file nor a folder: a pipe, a terminal."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def require_mcap_name(path: Path) -> None:
@@ -334,7 +338,7 @@ def require_mcap_name(path: Path) -> None:
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a single file, whole or not at all. Raises InputError when it cannot be written."""
     data = content if isinstance(content, bytes) else content.encode()
-    if path.exists() and not path.is_file() and not path.is_dir():  # a pipe, a terminal
+    if _is_special(path):
         try:
             path.write_bytes(data)
         except OSError as error:

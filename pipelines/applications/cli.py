@@ -342,8 +342,9 @@ def follow(
     folder = out or _default_folder(Path(_file_name(source)), "incremental")
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
-    auto = {"auto_topics": auto_topics, "auto_columns": auto_columns}
-    settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior, **auto)
+    settings = Settings(
+        method, config, parse_window(window), patience, checkpoint, not no_check, prior, auto_topics, auto_columns
+    )
     page_at = (host, page_port) if page else None
     pace = None if replay is None else speed
     calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or (), pace)

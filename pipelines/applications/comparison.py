@@ -55,8 +55,7 @@ class Comparison:
             return None
         if not (other.estimate.converged and batch.estimate.converged):
             return None
-        required = [q.name for q in batch.problem.quantities if q.required]
-        return solver_difference(other.estimate, batch.estimate, required)
+        return solver_difference(other.estimate, batch.estimate, batch.problem.quantities)
 
     @property
     def limit(self) -> float:

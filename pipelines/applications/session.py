@@ -438,8 +438,7 @@ class Session:
         if not batch.converged:
             return estimate, None
         batch = replace(batch, covariance=finite_covariance(quantities, batch.covariance))
-        difference = solver_difference(estimate, batch, [q.name for q in quantities if q.required])
-        return _concluded(estimate, batch), difference
+        return _concluded(estimate, batch), solver_difference(estimate, batch, quantities)
 
     def _solve(
         self,

@@ -90,7 +90,7 @@ def device_prior(known: SavedCalibration, method: Method, config: Config, sha256
 
 
 def finding_of_recording(calibration: Calibration) -> Finding | None:
-    """Return a finding on what one recording says by itself: inconsistent, or on its residuals; None without any."""
+    """Return a finding that collects what is inconsistent in one recording, and what residuals show; None without."""
     own = [
         finding
         for finding in calibration.findings

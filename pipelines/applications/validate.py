@@ -153,7 +153,8 @@ def validate(
     try:
         session = open_session(path, known.method, config, strict, auto_topics=auto_topics, auto_columns=auto_columns)
     except InputError:
-        known.of_method(known.method if method else _method_of(path, config) or known.method)
+        if method is None:
+            known.of_method(_method_of(path, config) or known.method)
         raise
     if not isinstance(calibration, Calibration):
         known = with_covariance(known, Path(calibration))
@@ -194,11 +195,12 @@ def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck,
     """
     from alidade.pipelines.solvers.chain import IndeterminateError
 
+    session = replace(session, near=known.values)
     if known.solver == "published" or all(q.prior_sigma == 0.0 for q in session.problem().quantities):
         return None
     gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:
-        own = replace(session, near=known.values).calibrate(report=False)
+        own = session.calibrate(report=False)
     except IndeterminateError:
         return None
     estimate = own.estimate

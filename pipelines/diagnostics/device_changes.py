@@ -108,7 +108,7 @@ class Changes:
 
     @property
     def jointly(self) -> tuple[Together, ...]:
-        """Significant steps of all numbers at once, where no number's step is significant by itself."""
+        """Joint tests of all numbers that show a change of the device, where the step of no single number does."""
         return () if self.found or self.others else tuple(each for each in self.together if each.significant)
 
     @property
@@ -142,22 +142,22 @@ def changes(
     left, residual = _projected(A * joined.scales, columns, b)
     determined = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _DETERMINED
     questions = [question for question, yes in zip(questions, determined, strict=True) if yes]
-    wanted = np.array([asked is None or name in asked for name, _, _ in questions], dtype=bool)
+    asked = {name for name, _ in steady} if asked is None else asked
+    wanted = np.array([name in asked for name, _, _ in questions], dtype=bool)
     if not wanted.any():
         return Changes(level)
     columns, left = columns[:, determined], left[:, determined]
     grown = np.array([inflations.get(name, 1.0) for name, _, _ in questions])
     limit = _limit(left, level)
     found, steps = _significant_steps(A * joined.scales, b, columns, questions, grown, limit)
-    names = {name for (name, _, _), yes in zip(questions, wanted, strict=True) if yes}
-    questions = [question for question in questions if question[0] in names]
+    questions = [question for question in questions if question[0] in asked]
     left, grown = left[:, wanted], grown[wanted]
     return Changes(
         level,
         limit,
-        tuple(step for step in found if step.name in names),
-        tuple(step for step in found if step.name not in names),
-        tuple(step for step in steps if step.name in names),
+        tuple(step for step in found if step.name in asked),
+        tuple(step for step in found if step.name not in asked),
+        tuple(step for step in steps if step.name in asked),
         tuple(_together(left, residual, questions, grown, level)),
         _rates(left, residual, questions, days, grown),
     )

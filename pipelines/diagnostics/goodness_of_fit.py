@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
 
 from alidade.factors.chi_square import quantile
-from alidade.pipelines.estimation.problem import Estimate, Residuals
+from alidade.pipelines.estimation.problem import Estimate, Quantity, Residuals
 
 # Either tail outside the 99.9 % interval.
 _TAIL = 5e-4
@@ -95,10 +95,12 @@ class SolverDifference:
     sigma_ratio: float
 
 
-def solver_difference(estimate: Estimate, reference: Estimate, required: Collection[str]) -> SolverDifference | None:
+def solver_difference(
+    estimate: Estimate, reference: Estimate, quantities: Sequence[Quantity]
+) -> SolverDifference | None:
     """Compare the required numbers with those of a reference solution; None if unconverged or without free ones."""
     known = (estimate.sigmas > 0.0) & (reference.sigmas > 0.0)
-    free = np.flatnonzero(known & np.isin(estimate.names, list(required)))
+    free = np.flatnonzero(known & np.isin(estimate.names, [q.name for q in quantities if q.required]))
     if not len(free) or not reference.converged:
         return None
     z = (estimate.values - reference.values)[free] / estimate.sigmas[free]

@@ -69,8 +69,7 @@ def find_hypotheses(
     """
     if estimate is not None and model.cut and estimate.residuals:
         # Noise that was estimated to grow with the motion is largest where a fault shows.
-        known = config.model_copy(update={"noise_known": 0.0})
-        stated = solve_trial(build, data, known) if config.noise_known else None
+        stated = solve_trial(build, data, _as_stated(config)) if config.noise_known else None
         residuals = estimate.residuals if stated is None else stated.estimate.residuals
         data = model.segment(data, *_worst_segment(residuals, _SEGMENT_S))
     found = _explaining_misfit(build, model, data, config, freed)
@@ -84,12 +83,11 @@ def _explaining_misfit(
 ) -> tuple[Finding, ...]:
     """Find faults without which chi-square falls significantly, arguments as of `find_hypotheses`."""
     known = config.noise_known == 0.0
-    # With the noise as stated: levels that are estimated hide what is looked for.
-    config = config.model_copy(update={"noise_known": 0.0})
+    config = _as_stated(config)
     before = solve_trial(build, data, config)
     if before is None or (before.fits and not rejects_many(rejections(before.estimate))):
         return ()
-    without = None if freed is None else solve_trial(build, data, freed.model_copy(update={"noise_known": 0.0}))
+    without = None if freed is None else solve_trial(build, data, _as_stated(freed))
     if without is not None and without.fits and not rejects_many(rejections(without.estimate)):
         return ()
     concurrent = max_concurrent(model.times(data))
@@ -105,6 +103,11 @@ def _explaining_misfit(
     if without is not None:
         found = [each for each in found if each[0].cost < without.cost]
     return _findings(before.cost, found[:_MAX_REPORTED])
+
+
+def _as_stated(config: Config) -> Config:
+    """Return a config whose noise is known as stated: levels that are estimated hide what is looked for."""
+    return config.model_copy(update={"noise_known": 0.0})
 
 
 def _above_suspicion(build: Build, model: FaultModel, data: Any, config: Config, estimate: Estimate) -> list[_Tested]:

@@ -74,9 +74,9 @@ def _with_share(shares: Mapping[str, float], source: str, share: float) -> dict[
 
 
 def marginalised(sqrt_info: SqrtInformation, columns: Array) -> SqrtInformation:
-    """Add errors S a, a (m,) unit normal, S `columns` (n, m), to square-root information R (x - at) = d on numbers x.
+    """Widen a square-root information R (x - at) = d on n numbers x by m independent errors.
 
-    They are marginalised out of R (x - S a - at) = d.
+    The errors S a, a (m,) unit normal, S `columns` (n, m), are marginalised out of R (x - S a - at) = d.
 
     Column by column: rows whitened by (I + r r')^-1/2, r = R s.
     """

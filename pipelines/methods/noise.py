@@ -70,7 +70,7 @@ def stated(
 
 
 def refuse_gyro_scale(method: str, config: Config) -> None:
-    """Raise InputError for noise.gyro_scale, of a method that estimates the gyro's scale."""
+    """Raise InputError if the config states noise.gyro_scale, for a method that estimates the gyro's scale itself."""
     if figure := config.noise.gyro_scale:
         raise InputError(
             f"noise.gyro_scale: {method} estimates the gyro's scale; write sensors: {{gyro: {{scale: {figure:g}, "

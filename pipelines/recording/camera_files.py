@@ -20,7 +20,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 
 SUFFIXES = (".yaml", ".yml", ".cameramodel")
-# Of a result in place of a recording.
+# Why a result is refused in place of a recording.
 IS_RESULT = "that is a result, no recording; `--prior` and `--calibration` take it"
 # ROS's name of Kalibr's and EuRoC's models.
 _ROS = {"radtan": "plumb_bob", "radial-tangential": "plumb_bob", "none": "plumb_bob"}

@@ -248,7 +248,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         solver=calibration.estimate.solver,
         status=calibration.status,
         recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=calibration.start),
-        sources=calibration.sources if len(calibration.sources) > 1 else [],
+        sources=calibration.sources,
         parameters=parameters,
         rotations=rotations_of(calibration),
         transforms=_transforms(calibration),

@@ -105,10 +105,11 @@ class Calibration(SensorValues):
 
     @property
     def sources(self) -> list[str]:
-        """SHA-256 of each recording that the values come from, those of an earlier calibration as prior included."""
+        """SHA-256 of each recording behind the values, those behind a prior included; empty if there is but one."""
         prior = self.config.gaussian_prior
         own = [part.sha256 for part in self.recordings] or [self.sha256]
-        return [*own, *(prior.recordings if prior else ())]
+        every = [*own, *(prior.recordings if prior else ())]
+        return every if len(every) > 1 else []
 
     @cached_property
     def parameters(self) -> dict[str, ParameterResult]:

@@ -371,7 +371,7 @@ def result(calibration: Calibration) -> Result:
                 "parameters": dict(zip(c.estimate.names, second.values.tolist(), strict=True)),
             },
             "constants": c.problem.constants or None,
-            "sources": c.sources if len(c.sources) > 1 else None,
+            "sources": c.sources or None,
             "recordings": c.recordings or None,
             "changes": c.changes
             and {"level": c.changes.level, "steps": _steps(c.changes, c.recordings), "rates": c.changes.rates},

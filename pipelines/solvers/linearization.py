@@ -360,7 +360,7 @@ class Linearization:
         return self.with_groups([group.counting(own) for group, own in zip(self.groups, used, strict=True)])
 
     def products(self, group: Group, values: Values, step: Tangent) -> tuple[Array, Array]:
-        """Product A x (n, m, k) of a group's whitened rows and k tangents, and the right side (n, m)."""
+        """Products (n, m, k) of a group of factors' whitened Jacobians with k tangents, and their right side (n, m)."""
         right, jacobians, _ = group.whitened(values)
         out = np.zeros((*right.shape, step.shared.shape[1]))
         for at, J in zip(group.at, jacobians, strict=True):

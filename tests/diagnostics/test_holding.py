@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +34,12 @@ MOVED_ARCSEC = 0.5
 def written(path: Path, simulated: Simulated) -> Path:
     method("indexer").write_data(path, simulated.data, simulated.truth, simulated.config)
     return path
+
+
+def short_head(**more: float) -> dict[str, Any]:
+    """The scenario of head that determines mounts, with samples as few as it takes."""
+    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0}
+    return method("head").settings("head_mounts").model_dump() | rates | more
 
 
 @pytest.fixture(scope="module")
@@ -112,8 +119,7 @@ def test_numbers_judged_up_to_a_factor_are_tested() -> None:
 
 def test_it_does_not_hold_for_a_recording_in_which_it_slips(tmp_path: Path, alidade: Command) -> None:
     """By three degrees at two thirds of it."""
-    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0, "duration_s": 30.0}
-    scenario = method("head").settings("head_mounts").model_dump() | rates
+    scenario = short_head(duration_s=30.0)
     opened(simulate("head", scenario, seed=1)).calibrate("batch", report=False).write(tmp_path)
     later = simulate("head", scenario, seed=2)
     wxyz = later.data.vision_wxyz.copy()
@@ -129,8 +135,7 @@ def test_it_does_not_hold_for_a_recording_in_which_it_slips(tmp_path: Path, alid
 
 def test_errors_of_vision_by_attitude_are_no_change(tmp_path: Path) -> None:
     """A change has the sigmas of the recording's own calibration, which these errors widen."""
-    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0, "duration_s": 20.0}
-    scenario = method("head").settings("head_mounts").model_dump() | rates | {"vision_map": 5e-3}
+    scenario = short_head(duration_s=20.0, vision_map=5e-3)
     opened(simulate("head", scenario, seed=2)).calibrate("batch", report=False).write(tmp_path)
     method("head").write(tmp_path / "later.mcap", simulate("head", scenario, seed=3))
     known, later = tmp_path / "calibration.yaml", tmp_path / "later.mcap"
@@ -142,8 +147,7 @@ def test_errors_of_vision_by_attitude_are_no_change(tmp_path: Path) -> None:
 
 def test_a_gyro_whose_scale_changed_is_no_mount_that_moved(tmp_path: Path) -> None:
     """By 3 %: both camera mounts were 4 and 7 sigmas off, and the scale was not mentioned."""
-    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0, "duration_s": 30.0}
-    scenario = method("head").settings("head_mounts").model_dump() | rates
+    scenario = short_head(duration_s=30.0)
     opened(simulate("head", scenario, seed=1)).calibrate("batch", report=False).write(tmp_path)
     later = simulate("head", scenario, seed=2)
     scaled = replace(later.data, head_gyro=later.data.head_gyro * [1.03, 1.0, 1.0])
@@ -179,8 +183,7 @@ def test_a_recording_that_says_nothing_gives_no_verdict() -> None:
 @pytest.mark.slow
 def test_head_mounts_that_turned_are_noticed(tmp_path: Path) -> None:
     """A helmet mount that turned by 0.3 deg, with everything else of the head's estimated too."""
-    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 100.0, "vision_rate_hz": 10.0, "duration_s": 30.0}
-    scenario = method("head").settings("head_mounts").model_dump() | rates
+    scenario = short_head(platform_gyro_rate_hz=100.0, duration_s=30.0)
     mount = scenario["helmet_mount_deg"]
     first = simulate("head", scenario, seed=1)
     opened(first).calibrate(report=False).write(tmp_path)

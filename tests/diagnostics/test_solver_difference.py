@@ -12,12 +12,15 @@ from typer.testing import CliRunner
 
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.diagnostics.goodness_of_fit import solver_difference
-from alidade.pipelines.estimation.problem import Estimate
+from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from tests.support.builders import IDEAL
 
 SCENARIO = LosScenario(duration_s=6.0, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL)
+
+
+_REQUIRED = [Quantity(name, "rad", 1.0, 1.0, 0.1) for name in "ab"]
 
 
 def _estimate(values: list[float]) -> Estimate:
@@ -27,14 +30,14 @@ def _estimate(values: list[float]) -> Estimate:
 def test_the_largest_difference_is_told() -> None:
     batch = _estimate([1.0, 2.0, 0.0])
     found = solver_difference(
-        replace(_estimate([1.1, 3.0, 0.0]), covariance=np.diag([0.04, 0.16, 0.0])), batch, ["a", "b"]
+        replace(_estimate([1.1, 3.0, 0.0]), covariance=np.diag([0.04, 0.16, 0.0])), batch, _REQUIRED
     )
     assert found is not None
     assert found.parameter == "b"
     assert found.z == pytest.approx(2.5)
     assert found.sigma_ratio == pytest.approx(0.8)
-    assert solver_difference(batch, replace(batch, converged=False), ["a", "b"]) is None
-    only = solver_difference(_estimate([1.1, 3.0, 0.0]), batch, ["a"])
+    assert solver_difference(batch, replace(batch, converged=False), _REQUIRED) is None
+    only = solver_difference(_estimate([1.1, 3.0, 0.0]), batch, _REQUIRED[:1])
     assert only is not None
     assert only.parameter == "a"
 

@@ -311,7 +311,7 @@ def _summary(calibration: Calibration) -> dict[str, Any]:
 
 
 def _up_to_factor(quantity: Quantity, sigma: float) -> str | None:
-    """Verdict on a number that is judged with others, up to their common factor; None of what has no requirement."""
+    """Verdict on a parameter that is required up to a factor in common with others; None if it is not required."""
     return "observable" if quantity.required and quantity.determined(sigma) else None
 
 
