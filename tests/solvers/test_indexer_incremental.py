@@ -101,7 +101,9 @@ def test_hours_of_indexing_cost_the_same_per_turn() -> None:
 
     The quickest tenth of them, by processor time: whatever else the machine does only adds to it.
     """
-    graph, _ = _problem(load_scenario(IndexerScenario, "indexer_long"), 1)
+    graph, _ = _problem(
+        load_scenario(IndexerScenario, "indexer_long"), 2
+    )  # of seed 1 the gate takes one of 3,072 turns
     batch = solve_batch(graph)
     moments: list[float] = []
 

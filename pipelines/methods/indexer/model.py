@@ -20,8 +20,10 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.array import Array, Index
+from alidade.factors.chi_square import gate
 from alidade.factors.earth import EARTH_RATE
 from alidade.factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option, base_from_platform
+from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Motion
 from alidade.pipelines.estimation.noise import Level, Noise
@@ -66,6 +68,8 @@ _NO_ERROR = 1e-8
 _SCATTERED = 0.05
 # What is stated and the scatter at rest certainly differ beyond so many sigmas of the former.
 _CERTAIN = 2.0
+# Of windows in which the gyro stuck, or an encoder slipped.
+_LOSS = TruncatedLoss(gate(3))
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,7 @@ def problem(data: IndexerData, config: Config) -> Problem:
         advice=_advice,
         dropped=dropped,
         noises=model.noises,
+        loss=_LOSS,
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=ChainLayout(nodes=NODES),
     )
@@ -162,17 +167,16 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
                 f"indexer: the earth's rate shows in windows of {shortest:.3g} s and the latitude is not known; "
                 f"record {config.topic(FIX)} or give latitude_deg in the config"
             )
-    groups, disagreeing = agreeing(groups, parameters, density, encoder)
+    require_agreeing(groups, parameters)
     theta_guess, bias_guess = guess(groups)
     starts = np.array([g.rates.edges[0] for g in groups])
     walks = walking(config)
     walk = walks.used
     rows = frames(data, motion)
-    reasons = {
-        "turn cut by a gap in the stamps (what lies before and after is used)": cut_turns(motion),
-        "turn in which gyro and encoder disagree by more than 1 %": disagreeing,
-    }
-    dropped = {**data.dropped, **{reason: number for reason, number in reasons.items() if number}}
+    cut = cut_turns(motion)
+    dropped = dict(data.dropped)
+    if cut:
+        dropped["turn cut by a gap in the stamps (what lies before and after is used)"] = cut
     model = _Model(
         data=data,
         motion=motion,
@@ -251,7 +255,7 @@ def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: St
     average = IndexerAverageFactor.of(
         group.gyro, group.rates, model.density, encoder, options, wander, THETA_UNIT, temperature_rise
     )
-    step.factors.append(Factor.of(group.kind, average.on(*columns)))
+    step.factors.append(Factor.of(group.kind, average.on(*columns, loss=_LOSS)))
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
@@ -304,10 +308,8 @@ def _advice(weights: Mapping[str, float]) -> Motion:
 _DISAGREEMENT = 0.01
 
 
-def agreeing(
-    groups: tuple[Group, ...], parameters: Sequence[Parameter], density: float, encoder: float
-) -> tuple[tuple[Group, ...], int]:
-    """Groups whose gyro agrees with the encoders, and the number of groups that disagree.
+def require_agreeing(groups: tuple[Group, ...], parameters: Sequence[Parameter]) -> None:
+    """Raise if gyro and encoders disagree about an axis.
 
     Fits gyro = A w + b over all groups, so that neither mounting nor bias counts as disagreement.
 
@@ -317,7 +319,6 @@ def agreeing(
     """
     w = np.array([g.mean_platform for g in groups])
     gyro = np.array([g.mean_gyro for g in groups])
-    moving = np.array([g.position is not None for g in groups])
     speed = np.linalg.norm(w, axis=1)
     weight = np.array([g.duration for g in groups])
     for _ in range(10):
@@ -346,10 +347,6 @@ def agreeing(
                 f"indexer: about the axis {name} the gyro turns at {100.0 * gain:.4g} % of the encoder's rate, more "
                 "than 1 % off; check units and gear, or state the gyro's scale error (sensors: {gyro: {scale: 0.05}})"
             )
-    duration = np.array([g.duration for g in groups])
-    noise = np.sqrt(density**2 / duration + 2.0 * (encoder / duration) ** 2)
-    good = ~moving | (misfit <= _DISAGREEMENT * np.maximum(speed, 0.1 * speed.max()) + 5.0 * noise)
-    return tuple(g for g, ok in zip(groups, good, strict=True) if ok), int((~good).sum())
 
 
 def _fit(w: Array, gyro: Array, weight: Array) -> tuple[Array, Array]:
