@@ -33,10 +33,11 @@ from alidade.pipelines.diagnostics.change_test import (
     with_change,
 )
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, held_out_residuals, solve_segments, split_halves
-from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, prior_conflicts
+from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect, prior_conflicts, rejects_an_end
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses, misstatements
 from alidade.pipelines.diagnostics.observability import finite_covariance
+from alidade.pipelines.diagnostics.split_test import RESOLUTION, change_by_parts
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config, with_conflicts
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
@@ -308,7 +309,8 @@ class Session:
             tables = self.method.report.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(estimate)
             with deadline.renewed():
-                findings = [*self._findings(estimate, quantities, change, conflicts)]
+                found_at, judged = self._findings(estimate, quantities, change, conflicts)
+            stable, findings = found_at or stable, [*judged]
             findings += [*_remarks(problem, estimate, difference), *carried]
             findings += map(remark, filter(None, [deadline.stopped()]))
             if not estimate.converged and estimate.solver != "published":  # curvature where no minimum is
@@ -360,25 +362,63 @@ class Session:
         quantities: Sequence[Quantity],
         change: Finding | None,
         conflicts: Sequence[Finding],
-    ) -> tuple[Finding, ...]:
-        """Return the findings on an estimate; hypotheses are tested if the estimate is suspect."""
+    ) -> tuple[Stability | None, tuple[Finding, ...]]:
+        """Return the findings on an estimate; if it is suspect, causes are looked for.
+
+        The first is the test of a change that explains the misfit; None where nothing did.
+        """
         contradicted, advice = self._contradictions(estimate, quantities), self.problem().advice
         findings = diagnose(estimate, quantities, advice, change, (), contradicted, conflicts)
         if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
-            return findings
-        hypotheses = misstatements(self.method.graph, self.method.faults, self.data, self.config)
-        if not hypotheses and not is_suspect(estimate, findings, quantities):
-            return findings
+            return None, findings
+        model, build = self.method.faults, self.method.graph
+        hypotheses = misstatements(build, model, self.data, self.config)
+        suspect = is_suspect(estimate, findings, quantities)
+        # Steps at every keyframe, where they are tested, tell a slip from outliers, and a change from other faults.
+        by_parts = estimate.steps is None and not hypotheses
+        rejects = rejects_an_end(estimate) or any(each.kind == "rejection" for each in findings)
+        if not (hypotheses or suspect or (by_parts and (rejects or change is not None))):
+            return None, findings
         severe = any(each.severity > Severity.NOTE for each in contradicted)
         freed = self._freed[0] if severe and self._freed is not None else None
-        with progress.doing("testing hypotheses"):
-            hypotheses = hypotheses or find_hypotheses(
-                self.method.graph, self.method.faults, self.data, self.config, estimate, freed
-            )
-        deadline.passed(_HYPOTHESES)
+        split = self._changed_between(quantities, freed) if by_parts else None
+        if suspect and not hypotheses and (split is None or not split[1].evidence["steps"]):
+            with progress.doing("testing hypotheses"):
+                hypotheses = find_hypotheses(build, model, self.data, self.config, estimate, freed)
+            deadline.passed(_HYPOTHESES)
+        if not hypotheses and split is not None:
+            stable, found = split
+            if not suspect and not found.evidence["steps"]:
+                weak = replace(found, severity=Severity.WEAK)
+                return stable, diagnose(estimate, quantities, advice, weak, (), contradicted, conflicts)
+            # What of a device contradicts its data sheet is what a mixture of two devices has.
+            return stable, diagnose(estimate, quantities, advice, None, (found,), (), ())
         # A fault that explains more than freeing what is fixed is what these contradictions come from.
         contradicted = () if hypotheses else contradicted
-        return diagnose(estimate, quantities, advice, change, hypotheses, contradicted, conflicts)
+        return None, diagnose(estimate, quantities, advice, change, hypotheses, contradicted, conflicts)
+
+    def _changed_between(
+        self, quantities: Sequence[Quantity], freed: Config | None
+    ) -> tuple[Stability, Finding] | None:
+        """Test whether a change explains what does not fit; return the test and the finding with the steps at it.
+
+        There are no steps where the parts do not determine what changed; a step that is immaterial is no change.
+        """
+        with progress.doing("looking for a change"):
+            model, build = self.method.faults, self.method.graph
+            stable = change_by_parts(build, model, self.data, self.config, freed)
+            if stable is None:
+                return None
+            late = deadline.passed(_SEGMENTS)
+            parts = {} if late else solve_segments(build, model, self.data, self.config, stable.time_s)
+        found = change_finding(stable, parts, quantities)
+        if found is not None and found.severity < Severity.INCONSISTENT:
+            return None
+        start, stop = model.span(self.data)
+        between = RESOLUTION * (stop - start)
+        steps = {} if found is None else found.evidence["steps"]
+        evidence = {"since_s": stable.time_s - between, "time_s": stable.time_s + between, "steps": steps}
+        return replace(stable, differences=steps), Finding("change", Severity.INCONSISTENT, evidence)
 
     def _contradictions(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Finding, ...]:
         """Return findings on inputs that the config fixes and the recording contradicts."""

@@ -74,6 +74,16 @@ class Stability:
     time_s: float
     differences: Mapping[str, tuple[float, float]]
 
+    @classmethod
+    def of_fall(
+        cls, fall: float, numbers: int, times: float, time_s: float, differences: Mapping[str, tuple[float, float]]
+    ) -> Stability:
+        """Build the test of a change of so many numbers by chi-square's fall, at the best of so many times."""
+        from scipy.special import chdtrc
+
+        size = float(_as_normal(np.array([fall]), np.array([numbers]))[0])
+        return cls(size, min(float(chdtrc(numbers, fall)) * times, 1.0), time_s, differences)
+
     @property
     def departures(self) -> dict[str, float]:
         """Estimate before the change minus the final one, in sigmas of the difference, by parameter; largest first."""
@@ -141,12 +151,8 @@ def offset_finding(step: OffsetStep, quantities: Sequence[Quantity]) -> Finding 
 
 def step_stability(step: StepEstimate, duration: float) -> Stability:
     """Convert a step estimate to a stability test, its p-value corrected for the number of possible times."""
-    from scipy.special import chdtrc
-
     times = max(duration, _EVERY_S) / _EVERY_S
-    size = float(_as_normal(np.array([step.statistic]), np.array([_TURNS]))[0])
-    level = min(float(chdtrc(_TURNS, step.statistic)) * times, 1.0)
-    return Stability(size, level, step.time_s, _by_size(step.steps))
+    return Stability.of_fall(step.statistic, _TURNS, times, step.time_s, _by_size(step.steps))
 
 
 def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Sequence[Quantity]) -> Finding | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Mask
 from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.diagnostics.observability import UNCHANGED, Advise, verdict, weak_directions
@@ -71,8 +71,8 @@ def diagnose(
         estimate: with its final covariance.
         quantities: of the estimate, in its order.
         advise: weights of a direction -> motion that would determine it.
-        change, hypotheses, contradictions: findings of the modules `change_test`, `hypothesis_tests`, which runs where
-            `is_suspect` is true, and `stated_priors`.
+        change, hypotheses, contradictions: findings of the modules `change_test`, `hypothesis_tests` or `split_test`,
+            which run where `is_suspect` is true, and `stated_priors`.
         conflicts: `prior_conflicts` of the estimate before they widened it; None: of the estimate.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone
@@ -301,9 +301,7 @@ def _misfit(family: str | None, fit: Fit, largest: str, noise_factor: float, sev
 
 def disturbances(estimate: Estimate) -> Iterator[Finding]:
     """Findings of intervals with most measurements of a family rejected, in time order."""
-    for family, residuals in estimate.residuals.items():
-        order = np.argsort(residuals.time, kind="stable")
-        time, rejected = residuals.time[order], ~residuals.used[order]
+    for family, time, rejected in _in_order(estimate):
         for first, last in intervals(rejected):
             evidence = {
                 "family": family,
@@ -312,6 +310,22 @@ def disturbances(estimate: Estimate) -> Iterator[Finding]:
                 "rejected": int(rejected[first:last].sum()),
             }
             yield Finding("disturbance", Severity.NOTE, evidence)
+
+
+def rejects_an_end(estimate: Estimate) -> bool:
+    """Whether a disturbed interval of a family is nearer to its beginning or end than the interval is long.
+
+    As before a slip, of which some measurements fit by chance.
+    """
+    found = ((len(time), intervals(rejected)) for _, time, rejected in _in_order(estimate))
+    return any(min(first, n - last) < last - first for n, spans in found for first, last in spans)
+
+
+def _in_order(estimate: Estimate) -> Iterator[tuple[str, Array, Mask]]:
+    """Yield each family with its times (n,), s, in order, and which of its measurements are rejected (n,)."""
+    for family, residuals in estimate.residuals.items():
+        order = np.argsort(residuals.time, kind="stable")
+        yield family, residuals.time[order], ~residuals.used[order]
 
 
 def _dominant_priors(

@@ -69,7 +69,7 @@ class FaultModel:
         scalings: numbers of the config that may be off by a factor.
         faults: of other kinds.
         exact: fixed inputs, whose effect is reported and not tested.
-        cut: whether a segment of the recording is a recording.
+        cut: whether a segment of the recording determines what the whole does, if less well.
     """
 
     streams: Mapping[str, Sequence[str]]

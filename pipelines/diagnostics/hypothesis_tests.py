@@ -69,7 +69,7 @@ def find_hypotheses(
     """
     if estimate is not None and model.cut and estimate.residuals:
         # Noise that was estimated to grow with the motion is largest where a fault shows.
-        stated = solve_trial(build, data, _as_stated(config)) if config.noise_known else None
+        stated = solve_trial(build, data, as_stated(config)) if config.noise_known else None
         residuals = estimate.residuals if stated is None else stated.estimate.residuals
         data = model.segment(data, *_worst_segment(residuals, _SEGMENT_S))
     found = _explaining_misfit(build, model, data, config, freed)
@@ -83,11 +83,11 @@ def _explaining_misfit(
 ) -> tuple[Finding, ...]:
     """Find faults without which chi-square falls significantly, arguments as of `find_hypotheses`."""
     known = config.noise_known == 0.0
-    config = _as_stated(config)
+    config = as_stated(config)
     before = solve_trial(build, data, config)
     if before is None or (before.fits and not rejects_many(rejections(before.estimate))):
         return ()
-    without = None if freed is None else solve_trial(build, data, _as_stated(freed))
+    without = None if freed is None else solve_trial(build, data, as_stated(freed))
     if without is not None and without.fits and not rejects_many(rejections(without.estimate)):
         return ()
     concurrent = max_concurrent(model.times(data))
@@ -105,7 +105,7 @@ def _explaining_misfit(
     return _findings(before.cost, found[:_MAX_REPORTED])
 
 
-def _as_stated(config: Config) -> Config:
+def as_stated(config: Config) -> Config:
     """Return a config whose noise is known as stated: levels that are estimated hide what is looked for."""
     return config.model_copy(update={"noise_known": 0.0})
 
@@ -222,15 +222,26 @@ def _worst_segment(residuals: Mapping[str, Residuals], length: float) -> tuple[f
 
 
 def _explains(before: TrialFit, after: TrialFit) -> bool:
-    """Whether a correction reduces chi-square significantly and to (nearly) its expectation.
+    """Whether a correction explains the misfit.
 
     Of a corrected gyro also the noise at rest is another: far larger than its residuals it fits any motion.
     """
     if after.factor < 1.0 / _MAX_NOISE_FACTOR and _is_noisier(before.estimate.levels, after.estimate.levels):
         return False
-    fall = (before.cost - after.cost) / max(after.factor, 1.0) ** 2
-    explains = after.factor < _MAX_REMAINING * before.factor and after.factor**2 <= _MAX_LEFT
-    return fall > _SIGNIFICANT**2 and (after.fits or explains)
+    return explains(before, [after])
+
+
+def explains(before: TrialFit, parts: Sequence[TrialFit]) -> bool:
+    """Whether in parts chi-square is significantly smaller, and (nearly) its expectation."""
+    cost, dof = sum(part.cost for part in parts), sum(part.dof for part in parts)
+    return before.cost - cost > _SIGNIFICANT**2 * max(cost / max(dof, 1.0), 1.0) and is_near(before, parts)
+
+
+def is_near(before: TrialFit, parts: Sequence[TrialFit]) -> bool:
+    """Whether every part fits, or chi-square over dof is at most `_MAX_LEFT` and far below what it was."""
+    square = sum(part.cost for part in parts) / max(sum(part.dof for part in parts), 1.0)
+    nearly = square < (_MAX_REMAINING * before.factor) ** 2 and square <= _MAX_LEFT
+    return nearly or all(part.fits for part in parts)
 
 
 def _is_noisier(before: Sequence[Level], after: Sequence[Level]) -> bool:
@@ -252,7 +263,7 @@ def _noise(build: Build, data: Any, config: Config) -> list[_Tested]:
 
 # Stamps are moved by this much first, s, and numbers scaled by this much; then so many times to the bottom of a
 # parabola.
-_FIRST_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 0.01, 5e-3, 4
+_FIRST_SHIFT, _SECOND_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 1e-3, 0.01, 5e-3, 4
 
 
 @dataclass(frozen=True)
@@ -348,8 +359,8 @@ def _late_stamps(build: Build, model: FaultModel, data: Any, config: Config) -> 
     def moved(shift: float) -> tuple[Any, Config]:
         return replace(data, **{stamps: getattr(data, stamps) + shift}), config
 
-    shift = _lowest(partial(_cost, build, moved), _FIRST_SHIFT)
-    if shift is not None:
+    shift = _bottom(build, moved, _FIRST_SHIFT, _SECOND_SHIFT)
+    if shift:
         side = "early" if shift > 0.0 else "late"
         yield TrialCase(f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift))
 
@@ -365,12 +376,20 @@ def _scale_factors(build: Build, model: FaultModel, data: Any, config: Config) -
             assert found is not None
             return found
 
-        # Not chi-square, which levels off where most measurements are rejected; near the bottom it discriminates best.
-        rough = _lowest(lambda more: score_trial(build, *changed(more))[0] ** 2, _FIRST_SCALING)
-        if rough:
-            more = _lowest(partial(_cost, build, changed), _SECOND_SCALING, rough)
-            more = rough if more is None else more
+        if more := _bottom(build, changed, _FIRST_SCALING, _SECOND_SCALING):
             yield TrialCase(factor.label.format(factor=1.0 + more), *changed(more))
+
+
+def _bottom(build: Build, changed: Callable[[float], tuple[Any, Config]], first: float, second: float) -> float | None:
+    """Find the size of a change with the smallest residuals, by steps of a first and a second size; None without.
+
+    First by scores: chi-square levels off where most measurements are rejected, but near the bottom discriminates best.
+    """
+    rough = _lowest(lambda size: score_trial(build, *changed(size))[0] ** 2, first)
+    if not rough:
+        return rough
+    found = _lowest(partial(_cost, build, changed), second, rough)
+    return rough if found is None else found
 
 
 def _cost(build: Build, changed: Callable[[float], tuple[Any, Config]], size: float) -> float:

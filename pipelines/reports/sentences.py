@@ -292,8 +292,9 @@ def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) ->
     steps = [
         f"{name} by {format_estimate(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]
     ]
-    small = " Immaterial; included in the sigmas." if severity == Severity.NOTE else ""
-    return f"Change {_when(e)}{': ' if steps else ''}{', '.join(steps)}.{small}"
+    if severity == Severity.NOTE:
+        return f"Change {_when(e)}{': ' if steps else ''}{', '.join(steps)}. Immaterial; included in the sigmas."
+    return f"Change {_when(e)}: {', '.join(steps) or 'the parts before and after it fit by themselves, not together'}."
 
 
 def _jump(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:

@@ -87,6 +87,12 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
     ),
     (
         "change",
+        INCONSISTENT,
+        {"since_s": 42.1, "time_s": 42.2, "steps": {}},
+        "Change at 42 s: the parts before and after it fit by themselves, not together.",
+    ),
+    (
+        "change",
         NOTE,
         {"since_s": 38.2, "time_s": 42.2, "steps": {}},
         "Change between 38 and 42 s. Immaterial; included in the sigmas.",
