@@ -89,12 +89,15 @@ def device_prior(known: SavedCalibration, method: Method, config: Config, sha256
     )
 
 
-def finding_of_recording(calibration: Calibration) -> Finding | None:
-    """Return a finding that collects what is inconsistent in one recording, and what residuals show; None without."""
+def finding_of_recording(calibration: Calibration, but: Finding | None = None) -> Finding | None:
+    """Return a finding that collects what is inconsistent in one recording, and what residuals show; None without.
+
+    `but` is left out.
+    """
     own = [
         finding
         for finding in calibration.findings
-        if finding.severity == Severity.INCONSISTENT or finding.kind in _ON_RESIDUALS
+        if finding is not but and (finding.severity == Severity.INCONSISTENT or finding.kind in _ON_RESIDUALS)
     ]
     if not own:
         return None

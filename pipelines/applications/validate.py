@@ -35,7 +35,7 @@ class Validated:
         held: whether the calibration holds; None where the recording cannot say.
         device: what the method says of the calibration's device, bias and the like of this recording re-estimated.
         best: the same of the recording's own calibration: errors that are to be expected of one that holds.
-        own: what the recording says by itself, where that is inconsistent or on its residuals.
+        own: the recording's own calibration; None where nothing is determined, and where everything is fixed.
     """
 
     calibration: SavedCalibration
@@ -46,7 +46,7 @@ class Validated:
     held: CalibrationCheck | None = None
     device: Sequence[Validation] = ()
     best: Sequence[Validation] = ()
-    own: Finding | None = None
+    own: Calibration | None = None
 
     def __repr__(self) -> str:
         return f"<Validated {self.calibration.method} on {self.recording}: {self.verdict}>"
@@ -54,8 +54,8 @@ class Validated:
     @property
     def within(self) -> Finding | None:
         """Finding on a material change of the device during the recording; None without one."""
-        found = self.own.evidence["findings"] if self.own else ()
-        return next((each for each in found if each.kind == "change" and each.severity == Severity.INCONSISTENT), None)
+        found = (each for each in (self.own.findings if self.own else ()) if each.kind == "change")
+        return next((each for each in found if each.severity == Severity.INCONSISTENT and each.evidence["steps"]), None)
 
     @property
     def applied(self) -> Sequence[Validation]:
@@ -116,10 +116,9 @@ class Validated:
             out.append(f"the calibration's own verdict is {self.calibration.status}")
         if self.held is not None:
             out += [f"{what}: no accuracy is required of it" for what in self._changes(self.held.changes.others)]
-        if self.own is not None and self.held is not None:
-            others = tuple(each for each in self.own.evidence["findings"] if each is not self.within)
-            own = replace(self.own, evidence={**self.own.evidence, "findings": others})
-            out += [sentence(own, self.held.quantities)] * bool(others)
+        shown = None if self.held is None else self.within  # by the sentence
+        if self.own is not None and (own := finding_of_recording(self.own, shown)) is not None:
+            out.append(sentence(own, self.own.quantities))
         return out
 
 
@@ -167,9 +166,9 @@ def validate(
     with session.usual_time():
         found = _check(session, known)
         lost = (*opened.notes, *filter(None, [deadline.stopped()]))
-    if found is None:
-        return Validated(known, path.name, validations, False, lost)
     held, own = found
+    if own is None or held is None:
+        return Validated(known, path.name, validations, False, lost, own=own)
     numbers = own.problem.numbers(own.estimate)
     of_device = walks(chosen, settings, [name for name in numbers if name in known.parameters])
     fixed = {name: values[name] for name in of_device if name in values}
@@ -177,7 +176,7 @@ def validate(
     conditional = dict(zip(others.names, others.mean.tolist(), strict=True))
     device = chosen.report.validate(data, settings, numbers | conditional | fixed)
     best = chosen.report.validate(data, settings, numbers)
-    return Validated(known, path.name, validations, False, lost, held, device, best, finding_of_recording(own))
+    return Validated(known, path.name, validations, False, lost, held, device, best, own)
 
 
 def _method_of(path: Path, config: Settings) -> str:
@@ -188,24 +187,24 @@ def _method_of(path: Path, config: Settings) -> str:
         return ""
 
 
-def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck, Calibration] | None:
+def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck | None, Calibration | None]:
     """Test an earlier calibration on a recording by the recording's own calibration, which is returned too.
 
-    None where the recording has no solution, or everything is fixed.
+    No test where that has not converged; and no calibration where nothing is determined, or everything is fixed.
     """
     from alidade.pipelines.solvers.chain import IndeterminateError
 
     session = replace(session, near=known.values)
     if known.solver == "published" or all(q.prior_sigma == 0.0 for q in session.problem().quantities):
-        return None
+        return None, None
     gaussian_prior = device_prior(known, session.method, session.config, session.sha256(), session.epoch_ns)
     try:
         own = session.calibrate(report=False)
     except IndeterminateError:
-        return None
+        return None, None
     estimate = own.estimate
     if not estimate.converged or estimate.sqrt_info is None:
         deadline.passed("the solution of this recording")
-        return None
+        return None, own
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
     return check_calibration(gaussian_prior, estimate.sqrt_info, own.problem.quantities, inflations), own

@@ -133,6 +133,20 @@ def test_it_does_not_hold_for_a_recording_in_which_it_slips(tmp_path: Path, alid
     assert re.search(r"does not hold: Change at (19|20) s: helmet_mount_x by ", done.out)
 
 
+@pytest.mark.slow
+def test_why_a_recording_says_nothing_is_said(tmp_path: Path) -> None:
+    """Encoders that slip half way leave no solution of the whole recording."""
+    scenario = {"duration_s": 20.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 10.0}
+    opened(simulate("los", scenario, seed=1)).calibrate("batch", report=False).write(tmp_path)
+    later = simulate("los", scenario, seed=2)
+    slipped = np.where((later.data.gimbal_t > 10.0)[:, None], np.deg2rad([8.0, -7.0]), 0.0)
+    data = replace(later.data, gimbal=later.data.gimbal + slipped)
+    method("los").write(tmp_path / "later.mcap", replace(later, data=data))
+    found = validate(tmp_path / "later.mcap", tmp_path / "calibration.yaml")
+    assert found.verdict == "unknown"
+    assert any(re.match(r"later.mcap by itself: Change at (9|10|11) s: ", note) for note in found.notes)
+
+
 def test_errors_of_vision_by_attitude_are_no_change(tmp_path: Path) -> None:
     """A change has the sigmas of the recording's own calibration, which these errors widen."""
     scenario = short_head(duration_s=20.0, vision_map=5e-3)
