@@ -376,8 +376,7 @@ class Session:
         suspect = is_suspect(estimate, findings, quantities)
         # Steps at every keyframe, where they are tested, tell a slip from outliers, and a change from other faults.
         by_parts = estimate.steps is None and not hypotheses
-        rejects = rejects_an_end(estimate) or any(each.kind == "rejection" for each in findings)
-        if not (hypotheses or suspect or (by_parts and (rejects or change is not None))):
+        if not (hypotheses or suspect or (by_parts and (rejects_an_end(estimate) or change is not None))):
             return None, findings
         severe = any(each.severity > Severity.NOTE for each in contradicted)
         freed = self._freed[0] if severe and self._freed is not None else None

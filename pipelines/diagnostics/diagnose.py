@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -50,6 +51,8 @@ class Thresholds:
 LIMITS = Thresholds()
 # Prior sigma of the worst devices over that of usual ones.
 _WORSE = 10.0
+# Of rejected measurements that lie at an end by chance.
+_CHANCE = 1e-3
 # Share of the parameters from which on a recording is said not to determine them.
 _MOST = 0.5
 # A data-sheet figure with at least this share of a variance is worth stating better; the largest ones are reported.
@@ -313,12 +316,19 @@ def disturbances(estimate: Estimate) -> Iterator[Finding]:
 
 
 def rejects_an_end(estimate: Estimate) -> bool:
-    """Whether a disturbed interval of a family is nearer to its beginning or end than the interval is long.
+    """Whether the rejected measurements of a family are those before or after some time, as of a sensor that slipped.
 
-    As before a slip, of which some measurements fit by chance.
+    Of many some fit by chance: a disturbed interval is nearer to the beginning or end than it is long. Of few they are
+    exactly the first or the last, which of k among n has the chance 2 / C(n, k).
     """
-    found = ((len(time), intervals(rejected)) for _, time, rejected in _in_order(estimate))
-    return any(min(first, n - last) < last - first for n, spans in found for first, last in spans)
+    for _, time, rejected in _in_order(estimate):
+        n, k = len(time), int(rejected.sum())
+        if any(min(first, n - last) < last - first for first, last in intervals(rejected)):
+            return True
+        ways = math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)  # log C(n, k)
+        if (rejected[:k].all() or rejected[n - k :].all()) and ways > math.log(2.0 / _CHANCE):
+            return True
+    return False
 
 
 def _in_order(estimate: Estimate) -> Iterator[tuple[str, Array, Mask]]:
