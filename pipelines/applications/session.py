@@ -41,6 +41,7 @@ from alidade.pipelines.diagnostics.split_test import RESOLUTION, change_by_parts
 from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config, with_conflicts
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity, remark
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
     AttitudeRate,
     Attitudes,
@@ -237,7 +238,7 @@ class Session:
         """The calibration by one of SOLVERS; `window` in s is the incremental one's, None keeps the whole history.
 
         With `check` an incremental run ends with the solution of all measurements together, as the command's does:
-        that alone finds a change of any size. Without `report` there are values, sigmas and verdicts,
+        that is what a change is looked for in. Without `report` there are values, sigmas and verdicts,
         the same to the last digit, and nothing of what else a report explains: where the variances come from, which
         measurements move a number most, the effect of fixed inputs on it, the method's own findings.
 
@@ -374,7 +375,7 @@ class Session:
         model, build = self.method.faults, self.method.graph
         hypotheses = misstatements(build, model, self.data, self.config)
         suspect = is_suspect(estimate, findings, quantities)
-        # Steps at every keyframe, where they are tested, tell a slip from outliers, and a change from other faults.
+        # Where steps are tested at every keyframe, that separates slips from outliers and from other faults.
         by_parts = estimate.steps is None and not hypotheses
         if not (hypotheses or suspect or (by_parts and (rejects_an_end(estimate) or change is not None))):
             return None, findings
@@ -399,7 +400,7 @@ class Session:
     def _changed_between(
         self, quantities: Sequence[Quantity], freed: Config | None
     ) -> tuple[Stability, Finding] | None:
-        """Test whether a change explains what does not fit; return the test and the finding with the steps at it.
+        """Test whether a change during the recording explains its misfit; return the test and a finding with the steps.
 
         There are no steps where the parts do not determine what changed; a step that is immaterial is no change.
         """
@@ -408,8 +409,7 @@ class Session:
             stable = change_by_parts(build, model, self.data, self.config, freed)
             if stable is None:
                 return None
-            late = deadline.passed(_SEGMENTS)
-            parts = {} if late else solve_segments(build, model, self.data, self.config, stable.time_s)
+            parts = self._either_side(stable.time_s)
         found = change_finding(stable, parts, quantities)
         if found is not None and found.severity < Severity.INCONSISTENT:
             return None
@@ -458,13 +458,15 @@ class Session:
         stable = stability(estimate, quantities)
         if stable is None or not stable.changed:
             return stable, None
-        parts: Mapping[str, SplitHalf] = {}
-        if self.method.faults.cut and not deadline.passed(_SEGMENTS):
-            with progress.doing("solving both sides of a change"):
-                parts = solve_segments(
-                    self.method.graph, self.method.faults, self.data, self.config, stable.time_s, estimate.levels
-                )
+        parts = self._either_side(stable.time_s, estimate.levels) if self.method.faults.cut else {}
         return stable, change_finding(stable, parts, quantities, ratio)
+
+    def _either_side(self, time_s: float, levels: Sequence[Level] = ()) -> Mapping[str, SplitHalf]:
+        """Return the parameters that both sides of a change determine, see `solve_segments`; none past the deadline."""
+        if deadline.passed(_SEGMENTS):
+            return {}
+        with progress.doing("solving both sides of a change"):
+            return solve_segments(self.method.graph, self.method.faults, self.data, self.config, time_s, levels)
 
     def _with_conclusion(
         self, estimate: Estimate, quantities: Sequence[Quantity], report: bool

@@ -90,9 +90,9 @@ def device_prior(known: SavedCalibration, method: Method, config: Config, sha256
 
 
 def finding_of_recording(calibration: Calibration, but: Finding | None = None) -> Finding | None:
-    """Return a finding that collects what is inconsistent in one recording, and what residuals show; None without.
+    """Collect what is inconsistent in a recording by itself, or shown by its residuals, in one finding; None without.
 
-    `but` is left out.
+    The finding `but` is left out.
     """
     own = [
         finding

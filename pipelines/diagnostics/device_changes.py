@@ -108,7 +108,7 @@ class Changes:
 
     @property
     def jointly(self) -> tuple[Together, ...]:
-        """Joint tests of all numbers that show a change of the device, where the step of no single number does."""
+        """Significant tests of a step of all numbers of the device at once, where no single number's step is."""
         return () if self.found or self.others else tuple(each for each in self.together if each.significant)
 
     @property

@@ -51,7 +51,7 @@ class Thresholds:
 LIMITS = Thresholds()
 # Prior sigma of the worst devices over that of usual ones.
 _WORSE = 10.0
-# Of rejected measurements that lie at an end by chance.
+# Chance that rejected measurements are the first or the last of a recording in which nothing changed.
 _CHANCE = 1e-3
 # Share of the parameters from which on a recording is said not to determine them.
 _MOST = 0.5
@@ -75,7 +75,7 @@ def diagnose(
         quantities: of the estimate, in its order.
         advise: weights of a direction -> motion that would determine it.
         change, hypotheses, contradictions: findings of the modules `change_test`, `hypothesis_tests` or `split_test`,
-            which run where `is_suspect` is true, and `stated_priors`.
+            which run where `is_suspect` or (the latter) `rejects_an_end` is true, and `stated_priors`.
         conflicts: `prior_conflicts` of the estimate before they widened it; None: of the estimate.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone

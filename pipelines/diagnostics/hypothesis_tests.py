@@ -232,14 +232,26 @@ def _explains(before: TrialFit, after: TrialFit) -> bool:
 
 
 def explains(before: TrialFit, parts: Sequence[TrialFit]) -> bool:
-    """Whether in parts chi-square is significantly smaller, and (nearly) its expectation."""
-    cost, dof = sum(part.cost for part in parts), sum(part.dof for part in parts)
-    return before.cost - cost > _SIGNIFICANT**2 * max(cost / max(dof, 1.0), 1.0) and is_near(before, parts)
+    """Whether separate fits of parts explain the misfit of a recording: a significant fall of chi-square, and a fit."""
+    return scaled_fall(before, parts) > _SIGNIFICANT**2 and is_near(before, parts)
+
+
+def scaled_fall(before: TrialFit, parts: Sequence[TrialFit]) -> float:
+    """Fall of chi-square by fitting parts separately, over the noise variance factor with which these would fit."""
+    return (before.cost - sum(part.cost for part in parts)) / max(_reduced(parts), 1.0)
+
+
+def _reduced(parts: Sequence[TrialFit]) -> float:
+    """Chi-square of several fits together over their degrees of freedom."""
+    return sum(part.cost for part in parts) / max(sum(part.dof for part in parts), 1.0)
 
 
 def is_near(before: TrialFit, parts: Sequence[TrialFit]) -> bool:
-    """Whether every part fits, or chi-square over dof is at most `_MAX_LEFT` and far below what it was."""
-    square = sum(part.cost for part in parts) / max(sum(part.dof for part in parts), 1.0)
+    """Whether parts of a recording fit, or nearly, and far better than the whole.
+
+    Nearly: chi-square over dof is at most `_MAX_LEFT`, and below `_MAX_REMAINING` squared of what it was.
+    """
+    square = _reduced(parts)
     nearly = square < (_MAX_REMAINING * before.factor) ** 2 and square <= _MAX_LEFT
     return nearly or all(part.fits for part in parts)
 
@@ -381,9 +393,10 @@ def _scale_factors(build: Build, model: FaultModel, data: Any, config: Config) -
 
 
 def _bottom(build: Build, changed: Callable[[float], tuple[Any, Config]], first: float, second: float) -> float | None:
-    """Find the size of a change with the smallest residuals, by steps of a first and a second size; None without.
+    """Find how far stamps or a number of the config are off, by the smallest residuals; None if nothing is found.
 
-    First by scores: chi-square levels off where most measurements are rejected, but near the bottom discriminates best.
+    By steps of a first size, then of a second. First by scores: chi-square levels off where most measurements are
+    rejected, but near the bottom discriminates best.
     """
     rough = _lowest(lambda size: score_trial(build, *changed(size))[0] ** 2, first)
     if not rough:

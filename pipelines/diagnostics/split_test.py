@@ -1,4 +1,4 @@
-"""Test for a change, however large, by solving the parts before and after it separately.
+"""Test whether something changed during a recording, however much: the parts before and after are solved separately.
 
 A change that is large beside the noise leaves no solution of the whole recording to compare anything with: it is
 rejected as outliers, or ends in whatever the priors leave free. Both parts fit by themselves. The time is bisected: of
@@ -18,7 +18,7 @@ from alidade.pipelines import deadline, parallel
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.cross_validation import Build, TrialFit, max_concurrent, solve_trial
 from alidade.pipelines.diagnostics.fault_models import FaultModel
-from alidade.pipelines.diagnostics.hypothesis_tests import as_stated, explains, is_near
+from alidade.pipelines.diagnostics.hypothesis_tests import as_stated, explains, is_near, scaled_fall
 from alidade.pipelines.settings import Config
 
 # The time of a change is found to 2^-7 of the recording; where no split explains the misfit yet, to 2^-20, less than a
@@ -32,7 +32,7 @@ _SEARCH = "the search for a change"
 
 @dataclass(frozen=True)
 class _Split:
-    """Fits of the parts before and after a time, s."""
+    """Separate fits of the parts of a recording before and after a time, s, and whether they explain its misfit."""
 
     time_s: float
     parts: Sequence[TrialFit]
@@ -42,11 +42,6 @@ class _Split:
     def cost(self) -> float:
         """Sum of the parts' costs."""
         return sum(part.cost for part in self.parts)
-
-    @property
-    def square(self) -> float:
-        """Cost over degrees of freedom."""
-        return self.cost / max(sum(part.dof for part in self.parts), 1.0)
 
 
 def change_by_parts(
@@ -67,7 +62,7 @@ def change_by_parts(
     without = None if freed is None else solve_trial(build, data, as_stated(freed))
     if deadline.passed(_SEARCH) or (without is not None and without.cost < best.cost):
         return None
-    fall = (before.cost - best.cost) / max(best.square, 1.0)
+    fall = scaled_fall(before, best.parts)
     found = Stability.of_fall(fall, len(before.quantities), 1.0 / RESOLUTION, best.time_s, {})
     return found if found.changed else None
 

@@ -101,9 +101,8 @@ def test_hours_of_indexing_cost_the_same_per_turn() -> None:
 
     The quickest tenth of them, by processor time: whatever else the machine does only adds to it.
     """
-    graph, _ = _problem(
-        load_scenario(IndexerScenario, "indexer_long"), 2
-    )  # of seed 1 the gate takes one of 3,072 turns
+    # Of seed 1 the gate takes one of 3,072 turns.
+    graph, _ = _problem(load_scenario(IndexerScenario, "indexer_long"), 2)
     batch = solve_batch(graph)
     moments: list[float] = []
 

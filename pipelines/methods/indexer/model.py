@@ -309,7 +309,7 @@ _DISAGREEMENT = 0.01
 
 
 def require_agreeing(groups: tuple[Group, ...], parameters: Sequence[Parameter]) -> None:
-    """Raise if gyro and encoders disagree about an axis.
+    """Raise InputError if the gyro turns the other way, or at another rate, than an encoder of the indexer.
 
     Fits gyro = A w + b over all groups, so that neither mounting nor bias counts as disagreement.
 
