@@ -439,7 +439,7 @@ def scenarios(
         if name in (None, method, scenario)
     ]
     if as_json:
-        print(plain_json("scenarios", {"scenarios": listed}))
+        _print_json(plain_json("scenarios", {"scenarios": listed}))
     else:
         rows = tuple((scenario["name"], scenario["summary"]) for scenario in listed)
         terminal.print_table(Table("", "", ("scenario", Column("what it shows", "prose")), rows))
@@ -507,7 +507,7 @@ def info(
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
-        print(terminal.facts_json(facts, found, left, columns))
+        _print_json(terminal.facts_json(facts, found, left, columns))
     else:
         terminal.print_facts(session.name, facts, found, left, columns)
 
@@ -661,7 +661,7 @@ def export(
     if out is not None:
         write_file(out, text)
     if as_json:
-        print(plain_json("export", {"method": saved.method, "format": form, "text": text}))
+        _print_json(plain_json("export", {"method": saved.method, "format": form, "text": text}))
     elif out is None:
         print(text, end="")
     else:
@@ -803,13 +803,24 @@ def _show(
 ) -> None:
     """Print a command's result: as JSON alone, or as its report, if any, followed by lines."""
     if as_json:
-        print(text().removesuffix("\n"))
+        _print_json(text())
         return
     if report is not None:
         from alidade.pipelines.reports.terminal import print_report
 
         print_report(report(), everything)
     _say(*lines)
+
+
+def _print_json(text: str) -> None:
+    """Print JSON; if the encoding of standard output lacks any of its characters, escape all that are not ASCII."""
+    try:
+        text.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        import json
+
+        text = re.sub(r"[^\x00-\x7f]", lambda found: json.dumps(found[0])[1:-1], text)
+    print(text.removesuffix("\n"))
 
 
 def _say(*lines: str) -> None:
@@ -834,7 +845,7 @@ def main() -> None:
     """Run the command; known trouble is one line on stderr."""
     # The matrices are small: threads that wait for each other cost more than they bring, most on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if isinstance(sys.stdout, TextIOWrapper):  # characters that the terminal's encoding lacks are question marks
+    if isinstance(sys.stdout, TextIOWrapper):  # characters that its encoding lacks are question marks, but in JSON
         sys.stdout.reconfigure(errors="replace")
     try:
         app(prog_name="alidade")

@@ -9,11 +9,13 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from alidade.pipelines.applications import cli
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.methods import method
@@ -377,6 +379,22 @@ def test_output_fits_any_encoding_and_a_full_disk_is_one_line(brief: Path, tmp_p
         run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=root)
     assert (run.returncode, run.stderr.count("\n")) == (2, 1)
     assert run.stderr.startswith("alidade: standard output, or temporary files in ")
+
+
+def test_json_on_a_terminal_without_unicode_loses_nothing(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Units such as rad/s/√Hz once had a question mark."""
+    with TextIOWrapper(BytesIO(), "ascii") as stdout:
+        monkeypatch.setattr("sys.stdout", stdout)
+        monkeypatch.setattr("sys.argv", ["alidade", "calibrate", str(session), "--json", "--out", str(tmp_path)])
+        with pytest.raises(SystemExit):
+            cli.main()
+        stdout.seek(0)
+        printed = json.load(stdout)
+    text = (tmp_path / "result.json").read_text()
+    assert "√" in text
+    assert printed == json.loads(text)
 
 
 def test_errors_name_what_is_missing_where_and_what_there_is(alidade: Command, session: Path, tmp_path: Path) -> None:
