@@ -111,7 +111,7 @@ def settings_key(*settings: Any) -> str:
 class Store(Generic[Result]):
     """Results of one kind by name, in `results.jsonl` of a folder; those of other settings are ignored.
 
-    A context manager: without any result it leaves neither the file nor a folder that it made.
+    A context manager: without any result it leaves neither the file nor the folders that it made.
 
     Raises InputError when the folder cannot be written to, or another process keeps its results there.
     """
@@ -119,7 +119,7 @@ class Store(Generic[Result]):
     def __init__(self, folder: Path, settings: str, kind: type[Result]) -> None:
         self._path, self._settings, self._kind = folder / FILE, settings, TypeAdapter(kind)
         self.results: dict[str, Result] = {}
-        self._makes_folder = not folder.exists()
+        self._made = [each for each in (folder, *folder.parents) if not each.exists()]
         require_writable(folder)
         try:
             self._stream = self._path.open("a+b")
@@ -138,8 +138,8 @@ class Store(Generic[Result]):
             return
         with suppress(OSError):  # another has put something there, or taken it away
             self._path.unlink()
-            if self._makes_folder:
-                self._path.parent.rmdir()
+            for folder in self._made:
+                folder.rmdir()
 
     def add(self, name: str, result: Result) -> None:
         """Append a result to the file, and flush the file before returning."""

@@ -152,6 +152,7 @@ def test_study_goes_on_and_sums_up(
         (["head", "--runs", "0"], "at least one run"),
         (["head", "--out", "/dev/null/out"], "no folder to write results to"),
         (["head", "--jobs", "1", "--scheduler", "tcp://127.0.0.1:1"], "not together with --scheduler"),
+        (["head", "--jobs", "0", "--out", "a/b/c"], "--jobs 0"),
     ],
 )
 def test_bad_input_is_one_line(
