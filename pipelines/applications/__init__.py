@@ -7,3 +7,6 @@ processes.
 
 The top room: imports all others, and none imports it.
 """
+
+# Added by `apply` to the name of a topic for that of the corrected one.
+CALIBRATED = "_calibrated"

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from alidade.pipelines import methods, progress
-from alidade.pipelines.applications.discovery import CALIBRATED
+from alidade.pipelines.applications import CALIBRATED
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.errors import InputError

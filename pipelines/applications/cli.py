@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from alidade.pipelines import deadline, errors, parallel, progress
+from alidade.pipelines.applications import CALIBRATED
 from alidade.pipelines.errors import InputError, nearest_three, printable
 from alidade.pipelines.files import plain_json, require_place, require_room, write_file, write_whole
 from alidade.pipelines.solvers.window import parse_window
@@ -673,9 +674,7 @@ def apply(
     recording: _RecordingPath,
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
     out: Annotated[Path, typer.Option(help="MCAP file to write.")],
-    suffix: Annotated[
-        str, typer.Option(help="Added to a topic's name for that of the corrected topic.")
-    ] = "_calibrated",
+    suffix: Annotated[str, typer.Option(help="Added to a topic's name for that of the corrected topic.")] = CALIBRATED,
     config: _ConfigFile = None,
     strict: _Strict = False,
     auto_columns: _AutoColumns = False,

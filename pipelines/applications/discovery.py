@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from alidade.pipelines import methods
+from alidade.pipelines.applications import CALIBRATED
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording import messages
@@ -23,8 +24,6 @@ from alidade.pipelines.recording.series import ImuSeries
 from alidade.pipelines.recording.topics import Setting, Topic, TopicSource, lacking, wanted
 from alidade.pipelines.settings import Config
 
-# Added by `apply` to the name of a topic for that of the corrected one.
-CALIBRATED = "_calibrated"
 # Correlations are compared up to this one.
 _HIGHEST = 1.0 - 1e-9
 # Names are alike above this ratio of difflib.
