@@ -3,9 +3,9 @@
     applied = apply("session.mcap", "calibration.yaml", "corrected.mcap")
 
 Everything recorded is copied as it is, block by block. Behind each block of a topic that the calibration corrects stand
-its corrected messages in ROS 2's form, with the stamps and log times of the recorded ones. Covariances are J C J^T, J
-the derivative of the correction. The error that the calibration leaves is the same in all messages, no noise, and in
-none of their covariances.
+its corrected messages in ROS 2's form, with the stamps and log times of the recorded ones; an attachment,
+`corrected:/imu_calibrated`, names the recorded topic. Covariances are J C J^T, J the derivative of the correction. The
+error that the calibration leaves is the same in all messages, no noise, and in none of their covariances.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.streams import StreamReader
 from alidade.pipelines.recording.topics import TEMPERATURE
 from alidade.pipelines.reports.calibration import SavedCalibration, as_saved
+from alidade.pipelines.settings import CORRECTED
 
 if TYPE_CHECKING:
     from alidade.factors.array import Array, Stamps
@@ -205,6 +206,7 @@ def _write(stream: BinaryIO, recording: Recording, topics: Sequence[CorrectedTop
     """Write the messages of a recording, each block followed by the corrected messages with its stamps."""
     container = recording.container
     attached = {name: container.attachment(name, needed=False) for name in container.attachments}
+    attached |= {f"{CORRECTED}{topic.name}": topic.recorded.encode() for topic in topics}
     out = McapOutput(stream, {name: data for name, data in attached.items() if data is not None})
     corrected = {topic.recorded: (topic, np.argsort(topic.messages.t_ns, kind="stable")) for topic in topics}
     defined = {number for number in container.channels if container.is_defined(number)}

@@ -22,7 +22,7 @@ from alidade.pipelines.recording.plausibility import is_there
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
 from alidade.pipelines.recording.topics import Setting, Topic, TopicSource, lacking, wanted
-from alidade.pipelines.settings import Config
+from alidade.pipelines.settings import CORRECTED, Config
 
 # Correlations are compared up to this one.
 _HIGHEST = 1.0 - 1e-9
@@ -136,20 +136,26 @@ def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     sources = (config.topics.get(topic.key, TopicSource(topic=topic.name)) for topic in chosen.topics)
     read = {part for source in sources for part in source.parts}
     read |= {source.name for source in config.topics.values()}
-    own = {name.removesuffix(CALIBRATED) for name in read}
+    own = {_corrected(recording, name) for name in read}
     sentences = []
     for topic in chosen.topics:
         if _is_attitude(topic) or wanted(recording, config, topic):
             continue
         there = recording.topics.items()
         free = [n for n, t in there if t.type == topic.types[0] and t.count and t.is_readable]
-        free = [name for name in free if name.removesuffix(CALIBRATED) not in own]
+        free = [name for name in free if _corrected(recording, name) not in own]
         if free:
             sentences.append(
                 f"{' and '.join(free)} ({topic.types[0].rpartition('/')[2]}): not used; is it the {topic.key}? "
                 f"`topics: {{{topic.key}: {free[0]}}}`"
             )
     return tuple(sentences)
+
+
+def _corrected(recording: Recording, name: str) -> str:
+    """Return the name of the topic that `apply` made a topic of; of one that was recorded its own."""
+    stated = recording.attachment(f"{CORRECTED}{name}", needed=False)
+    return name.removesuffix(CALIBRATED) if stated is None else stated.decode(errors="replace")
 
 
 def empty(recording: Recording, config: Config, method: str) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from mcap.writer import Writer
 
 import alidade as door
 from alidade.pipelines import methods
+from alidade.pipelines.applications.discovery import idle
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
@@ -172,6 +173,17 @@ def test_everything_recorded_is_copied_to_the_byte(tmp_path: Path) -> None:
     corrected = after.pop("/mag/corrected")
     assert after == before
     assert [log for log, _ in corrected] == [log for log, _ in before["/mag"]]
+
+
+def test_a_corrected_topic_is_no_other_sensor_whatever_its_suffix(tmp_path: Path) -> None:
+    """One with a suffix of one's own was once proposed as the platform's gyro."""
+    write_session(tmp_path / "s.mcap", {"/head/imu": sensors()["/head/imu"]})
+    calibration = saved("head", GYRO)
+    door.apply(tmp_path / "s.mcap", calibration, tmp_path / "c.mcap", suffix="/corrected")
+    door.apply(tmp_path / "c.mcap", calibration, tmp_path / "d.mcap", suffix="/again")
+    corrected = open_recording(tmp_path / "d.mcap")
+    assert {"/head/imu/corrected", "/head/imu/again"} <= corrected.topics.keys()
+    assert idle(corrected, Config(), "head") == ()
 
 
 def test_messages_that_nobody_reads_are_copied(tmp_path: Path) -> None:
