@@ -149,7 +149,9 @@ class Stream:
 GYRO_TREMOR, ACCEL_TREMOR = 0.05, 0.2
 
 
-def find_static_intervals(t: Array, accel: Stream, gyro: Stream | None = None, *others: Stream) -> Array:
+def find_static_intervals(
+    t: Array, accel: Stream, gyro: Stream | None = None, *others: Stream, dropped: dict[str, int] | None = None
+) -> Array:
     """Find static intervals: start and end, (P, 2) s, each at a sample's stamp.
 
     Without a gyro a steady turn about what a sensor feels passes for a rest.
@@ -159,6 +161,7 @@ def find_static_intervals(t: Array, accel: Stream, gyro: Stream | None = None, *
         accel: m/s^2.
         gyro: rad/s.
         others: more sensors that have to be quiet.
+        dropped: reason -> number of quiet intervals left out, filled in.
 
     Raises:
         InputError: there is none.
@@ -183,6 +186,8 @@ def find_static_intervals(t: Array, accel: Stream, gyro: Stream | None = None, *
             f"to {np.ptp(rates, axis=0).max():.2g} rad/s apart: either it turns steadily in them, or gravity shifts "
             "its gyro by far more than a usual one's (g-sensitivity)"
         )
+    if dropped is not None and not still.all():
+        dropped["quiet interval with another mean rate than the static ones"] = int((~still).sum())
     return np.asarray(t[runs[still]])
 
 

@@ -80,7 +80,7 @@ class StaticPoses:
         mag_duration: (P,) s.
         celsius: (P,) mean temperatures, degrees Celsius; None where nobody measures them.
         tags: one a pose, None where no tag of the cube is seen well.
-        dropped: reason -> number of tags or poses.
+        dropped: reason -> number of tags, poses or intervals.
     """
 
     span: Array
@@ -106,7 +106,7 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
         InputError: there is no static pose, no tag is seen in any though there is a camera, or a tag does not fit the
             others.
     """
-    span = static_intervals(data, config)
+    span, turning = _static_intervals(data, config)
     raw = config.section(CubeConfig).raw
     gyro, duration = _means(data.imu_t, nominal(data.gyro, raw.gyro), span)
     accel, _ = _means(data.imu_t, nominal(data.accel, raw.accel), span)
@@ -122,7 +122,7 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
         celsius = _means(data.imu_t, data.temperature.above(0.0, data.imu_t)[:, None], span)[0][:, 0]
     raws = (data.gyro, data.accel)
     unrest = np.stack([_unrest(data.imu_t, values, span) for values in raws], axis=1)
-    return StaticPoses(span, gyro, accel, duration, unrest, mag, mag_duration, celsius, tags, dropped)
+    return StaticPoses(span, gyro, accel, duration, unrest, mag, mag_duration, celsius, tags, turning | dropped)
 
 
 def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
@@ -315,16 +315,22 @@ def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
     )
 
 
-@computed_once
 def static_intervals(data: CubeData, config: Config) -> Array:
     """Start and end, (P, 2) s, of the device's static intervals. Raises InputError if there is none."""
+    return _static_intervals(data, config)[0]
+
+
+@computed_once
+def _static_intervals(data: CubeData, config: Config) -> tuple[Array, dict[str, int]]:
+    """Find `static_intervals`; return them with the number of quiet intervals left out, by reason."""
     root_rate = float(np.median(np.diff(data.imu_t))) ** -0.5
     gyro_sigma, accel_sigma = (
         stated_density(name, data, config).stated * root_rate for name in ("gyro_density", "accel_density")
     )
     raw = config.section(CubeConfig).raw
     gyro = Stream(nominal(data.gyro, raw.gyro), gyro_sigma, GYRO_TREMOR)
-    return find_static_intervals(data.imu_t, Stream(nominal(data.accel, raw.accel), accel_sigma, ACCEL_TREMOR), gyro)
+    accel, dropped = Stream(nominal(data.accel, raw.accel), accel_sigma, ACCEL_TREMOR), dict[str, int]()
+    return find_static_intervals(data.imu_t, accel, gyro, dropped=dropped), dropped
 
 
 # Messages that scatter by more than this many times their variance are those of a reference that moved.

@@ -31,9 +31,9 @@ def test_static_intervals_and_tag_poses_are_found_once(
     def counted(module: Any, name: str) -> None:
         original = getattr(module, name)
 
-        def call(*arguments: Any) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
             calls[name] += 1
-            return original(*arguments)
+            return original(*arguments, **options)
 
         monkeypatch.setattr(module, name, call)
 

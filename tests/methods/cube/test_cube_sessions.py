@@ -103,6 +103,9 @@ def test_a_steady_turn_is_no_rest() -> None:
     found = static_intervals(data, load_config(b""))
     middle = found.mean(axis=1)
     assert not ((middle > 1.0) & (middle < 3.5)).any()
+    assert static_poses(data, load_config(b"")).dropped == {
+        "quiet interval with another mean rate than the static ones": 1
+    }
 
 
 def test_a_gyro_that_gravity_shifts_is_at_rest_in_all_poses(session: CubeData) -> None:
