@@ -603,7 +603,8 @@ def of_other_methods(chosen: Method, config: Config) -> Iterator[str]:
             owners = [each.name for each in others if each.spec(name) is not None]
             if owners and chosen.spec(name) is None:
                 whose = f"a parameter of {' and '.join(owners)}, not of {chosen.name}"
-                raise InputError(f"{config.origin or 'config'}: {where}.{name}: {whose}")
+                written = "" if config.method in (None, chosen.name) else f"the config is for method {config.method}: "
+                raise InputError(f"{config.origin or 'config'}: {written}{where}.{name}: {whose}")
     own = chosen.config_section and chosen.config_section.key
     for key in sorted({each.config_section.key for each in others if each.config_section} - {own}):
         if key in config.model_fields_set:

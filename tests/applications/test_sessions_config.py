@@ -151,6 +151,8 @@ def test_what_is_of_another_method_is_named() -> None:
     assert list(of_other_methods(head, config)) == ["`cube:` in the config is of another method: head does not use it"]
     with pytest.raises(InputError, match=r"require.accel_b1: a parameter of cube and tumble, not of head"):
         list(of_other_methods(head, load_config(b"require: {accel_b1: 0.1}")))
+    with pytest.raises(InputError, match=r"the config is for method cube: require.accel_b1: a"):
+        list(of_other_methods(head, load_config(b"method: cube\nrequire: {accel_b1: 0.1}")))
 
 
 def test_a_result_given_as_the_config_is_named(tmp_path: Path) -> None:
