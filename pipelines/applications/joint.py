@@ -45,7 +45,7 @@ from alidade.pipelines.estimation.problem import (
 from alidade.pipelines.estimation.widening import marginalised
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.methods import Method
-from alidade.pipelines.recording.container import total
+from alidade.pipelines.recording.container import require_distinct, total
 from alidade.pipelines.recording.topics import SessionFacts
 from alidade.pipelines.reports.joint_report import recording_blocks
 from alidade.pipelines.reports.result import Calibration
@@ -178,16 +178,13 @@ def _one_device(alone: Sequence[Alone]) -> Method:
     if not alone:
         raise InputError("no recordings are named")
     first = alone[0].calibration
-    seen: set[str] = set()
     for each in alone:
         found = each.calibration
         if found.method is not first.method:
             raise InputError(
                 f"{each.name}: is calibrated by {found.method.name}, {first.recording} by {first.method.name}"
             )
-        if found.sha256 in seen:
-            raise InputError(f"{each.name}: the same recording is named twice; it would count twice")
-        seen.add(found.sha256)
+    require_distinct((each.name, each.calibration.sha256) for each in alone)
     return first.method
 
 

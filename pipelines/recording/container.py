@@ -338,6 +338,15 @@ def combined_sha256(digests: Iterable[str]) -> str:
     return hashlib.sha256(b"".join(map(bytes.fromhex, digests))).hexdigest()
 
 
+def require_distinct(recordings: Iterable[tuple[str, str]]) -> None:
+    """Raise InputError if two recordings, each a name and a SHA-256, are the same."""
+    seen: set[str] = set()
+    for name, sha256 in recordings:
+        if sha256 in seen:
+            raise InputError(f"{name}: the same recording is named twice; it would count twice")
+        seen.add(sha256)
+
+
 def _when(losses: Sequence[DataLoss], start_ns: int | None, duration_s: float) -> str:
     """Return a phrase with the time span of losses, s from the session's start; empty if unknown or implausible."""
     if start_ns is None:

@@ -19,6 +19,7 @@ from alidade.pipelines.methods.cube.parameters import PLACE, TAG
 from alidade.pipelines.methods.cube.recording import TAG_DETECTIONS, CubeConfig, CubeData, RefinedCamera, Sightings
 from alidade.pipelines.methods.cube.static_poses import static_intervals
 from alidade.pipelines.recording.checks import clean, count
+from alidade.pipelines.recording.container import require_distinct
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import IMAGE, wanted
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -212,11 +213,13 @@ def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: b
         recordings: each with its config; of one camera or of several.
         refine_camera: adjust the cameras' intrinsics too.
 
-    Raises InputError when there are no pictures or detections, or none that ties the tags together.
+    Raises InputError when there are no pictures or detections, or none that ties the tags together, or a recording is
+    named twice.
     """
     from alidade.pipelines.vision.layout import estimate_layout
     from alidade.pipelines.vision.pose import TagBody
 
+    require_distinct((recording.path.name, recording.sha256()) for recording, _ in recordings)
     shots = [_shots(recording, config) for recording, config in recordings]
     if not any(len(found) for each in shots for found in each.pictures):
         pictures = sum(len(each.pictures) for each in shots)

@@ -37,6 +37,7 @@ SCENARIO = CubeScenario(
     errors=Errors(tag_mount=0.02),
     magnetometer=None,
 )
+HIDDEN = SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))})
 # Corners enough to tell their own noise.
 DENSE = SCENARIO.model_copy(update={"camera": CubeCamera(rate_hz=4.0)})
 
@@ -51,7 +52,7 @@ def _session(path: Path, seed: int, scenario: CubeScenario = SCENARIO) -> dict[s
 def hidden(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording in which one tag is in no picture."""
     path = tmp_path_factory.mktemp("hidden") / "5.mcap"
-    _session(path, 5, SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))}))
+    _session(path, 5, HIDDEN)
     return path
 
 
@@ -113,7 +114,9 @@ def test_one_tag_alone_places_nothing(tmp_path: Path) -> None:
 
 def test_the_command_says_what_was_found(hidden: Path, alidade: Command, tmp_path: Path) -> None:
     out = tmp_path / "cube.yaml"
-    run = alidade("cube-layout", hidden, hidden, "--out", out, "--refine-camera")
+    other = tmp_path / "other.mcap"
+    method("cube").write_data(other, simulate_cube(HIDDEN, 5).data, None, cube_config(HIDDEN))
+    run = alidade("cube-layout", hidden, other, "--out", out, "--refine-camera")
     assert run.code == 0
     assert "5 of 6 tags placed" in run.out
     assert "Tag 19 could not be placed: in no picture" in run.out
@@ -124,6 +127,15 @@ def test_the_command_says_what_was_found(hidden: Path, alidade: Command, tmp_pat
     assert "5 of 6 tags placed" in page.text
     assert "Tag 19: in no picture." in page.text
     assert "distortion 1" in page.text
+
+
+def test_a_recording_named_twice_is_refused(hidden: Path, alidade: Command, tmp_path: Path) -> None:
+    (tmp_path / "copy.mcap").symlink_to(hidden)
+    run = alidade("cube-layout", hidden, tmp_path / "copy.mcap", "--out", tmp_path / "cube.yaml")
+    assert (run.code, run.err) == (
+        2,
+        "alidade: copy.mcap: the same recording is named twice; it would count twice\n",
+    )
 
 
 def test_the_page_takes_no_name_from_the_config(hidden: Path, alidade: Command, tmp_path: Path) -> None:
