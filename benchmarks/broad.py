@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the trials")
     parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 0.5], help="added to motion capture, deg")
     parser.add_argument("--solver", nargs="+", default=["batch"], choices=("batch", "incremental"))
+    parser.add_argument("--no-check", action="store_true", help="incremental: without a final batch solution")
     parser.add_argument("--config", type=Path, help="by default none")
     parser.add_argument("--window", type=float, default=np.inf, help="calibrate disjoint parts of so many seconds")
     parser.add_argument("--judge", action="store_true", help="compare accelerations too")
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for begin, session in _parts(trial, float(np.deg2rad(noise)), options.window, config):
                 for solver in options.solver:
                     start = time.process_time()
-                    calibration = session.calibrate(solver, check=False)
+                    calibration = session.calibrate(solver, check=not options.no_check)
                     seconds = time.process_time() - start
                     named = f"{path.name[:2]} {noise:.1f} {begin:3.0f} s {solver:11s}"
                     print(f"{named} {_line(trial, calibration)} {seconds:.0f} s", flush=True)

@@ -10,9 +10,10 @@ import gtsam
 import numpy as np
 import pytest
 
+import alidade
 from alidade.pipelines.solvers.engines import Compiled
 from benchmarks import __main__ as runner
-from benchmarks import static
+from benchmarks import broad, static
 from benchmarks.batch import los_problem, los_recording, native_los, solve
 from benchmarks.measure import Ratio, costs, growth, worse
 
@@ -56,6 +57,24 @@ def test_gate_passes_its_own_baseline_and_fails_a_ratio_made_worse(
     capfd.readouterr()
     assert runner.main([*common, "--gate"], ("toy",)) == 1
     assert "toy.sum" in capfd.readouterr().err
+
+
+@pytest.mark.usefixtures("few_solutions")
+@pytest.mark.parametrize(("words", "is_checked"), [((), True), (("--no-check",), False)])
+def test_broad_ends_incremental_runs_as_the_command_does(
+    words: tuple[str, ...],
+    is_checked: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "01.mat").touch()
+    session = alidade.open(alidade.simulate("head", {"duration_s": 4.0, "gyro_rate_hz": 100.0}, seed=1))
+    monkeypatch.setattr(broad, "read_trial", lambda _: None)
+    monkeypatch.setattr(broad, "_parts", lambda *_: [(0.0, session)])
+    monkeypatch.setattr(broad, "_line", lambda _, calibration: " ".join(calibration.notes))
+    assert broad.main(["--data", str(tmp_path), "--noise", "0", "--solver", "incremental", *words]) == 0
+    assert ("all measurements were solved together" in capsys.readouterr().out) == is_checked
 
 
 def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
