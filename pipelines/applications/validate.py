@@ -85,9 +85,9 @@ class Validated:
             return "The recording does not determine whether the calibration holds."
         if self.within is not None:
             return f"The calibration does not hold: {sentence(self.within, self.held.quantities)}"
-        steps = self.held.steps
         if self.verdict == "holds":
-            return f"The calibration holds: {len(steps)} of {len(steps)} parameters unchanged, to {self._resolution}."
+            tested = f"{len(self.held.steps)} of {len(self.held.required)} parameters"
+            return f"The calibration holds: {tested} unchanged, to {self._resolution}."
         found = self._changes(self.held.changes.found)
         what = "; ".join(found) or "all parameters together, none by more than chance for itself"
         small = " That is less than what is required of them." if self.serves and found else ""
@@ -116,6 +116,8 @@ class Validated:
             out.append(f"the calibration's own verdict is {self.calibration.status}")
         if self.held is not None:
             out += [f"{what}: no accuracy is required of it" for what in self._changes(self.held.changes.others)]
+            if self.held.steps and self.held.untested:
+                out.append(f"the recording does not determine whether {', '.join(self.held.untested)} changed")
         shown = None if self.held is None else self.within  # by the sentence
         if self.own is not None and (own := finding_of_recording(self.own, shown)) is not None:
             out.append(sentence(own, self.own.quantities))

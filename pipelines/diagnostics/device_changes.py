@@ -309,10 +309,12 @@ class CalibrationCheck:
     Attributes:
         changes: of the parameters between the two.
         quantities: the parameters, by name.
+        required: names of the calibration's parameters that have a required accuracy.
     """
 
     changes: Changes
     quantities: Mapping[str, Quantity]
+    required: Sequence[str]
 
     @property
     def verdict(self) -> Verdict:
@@ -323,8 +325,14 @@ class CalibrationCheck:
 
     @property
     def steps(self) -> Sequence[Change]:
-        """Change of every parameter, with all significant changes estimated jointly."""
+        """Change of every required parameter that is tested, with all significant changes estimated jointly."""
         return self.changes.steps
+
+    @property
+    def untested(self) -> list[str]:
+        """Required parameters whose change the recording does not determine, or not apart from significant ones."""
+        tested = {step.name for step in self.steps}
+        return [name for name in self.required if name not in tested]
 
     @property
     def matters(self) -> bool:
@@ -353,5 +361,5 @@ def check_calibration(
     rates = dict.fromkeys([*known.names, *of_device], 0.0)
     before = sqrt_information_of(known, [by_name[name].prior_scale for name in known.names])
     joined = join([before, sqrt_info], rates, [0.0, 1.0])
-    asked = {name for name in known.names if by_name[name].required}
-    return CalibrationCheck(changes(joined, [0.0, 1.0], inflations, asked), by_name)
+    required = [name for name in known.names if by_name[name].required]
+    return CalibrationCheck(changes(joined, [0.0, 1.0], inflations, required), by_name, required)

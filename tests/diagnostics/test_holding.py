@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from alidade import calibrate, simulate, validate
 from alidade import open as opened
 from alidade.factors import so3
 from alidade.pipelines.applications.sharing import device_prior, walks
+from alidade.pipelines.applications.validate import Validated
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.device_changes import LEVEL, CalibrationCheck, check_calibration
 from alidade.pipelines.estimation.problem import Quantity, SqrtInformation
@@ -115,6 +117,21 @@ def test_numbers_judged_up_to_a_factor_are_tested() -> None:
         ("b",), np.array([0.01]), np.eye(1) * 1e3, np.zeros(1), np.eye(1) * 10.0, np.array([-0.1]), np.ones(1)
     )
     assert check_calibration(known, shifted, (quantity,), {}).verdict == "changed"
+
+
+def test_a_parameter_that_goes_with_a_changed_one_is_counted_as_not_tested() -> None:
+    """The recording determines c, and the sum of a and b, which changed; no accuracy is required of b."""
+    names = ("b", "a", "c")
+    known = GaussianPrior(names, np.zeros(3), 1e-8 * np.eye(3), "march")
+    quantities = [Quantity(name, "rad", 0.1, 0.1, np.inf if name == "b" else 1e-2) for name in names]
+    R = 1e4 * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    values, prior = np.array([5e-3, 5e-3, 0.0]), 10.0 * np.eye(3)
+    sqrt_info = SqrtInformation(names, values, R, np.zeros(2), prior, -prior @ values, np.full(3, 0.1))
+    saved: Any = SimpleNamespace(status="calibrated")
+    held = check_calibration(known, sqrt_info, quantities, {})
+    validated = Validated(saved, "june.mcap", (), same_recording=False, held=held)
+    assert validated.sentence.startswith("The calibration holds: 1 of 2 parameters unchanged, to ")
+    assert validated.notes[-1] == "the recording does not determine whether a changed"
 
 
 def test_it_does_not_hold_for_a_recording_in_which_it_slips(tmp_path: Path, alidade: Command) -> None:
