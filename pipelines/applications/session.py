@@ -381,7 +381,7 @@ class Session:
             return None, findings
         severe = any(each.severity > Severity.NOTE for each in contradicted)
         freed = self._freed[0] if severe and self._freed is not None else None
-        split = self._changed_between(quantities, freed) if by_parts else None
+        split = self._changed_between(quantities, freed, estimate.converged) if by_parts else None
         if suspect and not hypotheses and (split is None or not split[1].evidence["steps"]):
             with progress.doing("testing hypotheses"):
                 hypotheses = find_hypotheses(build, model, self.data, self.config, estimate, freed)
@@ -398,11 +398,12 @@ class Session:
         return None, diagnose(estimate, quantities, advice, change, hypotheses, contradicted, conflicts)
 
     def _changed_between(
-        self, quantities: Sequence[Quantity], freed: Config | None
+        self, quantities: Sequence[Quantity], freed: Config | None, converged: bool
     ) -> tuple[Stability, Finding] | None:
         """Test whether a change during the recording explains its misfit; return the test and a finding with the steps.
 
         There are no steps where the parts do not determine what changed; a step that is immaterial is no change.
+        Where neither part nor the whole determines anything, as without motion, parts fit whatever was recorded.
         """
         with progress.doing("looking for a change"):
             model, build = self.method.faults, self.method.graph
@@ -410,6 +411,8 @@ class Session:
             if stable is None:
                 return None
             parts = self._either_side(stable.time_s)
+        if not (parts or converged):
+            return None
         found = change_finding(stable, parts, quantities)
         if found is not None and found.severity < Severity.INCONSISTENT:
             return None

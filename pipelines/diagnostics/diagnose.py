@@ -39,7 +39,7 @@ class Thresholds:
     noise_note: float = 2.0
     noise_suspect: float = 1.5  # with correlated residuals
     process_dof: float = 100.0  # processes with fewer are not tested
-    correlated: float = 0.10
+    lasting: float = 0.10  # residuals correlated, or the end disturbed
     prior_z: float = 4.0
     far_from_prior: float = 5.0  # of a calibrated parameter, in prior sigmas
     no_device: float = 5.0  # sigmas of a device ten times worse than usual, and of the estimate; beyond is a data fault
@@ -244,7 +244,7 @@ def _correlations(estimate: Estimate) -> Iterator[Finding]:
     """Findings of residuals with correlation lengths, in measurements, too long for noise."""
     for family, length in estimate.colours.items():
         share = length / len(estimate.residuals[family].time)
-        if share > LIMITS.correlated:
+        if share > LIMITS.lasting:
             yield Finding("correlation", INCONSISTENT, {"family": family, "share": share})
 
 
@@ -303,16 +303,21 @@ def _misfit(family: str | None, fit: Fit, largest: str, noise_factor: float, sev
 
 
 def disturbances(estimate: Estimate) -> Iterator[Finding]:
-    """Findings of intervals with most measurements of a family rejected, in time order."""
+    """Findings of intervals with most measurements of a family rejected, in time order.
+
+    One that lasts until the recording's end, and long, is WEAK: what is calibrated may no longer hold.
+    """
     for family, time, rejected in _in_order(estimate):
         for first, last in intervals(rejected):
+            at_end = len(time) - last < last - first
+            is_long = time[last - 1] - time[first] > LIMITS.lasting * (time[-1] - time[0])
             evidence = {
                 "family": family,
                 "since_s": float(time[first]),
                 "time_s": float(time[last - 1]),
                 "rejected": int(rejected[first:last].sum()),
             }
-            yield Finding("disturbance", Severity.NOTE, evidence)
+            yield Finding("disturbance", WEAK if at_end and is_long else NOTE, evidence)
 
 
 def rejects_an_end(estimate: Estimate) -> bool:

@@ -406,9 +406,9 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
         f"{100.0 * e['share']:.0f} % of {e['family']} measurements rejected; all would fit {e['noise_factor']:.2g} "
         "times the noise."
     ),
-    "disturbance": lambda e, *_: (
+    "disturbance": lambda e, severity, _: (
         f"{e['family']} disturbed {e['since_s']:.1f} to {e['time_s']:.1f} s: {e['rejected']} measurements are left out "
-        "there."
+        f"there{', and nothing shows that the calibration holds afterwards' * (severity == Severity.WEAK)}."
     ),
     "noise": _noise,
     "correlation": lambda e, *_: (

@@ -123,6 +123,13 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "magnetometer disturbed 12.3 to 15.8 s: 71 measurements are left out there.",
     ),
     (
+        "disturbance",
+        WEAK,
+        {"family": "magnetometer", "since_s": 12.31, "time_s": 15.8, "rejected": 71},
+        "magnetometer disturbed 12.3 to 15.8 s: 71 measurements are left out there, and nothing shows that the "
+        "calibration holds afterwards.",
+    ),
+    (
         "noise",
         INCONSISTENT,
         {"noise": "vision_attitude", "unit": "rad", "source": "config", "used": 0.078}

@@ -64,6 +64,21 @@ def test_disturbed_interval_is_named_and_the_rest_is_calibrated(kind: str, gyro:
     assert until == pytest.approx(end, abs=0.7)
 
 
+@pytest.mark.parametrize(("since", "until", "status"), [(0.0, 0.2, "calibrated"), (0.8, 1.0, "weak")])
+def test_nothing_shows_that_a_calibration_holds_after_a_disturbed_end(since: float, until: float, status: str) -> None:
+    """A field of 15 uT along with errors correlated over .3 s, so that neither part fits the noise as stated."""
+    simulated = TUMBLE.simulate(TumbleScenario(), 1)
+    t, mag, rng = simulated.data.mag_t, simulated.data.mag.copy(), np.random.default_rng(2)
+    share, error = (t - t[0]) / (t[-1] - t[0]), np.zeros(3)
+    mag[(share >= since) & (share < until)] += 1.5e-5 * np.array([0.6, -0.64, 0.48])
+    for k, kept in enumerate(np.exp(-np.diff(t, prepend=-np.inf) / 0.3)):
+        error = kept * error + np.sqrt(1.0 - kept**2) * rng.standard_normal(3)
+        mag[k] += 5e-7 * error
+    calibration = Session.of(TUMBLE, replace(simulated, data=replace(simulated.data, mag=mag))).calibrate(report=False)
+    assert len(_named(calibration.findings)) == 1
+    assert calibration.status == status
+
+
 @pytest.mark.parametrize(
     ("kind", "gyro", "seeds"),
     [
