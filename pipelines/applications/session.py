@@ -368,15 +368,16 @@ class Session:
 
         The first is the test of a change that explains the misfit; None where nothing did.
         """
-        contradicted, advice = self._contradictions(estimate, quantities), self.problem().advice
+        contradicted, problem = self._contradictions(estimate, quantities), self.problem()
+        advice = problem.advice
         findings = diagnose(estimate, quantities, advice, change, (), contradicted, conflicts)
         if estimate.solver == "published" or deadline.passed(_HYPOTHESES):
             return None, findings
         model, build = self.method.faults, self.method.graph
         hypotheses = misstatements(build, model, self.data, self.config)
         suspect = is_suspect(estimate, findings, quantities)
-        # Where steps are tested at every keyframe, that separates slips from outliers and from other faults.
-        by_parts = estimate.steps is None and not hypotheses
+        # A test of steps at every keyframe separates slips from outliers and from other faults.
+        by_parts = not hypotheses and not (problem.step_candidates and estimate.converged)
         if not (hypotheses or suspect or (by_parts and (rejects_an_end(estimate) or change is not None))):
             return None, findings
         severe = any(each.severity > Severity.NOTE for each in contradicted)

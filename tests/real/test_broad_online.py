@@ -55,3 +55,4 @@ def test_a_run_ends_near_batch_though_its_noise_grows_with_motion(shared_data: P
     attitudes = found.estimate.attitudes
     assert attitudes is not None
     assert np.rad2deg(score(trial, values, attitudes.time, attitudes.wxyz).attitude_rms) < 0.3
+    assert "change" not in {finding.kind for finding in found.findings}
