@@ -91,6 +91,7 @@ class ErrorMap:
         functions: (n, k) of mean 0 and rms 1.
         places: where each measurement was made, name -> (n,), rad, to be drawn.
         moves: whether it moves an estimate; else it may be an error of other sensors as well, and widens sigmas alone.
+        least: sigma of each in recordings that show no map: what no sensor is free of, nor a recording can show.
         slopes: (n, k, places) derivatives of the functions by the places, where these are the angles of a gimbal that
             the gyro drives; else None.
     """
@@ -104,6 +105,7 @@ class ErrorMap:
     functions: Array
     places: Mapping[str, Array]
     moves: bool = True
+    least: float = 0.0
     slopes: Array | None = None
 
     @classmethod
@@ -117,6 +119,7 @@ class ErrorMap:
         harmonics: Array,
         places: Mapping[str, Array],
         moves: bool = True,
+        least: float = 0.0,
         slopes: Array | None = None,
     ) -> ErrorMap | None:
         """Build the map's functions from harmonics (n, h) at the measurements, and slopes (n, h, places).
@@ -132,7 +135,7 @@ class ErrorMap:
         functions, places = U[:, kept] * np.sqrt(len(time)), {place: x[order] for place, x in places.items()}
         if slopes is not None:
             slopes = np.einsum("nhp,kh->nkp", slopes[order], V[kept] * (np.sqrt(len(time)) / sizes[kept, None]))
-        return cls(name, axes, prior, prior, families, time[order], functions[order], places, moves, slopes)
+        return cls(name, axes, prior, prior, families, time[order], functions[order], places, moves, least, slopes)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

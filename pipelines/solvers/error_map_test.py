@@ -6,9 +6,12 @@ than the prior does, singular values of R above 1 / p, the squares of d, over th
 widen sigmas by, sum to chi-square under the model (Rao, Proc. Camb. Phil. Soc. 1948).
 
 Where the sum is significant, c is freed. What it trades with is then known as well as its prior says, which must not
-be smaller than the map: p is at least the rms of the map that makes d most likely, and that rms where the map moves
-nothing. What was solved for moves as it does with c, where no other error can be mistaken for a map, and its covariance
-grows by what c adds. Noise levels, rejected measurements and residuals stay those without the map.
+be smaller than the map: p is at least the rms of the map that makes d most likely. A map that moves nothing has that
+rms, or `ErrorMap.least`. What was solved for moves as it does with c, where no other error can be mistaken for a map,
+and its covariance grows by what c adds. Noise levels, rejected measurements and residuals stay those without the map.
+
+Where it is not, a map may still be there: what it has in common with a mount or a scale shows in no residual. The
+covariance grows by one of rms `ErrorMap.least`.
 """
 
 from __future__ import annotations
@@ -22,8 +25,9 @@ from numpy.typing import NDArray
 from alidade.factors.array import Array
 from alidade.factors.chi_square import quantile
 from alidade.pipelines import deadline
-from alidade.pipelines.estimation.error_map import ErrorMap, FoundMap
+from alidade.pipelines.estimation.error_map import SOURCE, ErrorMap, FoundMap
 from alidade.pipelines.estimation.problem import Estimate, History, PosteriorHistory, Problem, SqrtInformation
+from alidade.pipelines.estimation.widening import widened
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
@@ -61,7 +65,12 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
     root = mapped.at(at)[0].root()
     chi_square, dof, _ = _tested(root[-k - 1 :, -k - 1 :], error_map, ratio)
     if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
-        return estimate
+        moves = -np.linalg.lstsq(root[: -k - 1, : -k - 1], root[: -k - 1, -k - 1 : -1], rcond=None)[0]
+        reported, columns = posterior.reported, np.zeros((len(estimate.names), k))
+        names = [estimate.names[i] for i in reported.free]
+        gain = _along_strong(reported.jacobian[reported.free] @ moves, names, posterior)
+        columns[reported.free] = gain @ _spread(root[-k - 1 : -1, -k - 1 : -1], error_map.least)
+        return widened(estimate, SOURCE, columns)
     try:
         return _freed(problem, error_map, posterior, estimate, ratio)
     except (IndeterminateStateError, np.linalg.LinAlgError):
@@ -84,7 +93,7 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
     if rms == 0.0 and not error_map.moves:
         return estimate
     if rms > error_map.prior or not error_map.moves:
-        error_map = replace(error_map, prior=rms)
+        error_map = replace(error_map, prior=max(rms, error_map.least))
         near = replace(estimate, names=information.names, values=information.at)
         compiled, solution, information = _solved(problem, error_map, near)
     if not solution.converged:
@@ -102,10 +111,8 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
     gain = np.asarray(-np.linalg.lstsq(rows[:p, :p], rows[:p, p:-1], rcond=None)[0], dtype=float)
     others = [name for name, is_own in zip(information.names, own, strict=True) if not is_own]
     gain = _along_strong(_along_strong(gain, others, posterior), others, without)
-    R = np.concatenate([root[:-1, :-1], np.eye(len(error_map.names)) / error_map.prior])
-    spread = np.linalg.inv(np.linalg.qr(R, mode="r"))
-    columns, rows_of = np.zeros((len(estimate.names), spread.shape[1])), [estimate.names.index(n) for n in others]
-    columns[rows_of] = gain @ spread
+    columns, rows_of = np.zeros((len(estimate.names), len(root) - 1)), [estimate.names.index(n) for n in others]
+    columns[rows_of] = gain @ _spread(root[:-1, :-1], error_map.prior)
     weak = np.zeros_like(shift)
     weak[rows_of] = shift[rows_of] - _along_strong(shift[rows_of, None], others, without)[:, 0]
     found = FoundMap(
@@ -119,6 +126,13 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
     )
     out = replace(found.applied(estimate), error_map=found)
     return _with_history(out, compiled, posterior, weak) if error_map.moves else out
+
+
+def _spread(root: Array, prior: float) -> Array:
+    """Root S (k, k) of the covariance S S' of a map's numbers, from rows R (k, k) about them and their prior sigma."""
+    if prior == 0.0:
+        return np.zeros_like(root)
+    return np.asarray(np.linalg.inv(np.linalg.qr(np.concatenate([root, np.eye(len(root)) / prior]), mode="r")))
 
 
 def _along_strong(gain: Array, names: Sequence[str], posterior: Posterior) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.solvers.batch import solve_batch
 
 NAMES = {"los": ("los_nominal", "los_map"), "head": ("head_mounts", "vision_map")}
 
@@ -64,17 +66,17 @@ def test_los_errors_by_gimbal_angles_are_found_named_and_covered(solver: str) ->
     assert 3e-5 < found.estimate.error_map.rms < 3e-4
 
 
+def _without_map(session: Session) -> Calibration:
+    """Calibration by a config that excludes a map."""
+    sensors = session.config.sensors
+    camera = type(sensors.camera)(map=0.0)
+    config = session.config.model_copy(update={"sensors": sensors.model_copy(update={"camera": camera})})
+    return Session(session.method, session.data, config).calibrate("batch", report=False)
+
+
 def test_clean_los_recording_is_the_same_to_the_last_digit() -> None:
     session = _session("los", 0.0, 1, 8.0, **FEW["los"])
-    searched = session.calibrate("batch", report=False)
-    fixed = session.config.model_copy(
-        update={
-            "sensors": session.config.sensors.model_copy(
-                update={"camera": type(session.config.sensors.camera)(map=0.0)}
-            )
-        }
-    )
-    without = Session(session.method, session.data, fixed).calibrate("batch", report=False)
+    searched, without = session.calibrate("batch", report=False), _without_map(session)
     assert searched.estimate.error_map is None
     assert without.problem.error_map is not None
     assert without.problem.error_map(without.estimate) is None
@@ -107,6 +109,22 @@ def test_a_map_that_moves_nothing_widens_by_its_own_size() -> None:
         assert mapped is not None
         assert mapped.map.prior < 0.3 * mapped.map.stated
         assert np.abs(_errors(found)).max() < 3.5
+
+
+def test_vision_that_shows_no_map_widens_sigmas_by_the_least_one() -> None:
+    """As they are with a map of that size as parameters of the graph."""
+    session = _session("head", 0.0, 2, 20.0, **FEW["head"])
+    searched, without = session.calibrate("batch", report=False).estimate, _without_map(session).estimate
+    assert searched.error_map is None
+    assert np.array_equal(searched.values, without.values)
+    problem = session.problem()
+    assert problem.error_map is not None
+    least = problem.error_map(searched)
+    assert least is not None
+    with_map = solve_batch(replace(least, prior=least.least).added_to(problem))
+    mounts = [i for i, name in enumerate(searched.names) if "mount" in name]
+    assert (searched.sigmas[mounts] > 1.02 * without.sigmas[mounts]).any()
+    np.testing.assert_allclose(searched.sigmas[mounts], with_map.sigmas[mounts], rtol=0.05)
 
 
 def test_map_is_drawn_over_where_measurements_were_made() -> None:
