@@ -26,14 +26,13 @@ if TYPE_CHECKING:
     from alidade.pipelines.applications.planning import plan
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.applications.validate import validate
-    from alidade.pipelines.errors import InputError
+    from alidade.pipelines.errors import IndeterminateError, InputError
     from alidade.pipelines.methods import Method
     from alidade.pipelines.methods import names as methods
     from alidade.pipelines.reports.certificate import certificate
     from alidade.pipelines.reports.export_formats import export
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.simulation.scenario import Simulated
-    from alidade.pipelines.solvers.chain import IndeterminateError
 
 __all__ = [
     "Calibration",
@@ -65,7 +64,7 @@ __all__ = [
 
 _MODULES = {
     "Calibration": "alidade.pipelines.reports.result",
-    "IndeterminateError": "alidade.pipelines.solvers.chain",
+    "IndeterminateError": "alidade.pipelines.errors",
     "InputError": "alidade.pipelines.errors",
     "Method": "alidade.pipelines.methods",
     "Session": "alidade.pipelines.applications.session",

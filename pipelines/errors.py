@@ -64,6 +64,10 @@ class NotARecordingError(InputError):
         )
 
 
+class IndeterminateError(Exception):
+    """The recording does not determine the unknowns that an estimate needs."""
+
+
 def printable(text: str, longest: int = 200) -> str:
     """Return text for a terminal: control characters as escapes, the middle of a text that is too long left out."""
     if len(text) > longest:

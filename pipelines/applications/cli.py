@@ -19,7 +19,7 @@ from typer.core import TyperGroup
 
 from alidade.pipelines import deadline, errors, parallel, progress
 from alidade.pipelines.applications import CALIBRATED
-from alidade.pipelines.errors import InputError, nearest_three, printable
+from alidade.pipelines.errors import IndeterminateError, InputError, nearest_three, printable
 from alidade.pipelines.files import plain_json, require_place, require_room, write_file, write_whole
 from alidade.pipelines.solvers.window import parse_window
 
@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from alidade.pipelines.recording.opening import Where
     from alidade.pipelines.reports.report import Report
     from alidade.pipelines.reports.result import Calibration
-
-# Errors that are printed in one line, by name: to import the second takes gtsam's quarter of a second.
-_TROUBLE = {"InputError": errors.EXIT_BAD_INPUT, "IndeterminateError": errors.EXIT_UNDETERMINED}
 
 
 class _WithPlugins(TyperGroup):
@@ -851,12 +848,10 @@ def main() -> None:
     except BaseException as error:
         if _interrupted(error):
             sys.exit(errors.EXIT_INTERRUPTED)
-        names = (kind.__name__ for kind in type(error).__mro__)
-        code = next((_TROUBLE[name] for name in names if name in _TROUBLE), None)
-        if code is None and not isinstance(error, OSError):
+        if not isinstance(error, InputError | IndeterminateError | OSError):
             raise
         print(f"alidade: {_os_error_line(error) if isinstance(error, OSError) else error}", file=sys.stderr)
-        sys.exit(errors.EXIT_BAD_INPUT if code is None else code)
+        sys.exit(errors.EXIT_UNDETERMINED if isinstance(error, IndeterminateError) else errors.EXIT_BAD_INPUT)
 
 
 def _os_error_line(error: OSError) -> str:

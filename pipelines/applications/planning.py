@@ -22,7 +22,7 @@ from alidade.factors.array import Array
 from alidade.pipelines import methods, progress
 from alidade.pipelines.config import Settings
 from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import IndeterminateError, InputError
 from alidade.pipelines.estimation.finding import Finding, Status, status
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.files import dump_yaml
@@ -207,7 +207,6 @@ def _predicted(
     """Predict the estimate of a recording of the motion with one seed."""
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.solvers.batch import solve_batch
-    from alidade.pipelines.solvers.chain import IndeterminateError
 
     method = methods.method(method_name)
     session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), seed), config_file)

@@ -13,7 +13,7 @@ from alidade.pipelines.config import Settings, configured
 from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Change, Verdict, check_calibration
 from alidade.pipelines.display.units import format_estimate, human_unit, rounded
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import IndeterminateError, InputError
 from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.gaussian_prior import GaussianPrior
 from alidade.pipelines.recording.recording import open_recording
@@ -194,8 +194,6 @@ def _check(session: Session, known: SavedCalibration) -> tuple[CalibrationCheck 
 
     No test where that has not converged; and no calibration where nothing is determined, or everything is fixed.
     """
-    from alidade.pipelines.solvers.chain import IndeterminateError
-
     session = replace(session, near=known.values)
     if known.solver == "published" or all(q.prior_sigma == 0.0 for q in session.problem().quantities):
         return None, None

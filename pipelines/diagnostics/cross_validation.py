@@ -17,7 +17,7 @@ from alidade.factors.array import Array, Mask
 from alidade.pipelines import deadline, parallel
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import IndeterminateError, InputError
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import CHUNK, ChiSquare, Estimate, Problem, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
@@ -140,8 +140,6 @@ def score_trial(build: Build, data: Any, config: Config, label: str = "") -> tup
 
 def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
     """Run a trial; None past the deadline or after an exception, which is logged (a defect as a warning)."""
-    from alidade.pipelines.solvers.chain import IndeterminateError
-
     if deadline.passed():
         return None
     try:

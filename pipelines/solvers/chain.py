@@ -31,6 +31,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.errors import IndeterminateError
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
@@ -48,10 +50,6 @@ UNDETERMINED = (
     "a state (an attitude or a bias at one moment) is not determined by any measurement: record longer and with more "
     "motion, and check that every sensor measured throughout"
 )
-
-
-class IndeterminateError(Exception):
-    """The recording does not determine the unknowns that an estimate needs."""
 
 
 class IndeterminateStateError(IndeterminateError):

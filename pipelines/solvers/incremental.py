@@ -25,6 +25,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors.array import Array
+from alidade.pipelines.errors import IndeterminateError
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
     Attitudes,
@@ -37,7 +38,6 @@ from alidade.pipelines.estimation.problem import (
     Step,
 )
 from alidade.pipelines.solvers.batch import Solved, residuals_by_family, solve, whole_estimate
-from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.checkpoint import (
     MarginalState,
     RunState,

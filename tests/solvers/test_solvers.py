@@ -15,12 +15,12 @@ from alidade.factors.array import Array
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import IndeterminateError
 from alidade.pipelines.estimation.problem import Estimate, Factor, Parameter, Problem, Quantity, Step
 from alidade.pipelines.methods.los import model as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.solvers import levenberg
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.chain import IndeterminateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import solve_incremental
 from alidade.pipelines.solvers.layout import Tangent

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from typing_extensions import TypedDict  # pydantic needs it below Python 3.12, and brings it
 
 from alidade.pipelines import errors
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.errors import IndeterminateError, InputError
 
 if TYPE_CHECKING:
     from alidade.pipelines.reports.result import Calibration
@@ -190,8 +190,6 @@ def require_writable(folder: Path) -> None:
 
 def run_isolated(summarise: Callable[[Calibration], dict[str, Any]], calibrate: Callable[[], Calibration]) -> Any:
     """Run a calibration; return status, exit code, reason, wall time, s, and the keys of `summarise`."""
-    from alidade.pipelines.solvers.chain import IndeterminateError
-
     try:
         calibration = calibrate()
         return {
