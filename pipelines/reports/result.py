@@ -10,7 +10,7 @@ import json
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
@@ -41,7 +41,7 @@ from alidade.pipelines.estimation.parameters import prior_z_scores
 from alidade.pipelines.estimation.problem import Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.gaussian_prior import GaussianPrior
-from alidade.pipelines.methods.formula import Formula, results
+from alidade.pipelines.methods.formula import Formula
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.topics import SessionFacts
 from alidade.pipelines.reports import sentences
@@ -438,20 +438,6 @@ def software_versions() -> dict[str, str]:
     return versions
 
 
-class AppliedFormulas:
-    """Formulas with values of parameters; parameters without a value count as zero."""
-
-    def __init__(self, formulas: Sequence[Formula], values: Mapping[str, float], others: Mapping[str, float]) -> None:
-        self.values = values
-        self._formulas, self._all = formulas, {**others, **values}
-        self._first = {"temperature": others["first_temperature"]} if "first_temperature" in others else {}
-
-    def __call__(self, **measured: Array) -> Mapping[str, Array]:
-        """Compute the formulas from measured arrays, at the first temperature."""
-        found = results(self._formulas, self._all, {**measured, **self._first})
-        return {name: value.array for name, value in found.items()}
-
-
 def posterior_of(c: Calibration) -> Posterior:
     """Return the posterior of the parameters that the formulas apply."""
     quantities, known = quantities_of(c.problem, c.estimate), c.application()
@@ -472,8 +458,8 @@ def posterior_of(c: Calibration) -> Posterior:
         x=c.estimate.values,
         P=c.covariance,
         require=np.array(require),
-        applied=AppliedFormulas(known.formulas, known.values, known.constants),
-        nominal=AppliedFormulas(known.formulas, nominal, known.constants),
-        whole=AppliedFormulas(known.whole, c.values, known.constants),
+        applied=known,
+        nominal=replace(known, values=nominal),
+        whole=replace(known, formulas=known.whole, values=c.values),
         truth=truth,
     )

@@ -17,6 +17,7 @@ from alidade.factors import so3
 from alidade.factors.array import Array
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.methods.formula import Formula, Value, apply, results
+from alidade.pipelines.methods.temperature import FIRST
 
 # Of a sigma, for derivatives.
 _STEP = 0.1
@@ -36,13 +37,19 @@ class Application:
     Attributes:
         formulas: of the parameters that are applied; whole: of all parameters.
         values: parameter -> value that is applied.
-        constants: the other names in the formulas.
+        constants: the other names in the formulas; parameters without a value count as zero.
     """
 
     formulas: Sequence[Formula]
     whole: Sequence[Formula]
     values: Mapping[str, float]
     constants: Mapping[str, float]
+
+    def __call__(self, **measured: Array) -> dict[str, Array]:
+        """Compute the formulas from measured arrays, at the first temperature."""
+        first = {"temperature": self.constants[FIRST]} if FIRST in self.constants else {}
+        found = results(self.formulas, {**self.constants, **self.values}, {**measured, **first})
+        return {name: value.array for name, value in found.items()}
 
 
 class SensorValues:

@@ -16,7 +16,7 @@ from alidade.factors.array import Array
 from alidade.pipelines.diagnostics.use import Applied, Line, Posterior, Truth, Use, coverage, use_bands
 from alidade.pipelines.methods.formula import input_kind, results
 from alidade.pipelines.methods.triads import deviation_coefficients, triad_of
-from alidade.pipelines.reports.result import AppliedFormulas, Calibration, posterior_of
+from alidade.pipelines.reports.result import Calibration, posterior_of
 
 SCENARIOS: dict[str, object] = {
     "tumble": None,
@@ -146,7 +146,7 @@ def test_values_applied_leave_hardly_more_than_all_estimates_would(name: str) ->
 
 def test_what_was_estimated_with_parameters_left_out_is_applied_without_them() -> None:
     c = calibrated("head")
-    estimates = replace(posterior_of(c), applied=AppliedFormulas(c.formulas, c.values, c.problem.constants))
+    estimates = replace(posterior_of(c), applied=replace(c.application(), values=c.values))
     (outage,) = (found for found in c.uses if found.use.name == "outage")
     assert outage.after < 0.5 * use_bands(outage.use, estimates).after
     assert c.parameters["gyro_bias_x"].value == c.values["gyro_bias_x"] != c.applied_values["gyro_bias_x"]
