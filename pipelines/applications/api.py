@@ -122,8 +122,9 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     if name is None:
         raise InputError("arrays do not say which method they are for: open(..., method=...)")
     chosen = methods.method(name)
-    data = _at_config_place(_checked(chosen, _data(chosen, source)), settings)
+    given = _data(chosen, source)
     with _naming_arrays():
+        data = _at_config_place(_checked(chosen, given), settings)
         chosen.check(data)
     return Session(chosen, data, settings)
 
@@ -302,7 +303,7 @@ def _checked(method: Method, data: Any) -> Any:
     if dates:
         if len(dates) < len(streams.keys() & given.keys()):
             others = ", ".join(sorted(streams.keys() & given.keys() - dates.keys()))
-            raise InputError(f"arrays: {', '.join(dates)} are dates, {others} are not: give all as dates, or all in s")
+            raise InputError(f"{', '.join(dates)} are dates, {others} are not: give all as dates, or all in s")
         start = min(int(t_ns.min(initial=np.iinfo(np.int64).max)) for t_ns in dates.values())
         given |= {name: (t_ns - start) * 1e-9 for name, t_ns in dates.items()}
         data = replace(data, epoch_ns=start)
@@ -312,13 +313,13 @@ def _checked(method: Method, data: Any) -> Any:
         t, names = arrays.get(stamps), [name for name in carried if name in arrays]
         if t is None:
             if names:
-                raise InputError(f"arrays: {names[0]} needs its stamps, {stamps}")
+                raise InputError(f"{names[0]} needs its stamps, {stamps}")
             continue
         _check_stamps(stamps, given[stamps], t)
         for name in names:
             values = arrays[name]
             if len(values) != len(t):
-                raise InputError(f"arrays: {name} has {len(values)} rows for the {len(t)} stamps of {stamps}")
+                raise InputError(f"{name} has {len(values)} rows for the {len(t)} stamps of {stamps}")
             if missing := rows[name].placeholders(values):
                 arrays[name] = values = values.copy()
                 values[:, missing] = np.nan
@@ -326,31 +327,27 @@ def _checked(method: Method, data: Any) -> Any:
             lost = rows[name].lost(values)
             if len(lost):
                 more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
-                raise InputError(f"arrays: {name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
+                raise InputError(f"{name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
             if rows[name].are_quaternions:
-                with _naming_arrays():
-                    arrays[name] = unit_quaternions(name, t, values)
+                arrays[name] = unit_quaternions(name, t, values)
         if not (np.diff(t) > 0.0).all():  # the rows are sorted, and some dropped, as those of a file are
             each = (np.nan_to_num(arrays[name]).reshape(len(t), -1) for name in names)
-            with _naming_arrays():
-                kept = clean(stamps, nanoseconds(t, 0), 0, np.hstack([t[:, None] * 0.0, *each]), dropped)[1]
+            kept = clean(stamps, nanoseconds(t, 0), 0, np.hstack([t[:, None] * 0.0, *each]), dropped)[1]
             arrays |= {name: arrays[name][kept] for name in (stamps, *names)}
         has_gyro = any("gyro" in name for name in names)
         t_ns = nanoseconds(arrays[stamps], 0)
-        check_time_unit(f"arrays: {stamps}", t_ns, SLOWEST_GYRO_S if has_gyro else SLOWEST_S)
-        with _naming_arrays():
-            sensors = [
-                SensorReadings(name, arrays[name], rows[name].unit, rows[name].may_be_constant)
-                for name in names
-                if rows[name].unit
-            ]
-            sound = screened(stamps, arrays[stamps], sensors, dropped)
+        check_time_unit(stamps, t_ns, SLOWEST_GYRO_S if has_gyro else SLOWEST_S)
+        sensors = [
+            SensorReadings(name, arrays[name], rows[name].unit, rows[name].may_be_constant)
+            for name in names
+            if rows[name].unit
+        ]
+        sound = screened(stamps, arrays[stamps], sensors, dropped)
         arrays |= {name: take_rows(arrays[name], sound) for name in (stamps, *names)}
         for name in names:
             # Those of a method that takes counts are looked at with their conversion.
             if "gyro" in name and "raw" not in getattr(method.config_section, "model_fields", {}):
-                with _naming_arrays():
-                    check_gyro(name, arrays[stamps], arrays[name])
+                check_gyro(name, arrays[stamps], arrays[name])
     if dropped:
         data = replace(data, dropped={**data.dropped, **dropped})
     return replace(data, **arrays)
@@ -362,21 +359,21 @@ def _naming_arrays() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(f"arrays: {str(error).removeprefix('topic ')}") from error
+        raise InputError(f"arrays: {str(error).removeprefix('topic ').removeprefix('arrays: ')}") from error
 
 
 def _check_stamps(name: str, given: Any, t: Array) -> None:
     if t.ndim != 1 or not np.isfinite(t).all():
-        raise InputError(f"arrays: {name} has to be one row of stamps in s, each later than the one before")
+        raise InputError(f"{name} has to be one row of stamps in s, each later than the one before")
     if getattr(given, "dtype", None) == np.float32 and len(t) > 1:
         held, step = float(np.spacing(np.float32(np.abs(t).max()))), float(np.ptp(t)) / (len(t) - 1)
         if held > 0.1 * step:
             raise InputError(
-                f"arrays: {name} is float32, which holds {np.abs(t).max():.6g} to {held:.3g} s: give float64, or "
+                f"{name} is float32, which holds {np.abs(t).max():.6g} to {held:.3g} s: give float64, or "
                 "subtract the first stamp before it becomes float32"
             )
     if np.ptp(t) > _LONGEST:
-        raise InputError(f"arrays: {name} spans {np.ptp(t):.3g} s; times have to be in s, not in us or ns")
+        raise InputError(f"{name} spans {np.ptp(t):.3g} s; times have to be in s, not in us or ns")
 
 
 def _at_config_place(data: Any, config: _BaseConfig) -> Any:
@@ -394,6 +391,6 @@ def _at_config_place(data: Any, config: _BaseConfig) -> Any:
             continue
         there = getattr(data, name)
         if there is not None and there != known[name] and abs(there - value) > _SAME_PLACE:
-            raise InputError(f"arrays: {name} is {there:.8g}, by the config {value:.8g}; give one of them")
+            raise InputError(f"{name} is {there:.8g}, by the config {value:.8g}; give one of them")
         found[name] = float(value)
     return replace(data, **found)
