@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,7 @@ import numpy as np
 from alidade.pipelines.diagnostics.cross_validation import Validation, peak, rms
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure, Plot
 from alidade.pipelines.display.table import Cell, Column, Interval, Table
-from alidade.pipelines.display.units import human_unit, minute, significant, to_digits_of
+from alidade.pipelines.display.units import human_unit, minute, shown_unit, significant, to_digits_of
 from alidade.pipelines.files import plain_json
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Tone
@@ -20,8 +19,6 @@ from alidade.pipelines.reports.sentences import capital
 if TYPE_CHECKING:
     from alidade.pipelines.applications.validate import Validated
 
-# Angles smaller than this, rad, are shown in arc seconds.
-_FINE_RAD = 2e-4
 # Verdict, or "within" for a change within the required accuracy -> answer, tone and next steps.
 _ANSWERS: Mapping[str, tuple[str, Tone, tuple[str, ...]]] = {
     "holds": ("yes", "good", ("Continue to use it.",)),
@@ -153,7 +150,4 @@ def _unit(validation: Validation) -> tuple[str, float]:
     """Return the unit to show errors in, and its factor from SI, the same before and after compensation."""
     if validation.unit != "rad":
         return validation.unit, 1.0
-    if validation.micro:
-        return "µrad", 1e6
-    fine = rms(validation.after) < _FINE_RAD
-    return ("arcsec", math.degrees(3600.0)) if fine else ("deg", math.degrees(1.0))
+    return ("µrad", 1e6) if validation.micro else shown_unit("rad", rms(validation.after))
