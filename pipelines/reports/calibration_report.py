@@ -288,7 +288,7 @@ def _use_card(found: UseBands) -> Card:
     condition = Text(f"{sentences.capital(use.condition)}.")
     return Card(
         (
-            Text(" ".join(parts), soft=False),
+            Text(" ".join(parts), style=""),
             curves,
             condition,
             *_coefficients(found),
@@ -338,7 +338,7 @@ def _details(c: Calibration) -> tuple[Block, ...]:
     matrices = tuple(Code(text, copied=True) for text in matrix_texts(c))
     plots = tuple(_plots(c))
     parts: list[tuple[str, tuple[Block, ...]]] = [
-        ("All findings", (Text(c.headline, soft=False),)),
+        ("All findings", (Text(c.headline, style=""),)),
         ("Unobservable and weak directions", direction_blocks(c.findings)),
         ("Parameters", _parameters(c)),
         ("Nuisance parameters", _parameters(c, nuisance=True)),
@@ -639,7 +639,7 @@ def _stability(c: Calibration) -> tuple[Block, ...]:
         f"No significant change: the largest is at {c.stability.time_s:.0f} s, mostly of {name} "
         f"(p = {min(c.stability.level, 1.0):.2g})."
     )
-    return (Card((Text(changes[0] if changes else unchanged, soft=False),), id="stability"),)
+    return (Card((Text(changes[0] if changes else unchanged, style=""),), id="stability"),)
 
 
 def _recording(c: Calibration) -> tuple[Block, ...]:

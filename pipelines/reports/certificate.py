@@ -27,7 +27,7 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.reports.calibration import load_known
 from alidade.pipelines.reports.dcc import digital_certificate
 from alidade.pipelines.reports.html import render_html
-from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Signature, Summary, Text, Tone
+from alidade.pipelines.reports.report import Block, Bullets, Pairs, Report, Section, Summary, Text, Tone
 from alidade.pipelines.reports.result_json import Result, read_result
 from alidade.pipelines.settings import validated
 from alidade.pipelines.solvers.joint import RECORDING
@@ -220,7 +220,7 @@ def certificate_report(
     readable = [_readable(row, result) for row in rows]
     shares = ((row.name, [f"{each} {100.0 * x:.1f} %" for each, x in row.budget.items() if x >= 5e-4]) for row in rows)
     budgets = tuple(f"{name}: {', '.join(sources)}" for name, sources in shares)
-    adjustment = Text(f"Adjustment: {text['adjustment']}", soft=False)
+    adjustment = Text(f"Adjustment: {text['adjustment']}", style="")
     return Report(
         title=f"Calibration certificate {text['number']}",
         heading="Calibration certificate",
@@ -232,7 +232,7 @@ def certificate_report(
             Section("Conformity", _conformity_table(rows, readable, stated)),
             Section("As found, as left", (*_found_table(rows, readable, before), adjustment)),
             Section("Uncertainty budget", (Bullets(budgets), Text("Shares of the variance of each parameter."))),
-            Section("Remarks", (Text(text["remarks"], False), Text(_RESERVATION), Signature(text["signatory"]))),
+            Section("Remarks", (Text(text["remarks"], ""), Text(_RESERVATION), Text(text["signatory"], "signature"))),
         ),
         style="certificate",
     )

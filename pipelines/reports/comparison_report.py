@@ -184,7 +184,7 @@ def _halves_agree(comparison: Comparison) -> Iterator[str]:
 def _held_out(comparison: Comparison) -> tuple[Text, ...]:
     sizes = ", ".join(f"{size:.2f} ({family})" for family, size in comparison.predicted.items())
     said = f"Held-out measurements are predicted to {sizes} of their sigmas; 1 is expected."
-    return (Text(said, soft=False),) if sizes else ()
+    return (Text(said, style=""),) if sizes else ()
 
 
 def _with_sigma(value: float, sigma: float) -> str:

@@ -56,10 +56,10 @@ class Heading:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph, in small print if `soft`; `code` stands between backquotes."""
+    """A paragraph, in small print if "soft", or a line to sign with the name below; `code` is between backquotes."""
 
     text: str
-    soft: bool = True
+    style: Literal["soft", "", "signature"] = "soft"
 
 
 @dataclass(frozen=True)
@@ -152,16 +152,7 @@ class Curves:
     legend: tuple[tuple[str, str, str], ...]
 
 
-@dataclass(frozen=True)
-class Signature:
-    """A line to sign, with the name below."""
-
-    name: str
-
-
-Block = (
-    Heading | Tiles | Curves | Pairs | Signature | Text | Bullets | Code | Svg | Details | Card | Plots | Tables | Table
-)
+Block = Heading | Tiles | Curves | Pairs | Text | Bullets | Code | Svg | Details | Card | Plots | Tables | Table
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ def _paragraph(text: str, marked: str = "", style: str = "") -> None:
 def _print_blocks(title: str, blocks: Sequence[Block], everything: bool) -> None:
     """Print the blocks that a terminal can show under their heading; collapsed ones only if `everything`."""
     kinds = (Heading, Text, Table, Tables, Bullets, Tiles, *((Card, Details) if everything else ()))
-    shown = [block for block in blocks if isinstance(block, kinds) and not (isinstance(block, Text) and block.soft)]
+    shown = [block for block in blocks if isinstance(block, kinds) and not (isinstance(block, Text) and block.style)]
     if title and shown and not all(isinstance(block, Tables) for block in shown):
         say(title)
     for block in shown:
