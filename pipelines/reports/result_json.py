@@ -7,7 +7,7 @@ read_result(Path("out/result.json")) # the keys that later commands use
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,10 +22,11 @@ from pydantic import (
     ValidationError,
     model_serializer,
 )
+from pydantic_core import to_jsonable_python
 
 from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.finding import Finding, Severity, Status
+from alidade.pipelines.estimation.finding import Finding, Status
 from alidade.pipelines.estimation.noise import Source
 from alidade.pipelines.files import MAX_RESULT_BYTES, read_bytes
 
@@ -260,7 +261,7 @@ class UseResult(_Record):
     after95: float  # 95 % bound with it
     required: float | None  # at the requirements
     at: str  # operating point, in words
-    coefficients: dict[str, dict[str, dict[str, float | None]]] | None = None  # curve: A to E of a compass deviation
+    coefficients: dict[str, dict[str, dict[str, _Finite]]] | None = None  # curve: A to E of a compass deviation
 
 
 class Result(_Record):
@@ -383,7 +384,7 @@ def result(calibration: Calibration) -> Result:
                     "after95": found.after,
                     "required": found.figure(lambda band: band.allowed) or None,
                     "at": found.use.label,
-                    "coefficients": found.coefficients and _json(found.coefficients),
+                    "coefficients": found.coefficients,
                 }
                 for found in c.uses
             ],
@@ -394,22 +395,10 @@ def result(calibration: Calibration) -> Result:
 
 def finding_json(finding: Finding) -> dict[str, object]:
     """Return a finding as in result.json: kind, severity (note, weak, inconsistent, unobservable) and evidence."""
-    return {
-        "kind": finding.kind,
-        "severity": Severity(finding.severity).name.lower(),
-        **{key: _json(value) for key, value in finding.evidence.items()},
-    }
-
-
-def _json(value: Any) -> object:
-    """Convert evidence to JSON: findings become objects, tuples lists, numbers that are not finite null."""
-    if isinstance(value, Finding):
-        return finding_json(value)
-    if isinstance(value, Mapping):
-        return {key: _json(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_json(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    evidence = {k: [*map(finding_json, v)] if k == "findings" else v for k, v in finding.evidence.items()}
+    content = {"kind": finding.kind, "severity": finding.severity.name.lower(), **evidence}
+    found: dict[str, object] = to_jsonable_python(content, inf_nan_mode="null")
+    return found
 
 
 def result_json(calibration: Calibration) -> str:
