@@ -124,11 +124,6 @@ class Alone:
         """Name of the recording's file."""
         return self.calibration.recording
 
-    @property
-    def start(self) -> datetime.datetime:
-        """Date of the recording."""
-        return datetime.datetime.fromtimestamp(self.day * DAY_S, datetime.UTC)
-
     def loaded(self) -> Any:
         """The recording's data, read back from their file."""
         with self.data.open("rb") as stream:
@@ -470,11 +465,12 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
 
     found = [by_itself.parameters[name] for name in part.names]
     chi_square = by_itself.estimate.chi_square
+    start = datetime.datetime.fromtimestamp(alone.day * DAY_S, datetime.UTC)
     is_noise_estimated = any(level.noise.estimated for level in by_itself.estimate.levels)
     return PartResult(
         recording=alone.name,
         sha256=by_itself.sha256,
-        start=alone.start.isoformat(timespec="seconds"),
+        start=start.isoformat(timespec="seconds"),
         duration_s=by_itself.facts.duration_s,
         status=by_itself.status,
         headline=by_itself.headline,
