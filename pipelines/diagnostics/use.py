@@ -208,6 +208,11 @@ class UseBands:
         return self.figure(lambda band: band.bound + np.abs(band.after) * self.use.signed)
 
     @property
+    def required(self) -> float | None:
+        """Largest 95 % bound if the parameters only just met their requirements; None without requirements."""
+        return self.figure(lambda band: band.allowed) or None
+
+    @property
     def coefficients(self) -> dict[str, dict[str, dict[str, float]]] | None:
         """Coefficients of each line: before, before_sigma, after, after_sigma, in the use's unit; None if undefined."""
         if self.use.coefficients is None:

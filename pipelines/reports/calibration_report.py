@@ -253,9 +253,8 @@ def _use_card(found: UseBands) -> Card:
     sign = "± " if use.signed else ""
     before, after = rounded(found.before, 3), rounded(found.after)
     parts = [f"Before: 95 % within {sign}{before} {use.unit}. After: within {sign}{after} {use.unit}."]
-    allowed = found.figure(lambda band: band.allowed)
-    if allowed > 0.0:
-        parts.append(f"Parameters just at their requirements would allow {rounded(allowed)} {use.unit}.")
+    if found.required:
+        parts.append(f"Parameters just at their requirements would allow {rounded(found.required)} {use.unit}.")
     alone = found.figure(lambda band: band.uncorrelated) / max(found.figure(lambda band: band.bound), 1e-300)
     if not 1.0 / _GAIN < alone < _GAIN:
         parts.append(f"From the sigmas alone, without correlations, the band would be {rounded(alone)} times as wide.")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     AliasChoices,
+    AliasPath,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -158,7 +159,7 @@ class SessionResult(_Record):
 
     sha256: str  # of the file
     start: str  # ISO 8601
-    duration_s: float  # s
+    duration_s: float = Field(validation_alias=AliasChoices("duration_s", AliasPath("facts", "duration_s")))  # s
     counts: dict[str, int]  # messages by topic, measurements used by family
     dropped: dict[str, int]  # reason: how many were left out
 
@@ -192,7 +193,7 @@ class SelfCheckResult(_Record):
     """Difference of an incremental estimate from batch's, in sigmas."""
 
     parameter: str  # the one that differs most
-    difference: float  # incremental less batch, in sigmas
+    difference: float = Field(validation_alias=AliasChoices("difference", "z"))  # incremental less batch, in sigmas
     sigma_ratio: float  # the smallest of incremental over batch
 
 
@@ -255,12 +256,12 @@ class ChangesResult(_Record):
 class UseResult(_Record):
     """A use of the calibration with the 95 % bound of its error."""
 
-    name: str  # such as heading
-    unit: str  # of the numbers
+    name: str = Field(validation_alias=AliasChoices("name", AliasPath("use", "name")))  # such as heading
+    unit: str = Field(validation_alias=AliasChoices("unit", AliasPath("use", "unit")))  # of the numbers
     before: float  # 95 % bound without calibration
-    after95: float  # 95 % bound with it
+    after95: float = Field(validation_alias=AliasChoices("after95", "after"))  # 95 % bound with it
     required: float | None  # at the requirements
-    at: str  # operating point, in words
+    at: str = Field(validation_alias=AliasChoices("at", AliasPath("use", "label")))  # operating point, in words
     coefficients: dict[str, dict[str, dict[str, _Finite]]] | None = None  # curve: A to E of a compass deviation
 
 
@@ -351,18 +352,12 @@ def result(calibration: Calibration) -> Result:
                 "families": c.family_fits,
             },
             "noise": c.noises,
-            "session": {
-                "sha256": c.sha256,
-                "start": c.start,
-                "duration_s": c.facts.duration_s,
-                "counts": c.counts,
-                "dropped": c.dropped,
-            },
+            "session": c,
             "timing_s": c.timing,
             "causes": [{"label": label, "evidence": evidence} for label, evidence in c.causes],
             "stability": c.stability
             and {**vars(c.stability), "change": c.stability.departures if c.stability.changed else {}},
-            "self_check": c.solver_difference and {**vars(c.solver_difference), "difference": c.solver_difference.z},
+            "self_check": c.solver_difference,
             "measurements": c.estimate.strongest,
             "findings": [finding_json(finding) for finding in c.findings],
             "tables": {**c.tables, **({"derived": [each._asdict() for each in c.derived]} if c.derived else {})},
@@ -376,18 +371,7 @@ def result(calibration: Calibration) -> Result:
             "recordings": c.recordings or None,
             "changes": c.changes
             and {"level": c.changes.level, "steps": _steps(c.changes, c.recordings), "rates": c.changes.rates},
-            "uses": [
-                {
-                    "name": found.use.name,
-                    "unit": found.use.unit,
-                    "before": found.before,
-                    "after95": found.after,
-                    "required": found.figure(lambda band: band.allowed) or None,
-                    "at": found.use.label,
-                    "coefficients": found.coefficients,
-                }
-                for found in c.uses
-            ],
+            "uses": c.uses,
             "truth": None if c.truth is None else truth_errors(c),
         }
     )
