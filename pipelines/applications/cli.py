@@ -547,7 +547,7 @@ def demo(
 
     With all three solvers; prints the path of the report.
     """
-    from alidade.pipelines.applications.comparison import Comparison
+    from alidade.pipelines.applications.comparison import compared
     from alidade.pipelines.applications.session import open_session
     from alidade.pipelines.methods import simulate as simulated
     from alidade.pipelines.reports.comparison_report import comparison_report
@@ -559,11 +559,10 @@ def demo(
     with progress.shown(quiet):
         with progress.doing("simulating"):
             simulated("head", "head_mounts", 1, session, False)
-        calibrations = open_session(session).calibrations(["published", "batch", "incremental"])
-        for calibration in progress.track(calibrations, "writing", len(calibrations)):
+        comparison = compared(open_session(session), halves=False)
+        for calibration in progress.track(comparison.calibrations, "writing", len(comparison.calibrations)):
             write_results(out / calibration.estimate.solver, calibration)
-    report = partial(comparison_report, Comparison(tuple(calibrations)))
-    _show(False, str, report, f"Report: {(out / 'batch' / 'report.html').resolve()}")
+    _show(False, str, partial(comparison_report, comparison), f"Report: {(out / 'batch' / 'report.html').resolve()}")
 
 
 @app.command()
