@@ -44,7 +44,7 @@ from alidade.pipelines.reports.report import (
     Tiles,
     Tone,
 )
-from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import TruthResult, truth_errors
 from alidade.pipelines.reports.results_table import (
     LEGEND,
@@ -403,8 +403,9 @@ def _parameters(c: Calibration, nuisance: bool = False) -> tuple[Block, ...]:
     error = () if c.truth is None else (Column("error", wide=True),)
     errors = truth_errors(c)
     rows: list[Row] = []
-    for q in quantities_of(c.problem, c.estimate):
-        p, (unit, factor) = c.parameters[q.name], human_unit(q)
+    for p in c.parameters.values():
+        q = c.quantities[p.name]
+        unit, factor = human_unit(q)
         if (p.group is not None) != nuisance:
             continue
         is_known = p.sigma < MAX_SIGMA_OVER_PRIOR * q.scale

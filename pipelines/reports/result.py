@@ -114,14 +114,12 @@ class Calibration(SensorValues):
     @cached_property
     def parameters(self) -> dict[str, ParameterResult]:
         """Parameters by name, as result.json lists them."""
-        given = self.verdicts
-        quantities = quantities_of(self.problem, self.estimate)
         rows = zip(
-            quantities,
+            self._estimated,
             self.estimate.values,
             self.estimate.sigmas,
             self.estimate.inflations,
-            prior_z_scores(self.estimate, quantities),
+            prior_z_scores(self.estimate, self._estimated),
             strict=True,
         )
         return {
@@ -133,7 +131,7 @@ class Calibration(SensorValues):
                 prior_sigma=q.prior_sigma,
                 prior_mean=q.prior_mean,
                 require=q.require if q.judged else None,
-                observability=given.get(q.name),
+                observability=self.verdicts.get(q.name),
                 group=q.group,
                 pull=None if q.group is None else z,
                 inflation=float(inflation),
@@ -243,7 +241,7 @@ class Calibration(SensorValues):
     @property
     def _calibrated(self) -> list[str]:
         """Names of the calibrated parameters, nuisance parameters left out."""
-        return [q.name for q in quantities_of(self.problem, self.estimate) if q.group is None]
+        return [q.name for q in self._estimated if q.group is None]
 
     @property
     def start(self) -> str:
@@ -258,20 +256,22 @@ class Calibration(SensorValues):
     @cached_property
     def verdicts(self) -> dict[str, Verdict]:
         """Verdicts by parameter, of those with a required accuracy."""
-        return verdicts(
-            quantities_of(self.problem, self.estimate), self.estimate.covariance, self.findings, self.estimate.values
-        )
+        return verdicts(self._estimated, self.covariance, self.findings, self.estimate.values)
 
     @property
     def derived(self) -> list[DerivedNumber]:
         """Scale and shape of a sensor whose scale hangs on the strength of what it measures."""
-        known = quantities_of(self.problem, self.estimate)
-        return derived(known, self.estimate.covariance, self.estimate.values, self.findings)
+        return derived(self._estimated, self.covariance, self.estimate.values, self.findings)
 
     @cached_property
     def quantities(self) -> dict[str, Quantity]:
         """Quantities by name, those of several recordings too."""
         return {q.name: q for q in self.problem.quantities}
+
+    @property
+    def _estimated(self) -> tuple[Quantity, ...]:
+        """Quantities of the estimate, in its order; a published solver may have fewer than the problem."""
+        return tuple(self.quantities[name] for name in self.estimate.names)
 
     @property
     def headline(self) -> str:
@@ -421,12 +421,6 @@ class Calibration(SensorValues):
         return (*self.facts.notes, *sentences.notes(self.findings, self.quantities), *clipped)
 
 
-def quantities_of(problem: Problem, estimate: Estimate) -> tuple[Quantity, ...]:
-    """Return the quantities of an estimate, in its order; a published solver may have fewer than the problem."""
-    known = {q.name: q for q in problem.quantities}
-    return tuple(known[name] for name in estimate.names)
-
-
 def software_versions() -> dict[str, str]:
     """Versions of the software that computed the result."""
     versions = {"python": platform.python_version()}
@@ -440,7 +434,7 @@ def software_versions() -> dict[str, str]:
 
 def posterior_of(c: Calibration) -> Posterior:
     """Return the posterior of the parameters that the formulas apply."""
-    quantities, known = quantities_of(c.problem, c.estimate), c.application()
+    quantities, known = [c.quantities[name] for name in c.estimate.names], c.application()
     gains = {q.name: q for q in quantities if len(q.name) > 4 and q.name[-4:-2] == "_k"}
     plain = all(q.unit in ("", "1") for q in gains.values())
     nominal = {

@@ -21,7 +21,7 @@ from alidade.pipelines.methods.head.report import head_plots
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.plots import common_plots, histories
-from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 from tests.support.browser import drawn, needs_browser
 from tests.support.builders import make_calibration
@@ -222,7 +222,7 @@ def test_parameters_of_a_partial_estimate_keep_their_units() -> None:
     calibration = make_calibration(
         names=("time_offset",), values=np.zeros(1), covariance=np.eye(1) * 1e-8, history=None
     )
-    assert [q.unit for q in quantities_of(calibration.problem, calibration.estimate)] == ["s"]
+    assert [p.unit for p in calibration.parameters.values()] == ["s"]
     assert "Correlation" not in Page(report_html(calibration)).text
 
 

@@ -24,7 +24,7 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.topics import SessionFacts, TopicFacts
-from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.sensors import EulerMotion, Swing
 
@@ -81,7 +81,7 @@ def make_calibration(**changes: object) -> Calibration:
     )
     estimate = replace(estimate, **{k: v for k, v in changes.items() if hasattr(estimate, k)})  # type: ignore[arg-type]
     problem = make_problem()
-    quantities = quantities_of(problem, estimate)
+    quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
     estimate = replace(estimate, covariance=finite_covariance(quantities, estimate.covariance))
     calibration = Calibration(
         method=method("head"),
