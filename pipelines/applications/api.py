@@ -114,9 +114,7 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     if isinstance(source, str | Path | list | tuple):
         return Session.read(open_recording(source, strict), method, config)
     if isinstance(source, Simulated):
-        text = load_config(source.config.encode(), config)
-        chosen = methods.method(method or text.method or "")
-        return Session(chosen, source.data, text, known=source.truth)
+        return Session.of(methods.method(method) if method else None, source, config)
     settings = load_config(None, config)
     name = method or settings.method
     if name is None:

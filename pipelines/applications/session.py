@@ -172,10 +172,11 @@ class Session:
         return replace(self, data=self.method.read(recording, self.config), recording=recording)
 
     @classmethod
-    def of(cls, method: Method, simulated: Simulated, config_file: Settings = None) -> Session:
-        """Return a session of simulated data that were never written to a file."""
+    def of(cls, method: Method | None, simulated: Simulated, config_file: Settings = None) -> Session:
+        """Return a session of simulated data that were never written to a file; by default with their own method."""
         config = load_config(simulated.config.encode(), config_file)
-        return cls(method, simulated.data, config, known=simulated.truth)
+        chosen = method or methods.method(config.method or "")
+        return cls(chosen, simulated.data, config, known=simulated.truth)
 
     def __repr__(self) -> str:
         return f"<Session {self.method.name} of {self.name}>"
