@@ -18,11 +18,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alidade.pipelines.applications.api import Config, calibrate, compare, follow, load, open, simulate
+    from alidade.pipelines.applications.api import (
+        Config,
+        calibrate,
+        compare,
+        follow,
+        hand_eye,
+        imu_static,
+        load,
+        magcal,
+        open,
+        simulate,
+    )
     from alidade.pipelines.applications.apply import apply
     from alidade.pipelines.applications.fleet.fleet import fleet
     from alidade.pipelines.applications.noise import noise
-    from alidade.pipelines.applications.one_liners import hand_eye, imu_static, magcal
     from alidade.pipelines.applications.planning import plan
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.applications.validate import validate
@@ -76,7 +86,6 @@ _MODULES = {
     "noise": "alidade.pipelines.applications.noise",
     "plan": "alidade.pipelines.applications.planning",
     "validate": "alidade.pipelines.applications.validate",
-    **dict.fromkeys(("hand_eye", "imu_static", "magcal"), "alidade.pipelines.applications.one_liners"),
 }
 _API = "alidade.pipelines.applications.api"
 
