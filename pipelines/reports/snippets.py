@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -51,28 +52,22 @@ class _Node:
         return so3.matrix(self.value.array) if self.value.kind == "rotation" else self.value.array
 
 
-class _Reader:
-    """Parser of formulas, which may refer to earlier formulas."""
+def _read(formulas: Sequence[Formula], values: Mapping[str, float]) -> Iterator[tuple[Formula, _Node]]:
+    """Yield each formula with its expression; a later one calls an earlier one, or has its value."""
+    known, earlier = with_vectors(values) | AXES, dict[str, _Node]()
 
-    def __init__(self, values: Mapping[str, float]) -> None:
-        self._known = with_vectors(values) | AXES
-        self._earlier: dict[str, tuple[_Node, tuple[str, ...]]] = {}
-        self._inputs: tuple[str, ...] = ()
-
-    def read(self, formula: Formula) -> _Node:
-        self._inputs = formula.inputs
-        node = walk(formula.tree, self.name, _constant, _operation)
-        self._earlier[formula.name] = node, formula.inputs
-        return node
-
-    def name(self, name: str) -> _Node:
-        """Return the node of a name: an earlier formula, an input or a parameter."""
-        if name in self._earlier:
-            node, arguments = self._earlier[name]
-            return node if node.value is not None else _Node(node.kind, None, f"{name}({', '.join(arguments)})")
-        if name in self._inputs:
+    def of_name(inputs: Sequence[str], name: str) -> _Node:
+        if name in earlier:
+            return earlier[name]
+        if name in inputs:
             return _Node(_kind_in_code(input_kind(name)), None, name)
-        return _constant(Value.constant(self._known.get(name, np.array(0.0))))
+        return _constant(Value.constant(known.get(name, np.array(0.0))))
+
+    for formula in formulas:
+        node = walk(formula.tree, partial(of_name, formula.inputs), _constant, _operation)
+        call = f"{formula.name}({', '.join(formula.inputs)})"
+        earlier[formula.name] = node if node.value is not None else _Node(node.kind, None, call)
+        yield formula, node
 
 
 def _kind_in_code(kind: Kind) -> Kind:
@@ -104,9 +99,8 @@ def _operation(op: str, *parts: _Node) -> _Node:
 
 def python_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str:
     """A module with a function, or a constant, for each formula; it needs numpy alone. SI."""
-    reader, lines = _Reader(values), []
-    for formula in formulas:
-        node = reader.read(formula)
+    lines = []
+    for formula, node in _read(formulas, values):
         text = ast.unparse(ast.parse(_code(node, _PYTHON, _python_numbers), mode="eval"))
         lines += ["", "", f"# {formula.description}"]
         if node.value is not None:
@@ -180,15 +174,14 @@ def _axis_turn(node: _Node) -> tuple[str, _Node] | None:
 
 def c_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str:
     """A header of C99 with a function, or a constant, for each formula; it needs math.h alone. SI."""
-    reader, lines = _Reader(values), []
-    for formula in formulas:
-        node = reader.read(formula)
+    lines = []
+    for formula, node in _read(formulas, values):
         kind = _C_TYPES[node.kind]
         lines += ["", f"/* {formula.description} */"]
         if node.array is not None:
             lines.append(f"static const {kind} {formula.name} = {_c_numbers(node.array)};")
         else:
-            needed = ", ".join(f"{_C_TYPES[reader.name(name).kind]} {name}" for name in formula.inputs)
+            needed = ", ".join(f"{_C_TYPES[_kind_in_code(input_kind(name))]} {name}" for name in formula.inputs)
             lines.append(f"static {kind} {formula.name}({needed}) {{ return {_code(node, _C, _c_part)}; }}")
     body = "\n".join(lines)
     needed_helpers: list[str] = []
