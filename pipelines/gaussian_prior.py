@@ -52,6 +52,11 @@ class GaussianPrior:
         return replace(rest, mean=rest.mean + scale[one] * (gain @ off), covariance=rest.covariance - lost)
 
     @property
+    def means(self) -> dict[str, float]:
+        """Mean of each parameter, by name."""
+        return dict(zip(self.names, self.mean.tolist(), strict=True))
+
+    @property
     def sigmas(self) -> Array:
         """Standard deviations (n,)."""
         return np.sqrt(np.diag(self.covariance))

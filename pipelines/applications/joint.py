@@ -200,10 +200,7 @@ def _with_those_before(session: Session, alone: Sequence[Alone], sqrt_info: Sqrt
     if _far_apart(joined):
         return {}
     place = next(i for i, (_, each) in enumerate(order) if each is sqrt_info)
-    posterior = joined.all(place)
-    return {
-        name: float(mean) for name, mean in zip(posterior.names, posterior.mean, strict=True) if name in sqrt_info.names
-    }
+    return joined.all(place).of(sqrt_info.names).means
 
 
 def _day(session: Session) -> float:
@@ -273,7 +270,7 @@ def _again(
 
     Its noise levels and inliers stay those of its own solution: found anew at these levels, other inliers may fit too.
     """
-    estimate, found = alone.calibration.estimate, dict(zip(known.names, known.mean.tolist(), strict=True))
+    estimate, found = alone.calibration.estimate, known.means
     values = np.array([found.get(name, value) for name, value in zip(estimate.names, estimate.values, strict=True)])
     moves = estimate.error_map if estimate.error_map is not None and estimate.error_map.map.moves else None
     problem = method.graph(alone.loaded(), alone.calibration.config).near(found)
@@ -294,7 +291,7 @@ def _calibration(
     """Return the joint estimate as a calibration of the device at the last recording, with that one's parameters."""
     last = len(alone) - 1
     posterior = joined.all(last)
-    found = dict(zip(posterior.names, posterior.mean.tolist(), strict=True))
+    found = posterior.means
     names = tuple(dict.fromkeys([*(q.name for q in problem.quantities), *found]))
     problem = replace(problem, parameters=_with_others(problem, alone, found), premises=())
     quantities = {q.name: q for q in problem.quantities}

@@ -175,8 +175,7 @@ def validate(
     of_device = walks(chosen, settings, [name for name in numbers if name in known.parameters])
     fixed = {name: values[name] for name in of_device if name in values}
     others = GaussianPrior(own.estimate.names, own.estimate.values, own.estimate.covariance).given(fixed)
-    conditional = dict(zip(others.names, others.mean.tolist(), strict=True))
-    device = chosen.report.validate(data, settings, numbers | conditional | fixed)
+    device = chosen.report.validate(data, settings, numbers | others.means | fixed)
     best = chosen.report.validate(data, settings, numbers)
     return Validated(known, path.name, validations, False, lost, held, device, best, own)
 

@@ -89,7 +89,7 @@ def _with_prior(problem: Problem, gaussian_prior: GaussianPrior, before: Earlier
         for name, mean, sigma in zip(known.names, known.mean, known.sigmas, strict=True)
         if name in replaced
     }
-    means = dict(zip(known.names, known.mean.tolist(), strict=True))
+    means = known.means
     parameters = tuple(
         replace(p, quantities=tuple(replacements.get(q.name, q) for q in p.quantities)).near(means)
         for p in problem.parameters

@@ -375,8 +375,7 @@ class Calibration(SensorValues):
         applied, best = set(self.applied), self.values
         left_out = dict.fromkeys((name for name in best if name not in applied), 0.0)
         if np.isfinite(self.covariance).all():
-            joint = GaussianPrior(tuple(best), self.estimate.values, self.covariance).given(left_out)
-            best = dict(zip(joint.names, joint.mean.tolist(), strict=True))
+            best = GaussianPrior(tuple(best), self.estimate.values, self.covariance).given(left_out).means
         return {name: value for name, value in best.items() if name in applied}
 
     @property

@@ -150,8 +150,7 @@ class Joined:
 
     def distance(self, recording: int, sqrt_info: SqrtInformation) -> float:
         """Distance of the joint estimate from a recording's linearisation point, in the recording's sigmas."""
-        known = self.all(recording)
-        means = dict(zip(known.names, known.mean.tolist(), strict=True))
+        means = self.all(recording).means
         return float(np.linalg.norm(sqrt_info.R @ ([means[name] for name in sqrt_info.names] - sqrt_info.at)))
 
     @property
