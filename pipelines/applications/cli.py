@@ -786,10 +786,10 @@ def _show_result(
 ) -> NoReturn:
     """Show a calibration and the place of its files; exit with the code of its status."""
     from alidade.pipelines.reports.calibration_report import calibration_report, short_report
-    from alidade.pipelines.reports.result_json import results_json
+    from alidade.pipelines.reports.result_json import result_json
 
     report = partial(calibration_report if everything else short_report, calibration)
-    _show(as_json, partial(results_json, [calibration]), report, _results_in(folder, written), everything=everything)
+    _show(as_json, partial(result_json, calibration), report, _results_in(folder, written), everything=everything)
     raise typer.Exit(errors.EXIT_OF_STATUS[calibration.status])
 
 

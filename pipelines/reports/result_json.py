@@ -394,9 +394,8 @@ def result_json(calibration: Calibration) -> str:
 
 
 def results_json(calibrations: Sequence[Calibration]) -> str:
-    """Return the text of one calibration's result.json, or of a list of several."""
-    texts = [result_json(calibration).rstrip() for calibration in calibrations]
-    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
+    """Return the text of a list of several calibrations' result.json."""
+    return f"[{', '.join(result_json(calibration).rstrip() for calibration in calibrations)}]"
 
 
 def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
