@@ -11,7 +11,7 @@ import alidade
 from alidade.pipelines.diagnostics.split_test import change_by_parts
 from benchmarks.slips import SIMULATED
 
-QUICK = ("gimbal-gyro", "indexer-gyro", "compass-iron")
+QUICK = ("indexer-gyro", "compass-iron")
 
 
 @pytest.mark.parametrize(

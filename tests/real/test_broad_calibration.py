@@ -144,13 +144,14 @@ def test_an_inverted_axis_is_named_where_vision_is_far_better_than_its_default(
     assert found.headline.startswith(f"Consistent with: the sign of the helmet gyro's {'xyz'[axis]} is wrong")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "end"),
     [
         ("28_disturbed_stationary_magnet_A", 45.0),
-        pytest.param("21_undisturbed_fast_combined", 45.0, marks=pytest.mark.slow),
-        pytest.param("01_undisturbed_slow_rotation_A", 1e3, marks=pytest.mark.slow),
-        pytest.param("21_undisturbed_fast_combined", 1e3, marks=pytest.mark.slow),
+        ("21_undisturbed_fast_combined", 45.0),
+        ("01_undisturbed_slow_rotation_A", 1e3),
+        ("21_undisturbed_fast_combined", 1e3),
     ],
 )
 def test_inverted_attitudes_are_named_of_a_recording_that_begins_at_rest(
@@ -204,6 +205,7 @@ def test_a_swung_accelerometer_begins_as_nominal(name: str, shared_data: Path) -
     assert 20.0 < accel.level < 60.0
 
 
+@pytest.mark.slow
 def test_a_large_slip_is_found_whose_pictures_before_pass_for_outliers(shared_data: Path) -> None:
     """The noise levels of the solution with the slip are far from those without it: two rounds did not reach them."""
     head = methods.method("head")

@@ -53,6 +53,7 @@ def test_effect_of_the_scale_on_the_mount_is_that_of_a_scale_stated_smaller(reco
     assert abs(slope * scale) > 0.5 * np.deg2rad(1.0)
 
 
+@pytest.mark.slow
 def test_with_its_true_data_sheet_the_mount_is_right(recording: Path) -> None:
     found = calibrated(recording, TRUE_SHEET)
     mount = [found.parameters[f"helmet_mount_{axis}"] for axis in "xyz"]

@@ -134,6 +134,7 @@ def test_map_is_drawn_over_where_measurements_were_made() -> None:
     assert any("los_map" in title for title in titles)
 
 
+@pytest.mark.slow
 def test_a_map_moves_nothing_that_the_recording_does_not_determine(monkeypatch: pytest.MonkeyPatch) -> None:
     """A carrier that only yaws leaves delta_px to its prior; freed with a map it went to -0.17 rad."""
     monkeypatch.setattr("alidade.pipelines.applications.session.find_hypotheses", lambda *_: ())  # takes long

@@ -94,7 +94,8 @@ def test_tags_are_found_within_their_joint_sigmas() -> None:
     assert 0.6 < np.mean(squares) < 1.5
 
 
-@pytest.mark.parametrize("size", [pytest.param(1e-4, marks=pytest.mark.slow), 2e-3])
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1e-4, 2e-3])
 def test_tags_beside_where_the_drawing_has_them(size: float) -> None:
     """A tenth of a millimetre is within what a print is glued to; of two the tag is named. K is right in both.
 

@@ -450,8 +450,10 @@ def test_real_counts_of_an_xsens_without_camera(shared_data: Path) -> None:
 
 @pytest.mark.parametrize(
     ("axes", "fault"),
-    [(np.diag([1.0, 1.0, -1.0]), "the sign of the gyro's z is wrong"), (np.eye(3)[[1, 0, 2]], "x and y are swapped")],
-    ids=["inverted", "swapped"],
+    [
+        pytest.param(np.diag([1.0, 1.0, -1.0]), "the sign of the gyro's z is wrong", id="inverted"),
+        pytest.param(np.eye(3)[[1, 0, 2]], "x and y are swapped", id="swapped", marks=pytest.mark.slow),
+    ],
 )
 def test_wrong_gyro_axes_are_named_where_only_noise_that_is_none_converges(axes: Array, fault: str) -> None:
     """Of a gyro six times as noisy as stated. It once was `not converged` beside tiny sigmas, or an exception."""
