@@ -60,7 +60,6 @@ _COLUMNS: Mapping[str, Mapping[str, series.Column]] = {
         series.ImuSeries,
         series.MagneticSeries,
         series.VectorSeries,
-        series.QuaternionSeries,
         series.PoseSeries,
         series.FixSeries,
         series.TemperatureSeries,

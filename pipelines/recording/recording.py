@@ -269,21 +269,13 @@ class Recording:
         """Read a topic of vectors: Vector3Stamped, the rates of TwistStamped, or the accelerations of AccelStamped."""
         return self._series(series.VectorSeries, topic)
 
-    def quaternion(self, topic: str) -> series.QuaternionSeries:
-        """Read a geometry_msgs/QuaternionStamped topic."""
-        return self._series(series.QuaternionSeries, topic)
-
     def poses(self, topic: str, frame: str | None = None) -> series.PoseSeries:
         """Read a topic of poses, or of attitudes alone, of any type in messages.ATTITUDES."""
         if topic in self._sources:
             return self.poses_of(self._sources[topic])
-        kind = self._require(topic, *messages.ATTITUDES).type
-        if kind == messages.IMU:
+        if self._require(topic, *messages.ATTITUDES).type == messages.IMU:
             return self._orientations(topic, frame)
-        if kind != messages.QUATERNION:
-            return self._series(series.PoseSeries, topic, frame)
-        attitude = self._series(series.QuaternionSeries, topic, frame)
-        return series.PoseSeries(attitude.t_ns, attitude.wxyz, stamped_by_log=attitude.stamped_by_log)
+        return self._series(series.PoseSeries, topic, frame)
 
     def poses_of(self, source: TopicSource) -> series.PoseSeries:
         """Read the poses of a topic source, whether or not it was given to `with_config`."""

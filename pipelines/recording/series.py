@@ -115,7 +115,7 @@ class VectorSeries(Series):
 
 @dataclass(frozen=True, eq=False)
 class QuaternionSeries(Series):
-    """Attitudes as quaternions (N, 4)."""
+    """Attitudes as quaternions (N, 4), for writing; they are read as poses."""
 
     TYPE: ClassVar[str] = messages.QUATERNION
     COLUMNS: ClassVar[dict[str, Column]] = {"wxyz": Column("quaternion", (4,), _XYZW_TO_WXYZ)}
@@ -135,6 +135,7 @@ class PoseSeries(Series):
     }
     OTHERS: ClassVar[dict[str, dict[str, Column]]] = {
         messages.ODOMETRY: COLUMNS,
+        messages.QUATERNION: QuaternionSeries.COLUMNS,
         messages.PLAIN_POSE: {
             "wxyz": Column("pose.orientation", (4,), _XYZW_TO_WXYZ),
             "position": Column("pose.position", (3,)),

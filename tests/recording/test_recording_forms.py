@@ -59,7 +59,7 @@ def read_topics(recording: Recording, names: Any) -> dict[str, Any]:
         "/mag": recording.magnetic,
         "/joints": lambda topic: recording.joints(topic, ("azimuth", "elevation")),
         "/vector": recording.vector,
-        "/quaternion": recording.quaternion,
+        "/quaternion": recording.poses,
         "/pose": recording.poses,
         "/fix": recording.fixes,
         "/camera_info": recording.camera_info,

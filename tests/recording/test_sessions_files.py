@@ -30,7 +30,7 @@ def read_all(path: Path) -> dict[str, Any]:
         "/mag": recording.magnetic("/mag"),
         "/joints": recording.joints("/joints", ("azimuth", "elevation")),
         "/vector": recording.vector("/vector"),
-        "/quaternion": recording.quaternion("/quaternion"),
+        "/quaternion": recording.poses("/quaternion"),
         "/pose": recording.poses("/pose"),
         "/fix": recording.fixes("/fix"),
         "/camera_info": recording.camera_info("/camera_info"),

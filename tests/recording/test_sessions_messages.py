@@ -57,7 +57,7 @@ def test_groups_of_types_are_those_that_have_columns() -> None:
     imu, vector, pose = ({each.TYPE, *each.OTHERS} for each in (ImuSeries, VectorSeries, PoseSeries))
     assert set(messages.IMUS) == imu
     assert {*messages.RATES, messages.ACCEL} == imu | vector
-    assert set(messages.ATTITUDES) == pose | {messages.QUATERNION, messages.IMU}
+    assert set(messages.ATTITUDES) == pose | {messages.IMU}
 
 
 @pytest.mark.parametrize("kind", messages.IMUS)

@@ -19,7 +19,7 @@ READERS: dict[type[series.Series], str] = {
     series.ImuSeries: "imu",
     series.MagneticSeries: "magnetic",
     series.VectorSeries: "vector",
-    series.QuaternionSeries: "quaternion",
+    series.QuaternionSeries: "poses",
     series.PoseSeries: "poses",
     series.FixSeries: "fixes",
     series.TemperatureSeries: "temperature",
