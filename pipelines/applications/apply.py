@@ -228,7 +228,7 @@ def _of_stamps(corrected: series.Series, order: Stamps, stamps: Stamps, log_ns: 
     same = corrected.t_ns[rows] == stamps
     some = {name: getattr(corrected, name)[rows[same]] for name in ("t_ns", *corrected.COLUMNS)}
     encoder = encode_series(replace(corrected, **some))
-    return encoder.block(0, len(encoder.t_ns))._replace(log_ns=log_ns[same])
+    return encoder.block(0, len(encoder.log_ns))._replace(log_ns=log_ns[same])
 
 
 def applied_json(applied: Applied) -> str:

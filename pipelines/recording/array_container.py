@@ -31,18 +31,13 @@ class SeriesEncoder:
     """Encodes a series as CDR messages, in the order of its stamps.
 
     Attributes:
-        definition: message type.
-        t_ns: stamps (N,), Unix ns.
         log_ns: log times (N,), Unix ns: the stamps; a message stamped before its predecessor is logged with it.
         size: bytes of a message, expected ones where they vary.
         varies: whether they do.
     """
 
-    def __init__(
-        self, definition: Definition, t_ns: NDArray[np.int64], size: int, encode: Callable[[slice], Any], varies: bool
-    ) -> None:
-        self.definition, self.t_ns, self.size, self.varies = definition, t_ns, size, varies
-        self.log_ns = np.maximum.accumulate(t_ns)
+    def __init__(self, t_ns: NDArray[np.int64], size: int, encode: Callable[[slice], Any], varies: bool) -> None:
+        self.log_ns, self.size, self.varies = np.maximum.accumulate(t_ns), size, varies
         self._encode, self._taken = encode, 0
 
     def take(self, count: int) -> Any:
@@ -76,42 +71,35 @@ def _uniform(
             run.of(rows)[:] = values[which]
         return rows
 
-    return SeriesEncoder(definition, t_ns, len(data), encode, varies=False)
+    return SeriesEncoder(t_ns, len(data), encode, varies=False)
 
 
-def _varying(definition: Definition, t_ns: NDArray[np.int64], encoded: Iterator[bytes], size: int) -> SeriesEncoder:
+def _varying(t_ns: NDArray[np.int64], encoded: Iterator[bytes], size: int) -> SeriesEncoder:
     """Return the encoder of messages of any size, each of which rosbags has encoded by itself."""
-    return SeriesEncoder(
-        definition, t_ns, size, lambda which: list(islice(encoded, which.stop - which.start)), varies=True
-    )
+    return SeriesEncoder(t_ns, size, lambda which: list(islice(encoded, which.stop - which.start)), varies=True)
 
 
 def encode_series(topic: series.Topic) -> SeriesEncoder:
     """Return the encoder of a series as the CDR messages of a topic."""
+    definition = known(topic.TYPE)
+    header = _header(definition, 0, topic.frame_id)
     if isinstance(topic, series.Series):
-        definition = known(topic.TYPE)
         columns = {}
         for name, column in topic.COLUMNS.items():
             values = getattr(topic, name).reshape(len(topic), math.prod(column.shape))
             recorded_order = np.argsort(column.order) if column.order else slice(None)
             columns[column.path] = values[:, recorded_order]
-        first = definition.new(topic.TYPE, header=_header(definition, 0, topic.frame_id))
-        return _uniform(definition, topic.t_ns, first, columns)
+        return _uniform(definition, topic.t_ns, definition.new(topic.TYPE, header=header), columns)
     if isinstance(topic, series.JointSeries):
-        definition = known(messages.JOINT_STATE)
-        header = _header(definition, 0, topic.frame_id)
         zeros = np.zeros(len(topic.names))
-        first = definition.new(messages.JOINT_STATE, header=header, name=list(topic.names), position=zeros)
+        first = definition.new(topic.TYPE, header=header, name=list(topic.names), position=zeros)
         return _uniform(definition, topic.t_ns, first, {"position": topic.position})
     if isinstance(topic, series.CameraInfo):
-        definition = known(messages.CAMERA_INFO)
         t_ns = np.array([topic.t_ns], dtype=np.int64)
-        return _varying(definition, t_ns, iter([_camera_info(definition, topic)]), _PICTURE_BYTES)
+        return _varying(t_ns, iter([_camera_info(definition, topic)]), _PICTURE_BYTES)
     if isinstance(topic, series.ImageSeries):
-        definition = known(messages.COMPRESSED_IMAGE)
-        return _varying(definition, topic.t_ns, _images(definition, topic), _PICTURE_BYTES)
-    definition = known(messages.TAG_DETECTIONS)
-    return _varying(definition, topic.t_ns, _detections(definition, topic), _DETECTIONS_BYTES)
+        return _varying(topic.t_ns, _images(definition, topic), _PICTURE_BYTES)
+    return _varying(topic.t_ns, _detections(definition, topic), _DETECTIONS_BYTES)
 
 
 class ArrayContainer(Container):
@@ -139,8 +127,7 @@ class ArrayContainer(Container):
         self.assumptions, self._files, self._log_ns = tuple(assumptions), files, log_ns or {}
         self._topics = dict(enumerate(topics.values(), start=1))
         for number, (name, topic) in enumerate(topics.items(), start=1):
-            kind = encode_series(topic).definition.name
-            self.schemas[number] = ros2_schema(kind)._replace(id=number)
+            self.schemas[number] = ros2_schema(topic.TYPE)._replace(id=number)
             self.channels[number] = Channel(number, name, "cdr", number)
             self.counts[number] = 1 if isinstance(topic, series.CameraInfo) else len(topic)
 

@@ -64,7 +64,7 @@ def write_session(
     pieces = list(zip([0, *cuts], [*cuts, len(order)], strict=True))
     with replacing(Path(path)) as stream:
         out = McapOutput(stream, attachments or {}, int(log_ns[order[0]]) if len(log_ns) else 0)
-        numbers = [out.channel(name, "cdr", ros2_schema(encoder.definition.name)) for name, encoder in encoders.items()]
+        numbers = [out.channel(name, "cdr", ros2_schema(topic.TYPE)) for name, topic in topics.items()]
         # Pictures are drawn as they are written.
         for start, end in progress.track(pieces, "writing", len(pieces)):
             counts = np.bincount(owner[start:end], minlength=len(encoders)).tolist()

@@ -304,7 +304,7 @@ class Recording:
             )
         t_ns, from_log, numbers = self._sorted(topic, table)
         without = table.count - int(np.count_nonzero(table.filled))
-        return series.JointSeries(t_ns, numbers["position"], tuple(names), from_log, without)
+        return series.JointSeries(t_ns, numbers["position"], tuple(names), without, stamped_by_log=from_log)
 
     # -- messages one by one
 

@@ -35,18 +35,27 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
-    """Base of all series: fills in arrays that are left out, and raises ValueError at a wrong shape."""
+class Stamped:
+    """Messages of type TYPE at stamps (N,), Unix ns."""
 
     TYPE: ClassVar[str]
-    COLUMNS: ClassVar[dict[str, Column]]
-    # Where other types of messages hold the columns; what they have not got is filled in.
-    OTHERS: ClassVar[dict[str, dict[str, Column]]] = {}
-    DEFAULTS: ClassVar[dict[str, ArrayLike]] = {}
 
     t_ns: Stamps
     stamped_by_log: int = dataclasses.field(default=0, kw_only=True)
     frame_id: str = dataclasses.field(default="", kw_only=True)
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True, eq=False)
+class Series(Stamped):
+    """Base of the series of numbers: fills in arrays that are left out, and raises ValueError at a wrong shape."""
+
+    COLUMNS: ClassVar[dict[str, Column]]
+    # Where other types of messages hold the columns; what they have not got is filled in.
+    OTHERS: ClassVar[dict[str, dict[str, Column]]] = {}
+    DEFAULTS: ClassVar[dict[str, ArrayLike]] = {}
 
     def __post_init__(self) -> None:
         stamps = np.asarray(self.t_ns)
@@ -57,9 +66,6 @@ class Series:
             value = getattr(self, name)
             value = np.asarray(self.DEFAULTS.get(name, 0.0) if value is None else value, dtype=float)
             object.__setattr__(self, name, np.broadcast_to(value, (len(stamps), *column.shape)))
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,43 +186,37 @@ class TemperatureSeries(Series):
 
 
 @dataclass(frozen=True, eq=False)
-class JointSeries:
+class JointSeries(Stamped):
     """Positions (N, len(names)) rad of the named joints; `without` counts messages that lack one of them."""
 
-    t_ns: Stamps
+    TYPE: ClassVar[str] = messages.JOINT_STATE
+
     position: Array
     names: tuple[str, ...]
-    stamped_by_log: int = 0
     without: int = 0
-    frame_id: str = ""
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 @dataclass(frozen=True, eq=False)
-class DetectionSeries:
+class DetectionSeries(Stamped):
     """AprilTags found in pictures: M detections in N pictures.
 
     t_ns (N,) stamps of the pictures, frame (M,) index of the picture, tag_id (M,), corners (M, 4, 2) px in the order of
     the AprilTag library, family (M,).
     """
 
-    t_ns: Stamps
+    TYPE: ClassVar[str] = messages.TAG_DETECTIONS
+
     frame: NDArray[np.int64]
     tag_id: NDArray[np.int64]
     corners: Array
     family: NDArray[np.str_]
-    stamped_by_log: int = 0
-    frame_id: str = ""
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 @dataclass(frozen=True, eq=False)
 class CameraInfo:
     """Intrinsics: size in px, distortion model and coefficients d, matrices k (3, 3), r (3, 3), p (3, 4)."""
+
+    TYPE: ClassVar[str] = messages.CAMERA_INFO
 
     t_ns: int
     width: int
@@ -235,16 +235,13 @@ class CameraInfo:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageSeries:
+class ImageSeries(Stamped):
     """Compressed pictures: stamps (N,), the files in the same order (an iterable, taken one by one), their format."""
 
-    t_ns: Stamps
+    TYPE: ClassVar[str] = messages.COMPRESSED_IMAGE
+
     data: Iterable[bytes]
     format: str = "jpeg"
-    frame_id: str = ""
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 # Of one camera, as simulators draw them.

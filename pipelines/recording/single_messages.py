@@ -71,7 +71,7 @@ def tag_detections(messages: Iterable[DecodedMessage]) -> series.DetectionSeries
         np.array(tag_id, dtype=np.int64),
         np.array(corners, dtype=float).reshape(-1, 4, 2),
         np.array(family, dtype=np.str_),
-        sum(from_log for _, from_log in stamps),
+        stamped_by_log=sum(from_log for _, from_log in stamps),
     )
 
 

@@ -191,7 +191,7 @@ def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraI
     settings, t_ns = scenario.pictures, nanoseconds(t, EPOCH_NS)
     position = np.array(settings.position_m) + np.array(settings.sway_m) * np.sin(2.0 * np.pi * at[:, None] * _SWAY_HZ)
     files = _exposures(settings, cRh, position, np.random.default_rng(seed))
-    return settings.info(int(t_ns[0])), series.ImageSeries(t_ns, files, settings.format, "camera")
+    return settings.info(int(t_ns[0])), series.ImageSeries(t_ns, files, settings.format, frame_id="camera")
 
 
 def _exposures(settings: HeadPictures, cRh: Array, position: Array, rng: np.random.Generator) -> Iterator[bytes]:

@@ -310,7 +310,7 @@ def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraIn
         raise InputError("losses: pictures are simulated of a single target; leave out --images")
     t_ns = nanoseconds(stamps, EPOCH_NS)
     files = _exposures(scenario.camera, 1.0 + motion.effects["los_scale"], cRt, rng)
-    return scenario.camera.info(int(t_ns[0])), series.ImageSeries(t_ns, files, "jpeg", "camera")
+    return scenario.camera.info(int(t_ns[0])), series.ImageSeries(t_ns, files, frame_id="camera")
 
 
 def _exposures(settings: LosCamera, magnified: float, cRt: Array, rng: np.random.Generator) -> Iterator[bytes]:
