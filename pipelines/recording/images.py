@@ -6,6 +6,7 @@ files. OpenCV's FFmpeg decodes H.264, H.265 and files; PyAV (extra `video`) deco
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import tempfile
@@ -18,6 +19,8 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import open_binary
+from alidade.pipelines.recording.decoding import DecodedMessage
+from alidade.pipelines.recording.messages import MessageError
 
 Pixels = NDArray[Any]
 Stamp = TypeVar("Stamp")
@@ -96,6 +99,33 @@ def _file(pixels: Pixels) -> bytes:
     """Return a picture (height, width) or (height, width, 3) of 8 bits as a file in the Netpbm form."""
     kind = "P5" if pixels.ndim == 2 else "P6"
     return f"{kind} {pixels.shape[1]} {pixels.shape[0]} 255\n".encode() + pixels.tobytes()
+
+
+def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
+    """Yield pictures as (stamp in ns, file); raw ones and frames of a video become files in the Netpbm form."""
+    return ((t_ns, file) for t_ns, file in _files(messages, is_raw) if t_ns is not None)
+
+
+def _files(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int | None, bytes]]:
+    """Yield a picture for each message; its stamp is None where the message is left out."""
+    files = (_packet(message, is_raw) for message in messages)
+    for t_ns, form, data in files:
+        if form in ANNEX_B or form in BY_PYAV:
+            packets = itertools.chain([(t_ns, data)], ((t_ns, data) for t_ns, _, data in files))
+            try:
+                yield from decode_video(packets, form)
+            except ValueError as error:
+                raise MessageError(str(error)) from error
+            return
+        yield t_ns, data
+
+
+def _packet(message: DecodedMessage, is_raw: bool) -> tuple[int | None, str, bytes]:
+    """Return a message's stamp, ns, its format, and its picture as a file, or its packet of a video."""
+    found, t_ns = message.content, None if message.left_out else message.t_ns
+    if is_raw:
+        return t_ns, "netpbm", netpbm(found)
+    return t_ns, found.format.lower(), found.data.tobytes()
 
 
 def decode_video(packets: Iterable[tuple[Stamp, bytes]], form: str) -> Iterator[tuple[Stamp, bytes]]:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from alidade.factors.array import Array
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording import messages, series, single_messages
+from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.checks import check_clock, jitter_ns, stamp_notes
 from alidade.pipelines.recording.container import Container, MessageBlock
 from alidade.pipelines.recording.decoding import (
@@ -47,6 +47,7 @@ from alidade.pipelines.recording.decoding import (
     one_clock,
     with_log_times,
 )
+from alidade.pipelines.recording.images import pictures
 from alidade.pipelines.recording.messages import MessageError
 from alidade.pipelines.recording.opening import Where, open_container
 from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
@@ -311,7 +312,12 @@ class Recording:
     def camera_info(self, topic: str) -> series.CameraInfo:
         """Read the first message of a sensor_msgs/CameraInfo topic."""
         with self._problems(topic):
-            return single_messages.camera_info(next(self._decoded(topic, messages.CAMERA_INFO)))
+            message = next(self._decoded(topic, messages.CAMERA_INFO))
+            found = message.content
+            k, r, p, d = (np.array(values, dtype=float) for values in (found.k, found.r, found.p, found.d))
+            size = int(found.width), int(found.height)
+            matrices = k.reshape(3, 3), r.reshape(3, 3), p.reshape(3, 4)
+            return series.CameraInfo(message.t_ns, *size, found.distortion_model, d, *matrices, found.header.frame_id)
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """Yield the pictures on a CompressedImage or Image topic as (stamp in ns, file), one by one.
@@ -321,18 +327,43 @@ class Recording:
         info = self._require(topic, *messages.PICTURES)
         found = progress.track(self._decoded(topic, *messages.PICTURES), "pictures", info.count)
         with self._problems(topic):
-            yield from single_messages.pictures(found, info.type == messages.IMAGE)
+            yield from pictures(found, info.type == messages.IMAGE)
 
     def detections(self, topic: str) -> series.DetectionSeries:
-        """Read an apriltag_msgs/AprilTagDetectionArray topic."""
+        """Read an apriltag_msgs/AprilTagDetectionArray topic, with corners as points or as plain numbers."""
+        stamps: list[tuple[int, bool]] = []
+        rows: list[tuple[int, int, Array, str]] = []
         with self._problems(topic):
-            return single_messages.tag_detections(self._decoded(topic, messages.TAG_DETECTIONS))
+            decoded = self._decoded(topic, messages.TAG_DETECTIONS)
+            for i, message in enumerate(message for message in decoded if not message.left_out):
+                stamps.append((message.t_ns, message.from_log_time))
+                numbers = message.definition.numbers
+                for found in message.content.detections:
+                    # (x, y) or (x, y, z) of each
+                    xy = numbers(found.corners).reshape(4, -1)[:, :2]
+                    rows.append((i, int(numbers(found.id)[0]), xy, found.family))
+            frame, tag_id, corners, family = ([row[k] for row in rows] for k in range(4))
+            return series.DetectionSeries(
+                np.array([t_ns for t_ns, _ in stamps], dtype=np.int64),
+                np.array(frame, dtype=np.int64),
+                np.array(tag_id, dtype=np.int64),
+                np.array(corners, dtype=float).reshape(-1, 4, 2),
+                np.array(family, dtype=np.str_),
+                stamped_by_log=sum(from_log for _, from_log in stamps),
+            )
 
     def transforms(self, topic: str) -> Mapping[tuple[str, str], series.PoseSeries]:
         """Read the transforms on a tf2_msgs/TFMessage topic by (parent frame, child frame)."""
         if topic not in self._transforms:
+            rows: dict[tuple[str, str], list[tuple[int, int, Array]]] = {}
             with self._problems(topic):
-                self._transforms[topic] = single_messages.transforms(self._decoded(topic, messages.TF))
+                for message in self._decoded(topic, messages.TF):
+                    for one in message.content.transforms:
+                        t_ns = one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec
+                        row = t_ns, message.t_ns, message.definition.numbers(one.transform)
+                        pair = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+                        rows.setdefault(pair, []).append(row)
+                self._transforms[topic] = {pair: _poses(found) for pair, found in rows.items()}
         return {pair: poses for pair, (poses, _) in self._transforms[topic].items()}
 
     # -- derived topics
@@ -593,3 +624,13 @@ class Recording:
 def _concatenate(parts: Sequence[Times]) -> Times:
     none = np.empty(0, np.int64)
     return np.concatenate([none, *(t_ns for t_ns, _ in parts)]), np.concatenate([none, *(log for _, log in parts)])
+
+
+def _poses(rows: list[tuple[int, int, Array]]) -> tuple[series.PoseSeries, int]:
+    """Make poses of rows of stamp (0: none), log time, and x, y, z, qx, qy, qz, qw; count those left out."""
+    stamps, log_ns = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2).T
+    kept, absent = one_clock(stamps, log_ns)
+    numbers = np.array([row[2] for row in rows]).reshape(-1, 7)[kept]
+    t_ns, from_log = (log_ns, len(rows)) if absent else (stamps[kept], 0)
+    poses = series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=from_log)
+    return poses, int(np.count_nonzero(~kept))
