@@ -131,16 +131,14 @@ def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
 def _file(path: Path) -> Container:
     """Open one file as the format that its first bytes indicate."""
     require_regular(path)
-    with open_binary(path) as stream:
-        start = stream.read(16)
-    container = _decompressed(path) if start.startswith(_ZSTD) else _by_content(path, path)
+    container = _by_content(path, path)
     container.require_readable()
     return container
 
 
 def _by_content(path: Path, data: Path) -> Container:
     """Open the file `data`, which messages name `path`, as the format that its first bytes indicate."""
-    with data.open("rb") as stream:
+    with open_binary(data, path) as stream:
         start = stream.read(_START)
     if start.startswith(ros1_bag.MAGIC):
         return ros1_bag.Ros1Bag(path, data)
@@ -157,7 +155,9 @@ def _by_content(path: Path, data: Path) -> Container:
 
         return read_dataflash(path, data)
     if start.startswith(_ZSTD):
-        raise InputError(f"{path}: compressed twice")
+        if data != path:
+            raise InputError(f"{path}: compressed twice")
+        return _decompressed(path)
     if is_video(start):
         return ArrayContainer(path, {}, ["a video; `columns:` in the config says which table has its pictures' stamps"])
     from alidade.pipelines.recording.tables import looks_like_text, read_table
@@ -267,8 +267,6 @@ def _tables_in(path: Path) -> list[Path]:
 
 def _metadata(path: Path) -> dict[str, Any]:
     """Content of a bag's metadata.yaml; empty if it is not there or is something else."""
-    if not path.is_file():
-        return {}
     try:
         return bag_metadata(read_bytes(path, MAX_YAML_BYTES))
     except InputError:
