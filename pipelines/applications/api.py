@@ -433,7 +433,7 @@ def _checked(method: Method, data: Any) -> Any:
             if len(lost):
                 more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
                 raise InputError(f"{name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
-            if rows[name].are_quaternions:
+            if rows[name].shape == (4,):
                 arrays[name] = unit_quaternions(name, t, values)
         if not (np.diff(t) > 0.0).all():  # the rows are sorted, and some dropped, as those of a file are
             each = (np.nan_to_num(arrays[name]).reshape(len(t), -1) for name in names)

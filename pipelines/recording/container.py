@@ -238,9 +238,12 @@ class Container(ABC):
             raise InputError(f"{self.path}: {'; '.join(lost)}; --strict reads nothing that is damaged: record again")
 
     def _decompressed(self, block: MessageBlock) -> MessageBlock:
-        decompressor = zstandard.ZstdDecompressor()
+        decompressor, messages = zstandard.ZstdDecompressor(), []
         try:
-            messages = [_decompress(decompressor, block.message(i)) for i in range(len(block.start))]
+            for message in map(block.message, range(len(block.start))):
+                if (size := zstandard.frame_content_size(message)) > MAX_MESSAGE_BYTES:
+                    raise ValueError(f"it says that it holds {size} bytes")
+                messages.append(decompressor.decompress(message, max_output_size=MAX_MESSAGE_BYTES))
         except (zstandard.ZstdError, MemoryError, ValueError) as error:
             topic = self.channels[block.channel].topic
             raise InputError(f"{self.path}: topic {topic}: a compressed message is damaged ({error})") from error
@@ -357,10 +360,3 @@ def _when(losses: Sequence[DataLoss], start_ns: int | None, duration_s: float) -
     if not near:
         return ""
     return f", between {min(a for a, _ in near):.3f} and {max(b for _, b in near):.3f} s"
-
-
-def _decompress(decompressor: zstandard.ZstdDecompressor, message: bytes) -> bytes:
-    size = zstandard.frame_content_size(message)
-    if size > MAX_MESSAGE_BYTES:
-        raise ValueError(f"it says that it holds {size} bytes")
-    return decompressor.decompress(message, max_output_size=MAX_MESSAGE_BYTES)

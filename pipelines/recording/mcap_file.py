@@ -108,7 +108,11 @@ class McapFile(Container):
         self._data_end: tuple[int, int] | None = None  # byte and checksum
         self._walked = len(MAGIC)  # up to this byte
         with open_binary(self.data, self.path) as stream:
-            self._check_magic(stream)
+            start = stream.read(len(MAGIC))
+            if not start:
+                raise InputError(f"{self.path}: the file is empty: nothing was recorded")
+            if start != MAGIC:
+                raise NotARecordingError.of(self.path)
             self._read_index(stream)
 
     def _read_index(self, stream: BinaryIO) -> None:
@@ -169,13 +173,6 @@ class McapFile(Container):
             if loss not in self.losses:
                 self.losses.append(loss)
             return None
-
-    def _check_magic(self, stream: BinaryIO) -> None:
-        start = stream.read(len(MAGIC))
-        if not start:
-            raise InputError(f"{self.path}: the file is empty: nothing was recorded")
-        if start != MAGIC:
-            raise NotARecordingError.of(self.path)
 
     # -- the messages of a block
 

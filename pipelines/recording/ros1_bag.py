@@ -128,8 +128,13 @@ class Ros1Bag(Container):
 
     def _messages(self, stream: BinaryIO, chunk: _Chunk) -> dict[int, MessageBlock]:
         """Return the messages in a chunk, a block for each connection. Raises DamagedError."""
+        if chunk.compression not in ("none", "bz2", "lz4"):
+            raise DamagedError(f"unknown compression {chunk.compression!r}")
         stream.seek(chunk.start)
-        data = _unpacked(stream.read(chunk.end - chunk.start), chunk.compression, chunk.size)
+        packed = stream.read(chunk.end - chunk.start)
+        if chunk.size > most_unpacked(len(packed)):
+            raise DamagedError(f"it says that {len(packed)} bytes hold {chunk.size}")
+        data = bytes(decompress(packed, chunk.compression, chunk.size))
         found: dict[int, tuple[list[int], list[int], list[int]]] = {}
         for op, header, start, end in _records(BytesIO(data), 0, len(data), "a record in it"):
             if op == _CONNECTION:
@@ -201,12 +206,3 @@ def _fields(header: bytes) -> dict[bytes, bytes]:
             raise DamagedError("a header is not whole")
         fields[name] = value
     return fields
-
-
-def _unpacked(packed: bytes, compression: str, size: int) -> bytes:
-    """Decompress the data of a chunk, at most one byte more than the chunk states. Raises DamagedError."""
-    if compression not in ("none", "bz2", "lz4"):
-        raise DamagedError(f"unknown compression {compression!r}")
-    if size > most_unpacked(len(packed)):
-        raise DamagedError(f"it says that {len(packed)} bytes hold {size}")
-    return bytes(decompress(packed, compression, size))

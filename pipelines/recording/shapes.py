@@ -43,11 +43,6 @@ class Rows:
     unit: str = ""
     may_be_constant: bool = False
 
-    @property
-    def are_quaternions(self) -> bool:
-        """Whether the rows are attitudes."""
-        return self.shape == (4,)
-
     def read(self, name: str, value: Any) -> Array:
         """Convert user input for the array called `name` to floats; masked values become NaN.
 

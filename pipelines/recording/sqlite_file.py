@@ -86,7 +86,8 @@ class SqliteFile(Container):
                 if row is None:
                     break
         if reason or any(left.values()):
-            self._lose(left, reason or "fewer messages than it says")
+            self.lost_messages |= left
+            self.losses.append(DataLoss("damage", 0, 0, reason=reason or "fewer messages than it says"))
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
@@ -182,7 +183,3 @@ class SqliteFile(Container):
         except sqlite3.Error as error:
             self.losses.append(DataLoss("damage", 0, 0, reason=f"SQLite says: {error}"))
         self.set_counts(counts)
-
-    def _lose(self, left: dict[int, int], reason: str) -> None:
-        self.lost_messages |= left
-        self.losses.append(DataLoss("damage", 0, 0, reason=reason))

@@ -213,7 +213,8 @@ class TableTopic(BaseModel):
             if name in kind.COLUMNS
         }
         if kind is series.ImuSeries:
-            shaped |= _absent({"gyro", "accel"} - values.keys())
+            for name in {"gyro", "accel"} - values.keys():  # with covariance -1, ROS's convention
+                shaped |= {name: np.full(3, 0.0 if name == "gyro" else np.nan), f"{name}_cov": series.ABSENT}
         return kind(t_ns, **shaped), log_ns, notes
 
     @property
@@ -276,14 +277,6 @@ def of_yaw_pitch_roll(angles: Array) -> Array:
     """Quaternions (n, 4) of turns (n, 3) about z, the new y and the new x, rad."""
     about_z, about_y, about_x = (so3.exp(angles[:, [i]] * axis) for i, axis in enumerate(np.eye(3)[::-1]))
     return so3.multiply(so3.multiply(about_z, about_y), about_x)
-
-
-def _absent(names: set[str]) -> dict[str, Any]:
-    """Values of an IMU's missing sensor: zeros with covariance -1, the ROS convention."""
-    found: dict[str, Any] = {}
-    for name in names:
-        found |= {name: np.full(3, 0.0 if name == "gyro" else np.nan), f"{name}_cov": np.diag([-1.0, 0.0, 0.0])}
-    return found
 
 
 def _measures(name: str, unit: str) -> bool:
