@@ -22,6 +22,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.container import byte_windows
+from alidade.pipelines.recording.table_topics import of_yaw_pitch_roll
 from alidade.pipelines.recording.ulog import ENU_FROM_NED, Columns, columns, log_container
 
 # Messages: their kind and the number of the sensor.
@@ -155,9 +156,8 @@ def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
 
 def _attitude(data: Columns, offset: int) -> series.QuaternionSeries:
     """Return attitudes in ENU: yaw about down, then pitch about right, then roll about forward."""
-    turns = np.radians(columns(data, "Yaw", "Pitch", "Roll"))
-    about = [so3.exp(turns[:, i, None] * np.eye(3)[2 - i]) for i in range(3)]
-    return series.QuaternionSeries(_stamps(data, offset), so3.compose(ENU_FROM_NED, *about))
+    turned = of_yaw_pitch_roll(np.radians(columns(data, "Yaw", "Pitch", "Roll")))
+    return series.QuaternionSeries(_stamps(data, offset), so3.multiply(ENU_FROM_NED, turned))
 
 
 def _fix(data: Columns, offset: int) -> series.FixSeries:
