@@ -56,6 +56,8 @@ _KINDS: dict[str, type[series.Series]] = {
     "latitude_deg": series.FixSeries,
     "celsius": series.TemperatureSeries,
 }
+# Quantities that are columns of numbers.
+_NUMBERS = (*_KINDS, "position", "longitude_deg", "height")
 # Quantities that have units, and their SI units.
 _QUANTITIES = {"gyro": "rad/s", "accel": "m/s^2", "field": "T", "joints": "rad", "position": "m", "vector": "rad"}
 _QUANTITIES |= {"yaw_pitch_roll": "rad", "rotation_vector": "rad"}
@@ -275,8 +277,7 @@ class TableTopic(BaseModel):
 
 def of_yaw_pitch_roll(angles: Array) -> Array:
     """Quaternions (n, 4) of turns (n, 3) about z, the new y and the new x, rad."""
-    about_z, about_y, about_x = (so3.exp(angles[:, [i]] * axis) for i, axis in enumerate(np.eye(3)[::-1]))
-    return so3.multiply(so3.multiply(about_z, about_y), about_x)
+    return so3.compose(*(so3.exp(angles[:, [i]] * axis) for i, axis in enumerate(np.eye(3)[::-1])))
 
 
 def _measures(name: str, unit: str) -> bool:
@@ -306,12 +307,6 @@ def _without_erased(
     kept = len(t_ns) - int(np.argmin(alike[::-1])) if not alike.all() else 0
     notes.append(f"{path.name}: the last {len(t_ns) - kept} rows are all the same, as erased memory: left out")
     return t_ns[:kept], {name: one[:kept] for name, one in values.items()}
-
-
-_NUMBERS = (
-    *("gyro", "accel", "wxyz", "yaw_pitch_roll", "rotation_vector", "position", "field", "vector"),
-    *("latitude_deg", "longitude_deg", "height", "celsius"),
-)
 
 
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:
