@@ -32,9 +32,9 @@ UNITS = {unit: size for units in COMPATIBLE.values() for unit, size in units.ite
 TIME_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 # Other spellings, lower case, without blanks: `_plain` has made u of a micro sign and deg of a degree sign.
 _SPELLINGS = {
-    "rad/s": "rad/sec rads radps rads^-1 rad*s^-1 rads-1 radian/s radians/s rad_s rad.s^-1",
-    "deg/s": "dps deg/sec degs degps degree/s degrees/s degs^-1 deg_s deg.s^-1",
-    "mdeg/s": "mdps mdeg/sec",
+    "rad/s": "rad/s rad/sec rads radps rads^-1 rad*s^-1 rads-1 radian/s radians/s rad_s rad.s^-1",
+    "deg/s": "deg/s dps deg/sec degs degps degree/s degrees/s degs^-1 deg_s deg.s^-1",
+    "mdeg/s": "mdeg/s mdps mdeg/sec",
     "m/s^2": "m/s2 m/s/s mps2 ms^-2 m*s^-2 ms-2 ms2 m/sec^2 m/s**2 m_s2 m.s^-2 m/s^2",
     "g": "gs gravity gee g0",
     "mg": "milli-g millig",
@@ -66,9 +66,7 @@ _ENDINGS = ("dps", "mdps", "rads", "radps", "mps2", "ms2", "mg", "g", "ut", "nt"
 def unit_named(text: str) -> str:
     """Return the unit that a text names, as UNITS and TIME_UNITS spell it; empty for any other text."""
     plain = _plain(text)
-    if plain in UNITS or plain in TIME_UNITS:
-        return plain
-    return _KNOWN.get(plain.lower(), "") or next((unit for unit in UNITS if "/" in unit and unit == plain.lower()), "")
+    return plain if plain in UNITS or plain in TIME_UNITS else _KNOWN.get(plain.lower(), "")
 
 
 def unit_in(name: str) -> str:
