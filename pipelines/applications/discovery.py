@@ -113,8 +113,8 @@ def nearest_suggestion(found: Sequence[Suggestion]) -> str:
     lacks = f"; still missing: {'; '.join(best.missing)}" if best.missing else f", which `{by_name}--auto-topics` uses"
     if not best.topics:
         return f"for {best.method}: {'; '.join(best.reasons)}{lacks}"
-    topics = best.yaml.replace("\n  ", ", ").replace("topics:,", "topics: {", 1).replace("{ ", "{") + "}"
-    return f"for {best.method}: {'; '.join(best.reasons)}: `{topics}`{lacks}"
+    topics = flow_yaml({key: source.model_dump() for key, source in best.topics.items()})
+    return f"for {best.method}: {'; '.join(best.reasons)}: `topics: {topics}`{lacks}"
 
 
 def unused(recording: Recording, config: Config) -> tuple[str, ...]:
