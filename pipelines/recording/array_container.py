@@ -106,10 +106,7 @@ class ArrayContainer(Container):
     """Container of topics that are series in memory, encoded as CDR messages on reading.
 
     Args:
-        path: of the file or folder they were read from, as the user named it.
         topics: pictures are read from their iterable anew each time.
-        assumptions: sentences about what was assumed.
-        data: file they were read from; None: `path`.
         files: whose digests make that of the recording; none: `path` alone.
         log_ns: log times, Unix ns, of the topics whose messages were not recorded at their stamps.
     """

@@ -142,9 +142,7 @@ def check_time_unit(name: str, t_ns: NDArray[np.int64], slowest_s: float) -> Non
 def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
     """Return the factor (1e-3, 1e3, ...) that makes the median step of stamps, ns, plausible; None if none is needed.
 
-    Args:
-        t_ns: (N,), in order or not.
-        slowest_s: the longest usual step of such a sensor, s.
+    Stamps (N,) may be out of order; `slowest_s` is the longest usual step of such a sensor, s.
     """
     if len(t_ns) < _FEWEST_STEPS:
         return None

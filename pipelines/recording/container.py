@@ -170,9 +170,7 @@ class Container(ABC):
     def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
         """Return a sentence about each kind of loss, with its time in a session that starts at start_ns, Unix ns.
 
-        Args:
-            start_ns: None leaves out when the losses are.
-            duration_s: length of the session.
+        A start of None leaves out when the losses are; `duration_s` is the length of the session.
         """
         missing = self.missing
         messages = f"; messages lost: {', '.join(f'{n} of {topic}' for topic, n in missing.items())}" if missing else ""
@@ -253,9 +251,7 @@ class Container(ABC):
 class MultiPartContainer(Container):
     """Several files as one recording: parts of a bag that was split, or files recorded side by side.
 
-    Args:
-        path: folder, or first part.
-        parts: containers, in any order; they are read in the order of their first messages.
+    The parts are read in the order of their first messages; `path` is their folder, or the first of them.
     """
 
     def __init__(self, path: Path, parts: Sequence[Container]) -> None:  # counts and losses are those of the parts

@@ -305,9 +305,7 @@ class MessageFormat:
         """Yield a mapping from field path to number or word for each message of a block, whatever the type.
 
         LOG_TIME is the time at which a message was recorded, Unix ns, or its own field where the first one has it.
-
-        Raises:
-            MessageError: a message cannot be read.
+        Raises MessageError.
         """
         assert self._schema is not None
         parse = parser(self._recorded if self._wire else self._schema)

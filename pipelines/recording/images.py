@@ -176,12 +176,7 @@ def is_video(start: bytes) -> bool:
 class VideoFile:
     """Iterable of the pictures of an MP4 or AVI file as files in the Netpbm form, decoded anew on each iteration.
 
-    Args:
-        path: of the file.
-        count: pictures there have to be.
-
-    Raises:
-        InputError: it is no such file; when iterating, it cannot be decoded or has more or fewer pictures.
+    Raises InputError when it is no such file; when iterating, if it cannot be decoded or has not `count` pictures.
     """
 
     def __init__(self, path: Path, count: int) -> None:

@@ -90,10 +90,6 @@ class McapFile(Container):
 
     A chunk that is damaged within is found when it is first decompressed; until then it counts as readable.
 
-    Args:
-        path: of the file, as the user named it.
-        data: file to read instead.
-
     Raises InputError when there is no such file, when it is no MCAP, and when it is hostile: more definitions than any
     recording has, or a decompression bomb.
     """

@@ -78,10 +78,7 @@ def write_session(
 class McapOutput:
     """Writer of an MCAP file: header, attachments, definitions, chunks with their message indexes, summary.
 
-    Args:
-        stream: of the file.
-        attachments: name -> content.
-        time_ns: of the attachments, Unix ns.
+    Attachments, name -> content, have the time `time_ns`, Unix ns.
     """
 
     def __init__(self, stream: BinaryIO, attachments: Mapping[str, bytes], time_ns: int = 0) -> None:

@@ -31,13 +31,7 @@ _UNIX_NS = 10**17
 
 
 class MessageTable:
-    """Table of the messages of one topic.
-
-    Args:
-        container: where the messages are.
-        name: of the topic.
-        formats: of its channels.
-    """
+    """Table of the messages of the topic `name` of a container, with the formats of its channels by id."""
 
     def __init__(self, container: Container, name: str, formats: Mapping[int, MessageFormat]) -> None:
         self.name, self._container, self._formats = name, container, formats
@@ -72,14 +66,8 @@ class MessageTable:
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], Stamps]:
         """Return the named columns as texts (N,), empty where a message lacks the field, and log times (N,), Unix ns.
 
-        Between them the list of sentences about rows left out, as tables of files have it: there are none.
-
-        Args:
-            names: of the columns.
-            most: number of messages after which no more are looked at; None for all.
-
-        Raises:
-            InputError: a column is missing, or a message cannot be read.
+        Between them the list of sentences about rows left out, as tables of files have it: there are none. After `most`
+        messages no more are looked at. Raises InputError when a column is missing, or a message cannot be read.
         """
         wanted = [self.form.names[self.form.index(name)] for name in names]
         parts: list[list[NDArray[np.str_]]] = []
@@ -102,12 +90,7 @@ def _is_unix_ns(value: object) -> bool:
 
 
 class WithTables(MultiPartContainer):
-    """Recording that has, beside its own topics, those that the config describes as tables of its messages.
-
-    Args:
-        recorded: the recording.
-        made: topics of its messages.
-    """
+    """Recording that has, beside its own topics, those that the config describes as tables of its messages."""
 
     def __init__(self, recorded: Container, made: Container) -> None:
         parts = recorded.parts if isinstance(recorded, MultiPartContainer) else [recorded]

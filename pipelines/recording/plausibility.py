@@ -57,9 +57,7 @@ _PASSING_S, _ASIDE = 0.25, 5
 def implausible(kind: str, values: Array) -> str:
     """Return a phrase about readings (N, 3) that are implausible in their unit; empty if plausible, and for a gyro.
 
-    Args:
-        kind: accel, gyro or mag.
-        values: m/s^2, rad/s or T, as they should be; rows with NaN do not count.
+    They are of an accel, gyro or mag, and should be in m/s^2, rad/s or T; rows with NaN do not count.
     """
     if kind not in PLAUSIBLE:
         return ""
@@ -117,10 +115,7 @@ def to_signed(values: Array, bits: int) -> Array:
 def is_there(kind: str, values: Array, covariance: Array) -> bool:
     """Whether values (N, 3) in messages are measurements of a sensor, not filled in by a driver.
 
-    Args:
-        kind: accel or gyro.
-        values: as recorded.
-        covariance: (N, 3, 3) as recorded; one that begins with -1 says that there is no such sensor.
+    They are of an accel or gyro; a covariance (N, 3, 3) that begins with -1 says that there is no such sensor.
     """
     finite = values[np.isfinite(values).all(axis=1)]
     if not finite.any():
@@ -134,12 +129,7 @@ def is_there(kind: str, values: Array, covariance: Array) -> bool:
 def plausible_covariance(topic: str, kind: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
     """Return covariances (N, 3, 3) with zero in place of implausible ones, which are counted in `dropped`.
 
-    Args:
-        topic: for what is counted.
-        kind: a key of MOST_SIGMA.
-        covariance: of a sample each.
-        least: variance below which no sensor is.
-        dropped: reason -> samples, added to.
+    `kind` is a key of MOST_SIGMA, `least` the variance below which no sensor is.
     """
     # Those that never change are one in memory.
     alike = len(covariance) if len(covariance) and covariance.strides[0] == 0 else 1
@@ -161,13 +151,8 @@ def plausible_covariance(topic: str, kind: str, covariance: Array, least: float,
 def density(topic: str, kind: str, t: Array, covariance: Array, least: float, dropped: dict[str, int]) -> float | None:
     """Return the noise density, per sqrt(Hz), that covariances (N, 3, 3) of samples state; None if they state none.
 
-    Args:
-        topic: for what is counted.
-        kind: a key of MOST_SIGMA.
-        t: (N,) s.
-        covariance: as recorded.
-        least: density below which no sensor is.
-        dropped: reason -> samples, added to: what `plausible_covariance` leaves out.
+    The samples are at times t (N,), s; `kind` is a key of MOST_SIGMA, `least` the density below which no sensor is.
+    `dropped` counts what `plausible_covariance` leaves out.
     """
     step = float(np.median(np.diff(t)))
     covariance = plausible_covariance(topic, kind, covariance, least**2 / step, dropped)
@@ -208,11 +193,8 @@ def dead_band(t: Array, values: Array) -> tuple[float, Array]:
 
     Within a dead band a device reports one value. That is the value of far more samples of an axis than the values next
     to it. The half width is half of what readings change by while they pass through, on average. Beyond it a device
-    reports the rate or what is left of it: sides are -1 and 1 there, 0 within and without a dead band.
-
-    Args:
-        t: (N,) s.
-        values: in any unit.
+    reports the rate or what is left of it: sides are -1 and 1 there, 0 within and without a dead band. Times t (N,) are
+    in s, readings in any unit.
     """
     values = without_rounding(values)
     found = [value for column in values.T if (value := _one_value(column)) is not None]
@@ -229,11 +211,8 @@ def hidden(t: Array, half_width: float, side: Array) -> Array | None:
     """Density (N,) of what a gyro does not show within its dead band, rad/s/sqrt(Hz); None without one.
 
     The rate there, with the bias that rests hide, is uniform in the band and may be the same all the time. Over all the
-    time in it, T, white noise of the density half_width sqrt(T / 3) leaves its mean as uncertain as that.
-
-    Args:
-        t: (N,) s.
-        half_width, side: as `dead_band` has them.
+    time in it, T, white noise of the density half_width sqrt(T / 3) leaves its mean as uncertain as that. Times t (N,)
+    are in s, `half_width` and `side` as `dead_band` has them.
     """
     if not half_width:
         return None

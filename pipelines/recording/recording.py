@@ -232,10 +232,8 @@ class Recording:
     def read_together(self, topics: Mapping[str, Sequence[str]]) -> None:
         """Decode several topics in one pass over the file; the readers below then use the result.
 
-        A topic that has no numbers, or cannot be read, is left to the method, which says why.
-
-        Args:
-            topics: names, each with the joints that are needed if it is a sensor_msgs/JointState.
+        A topic that has no numbers, or cannot be read, is left to the method, which says why. Of a
+        sensor_msgs/JointState `topics` has the joints that are needed.
         """
         wanted = dict(topics)
         for name in wanted.keys() & self._sources.keys():

@@ -40,14 +40,7 @@ class _Chunk:
 
 
 class Ros1Bag(Container):
-    """ROS 1 bag as a container; the file is opened again for every read.
-
-    Args:
-        path: of the file, as it is named.
-        data: the file to read instead.
-
-    Raises InputError when it is hostile.
-    """
+    """ROS 1 bag as a container; the file is opened again for every read. Raises InputError when it is hostile."""
 
     def __init__(self, path: Path, data: Path | None = None) -> None:
         super().__init__(path, data)

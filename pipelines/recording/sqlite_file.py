@@ -32,10 +32,6 @@ _BLOCK, _MOST = 1 << 22, 8192
 class SqliteFile(Container):
     """A SQLite file as rosbag2 writes it; opened again for every read.
 
-    Args:
-        path: of the file, as it is named.
-        data: the file to read instead.
-
     Raises InputError when it cannot be opened or is no recording.
     """
 

@@ -107,7 +107,6 @@ class StreamReader:
     """Reads the sensors of a recording and counts the samples that cannot be used.
 
     Args:
-        recording: it.
         topics: names of topics that are decoded in one pass, each with the joints that are needed; those that are not
             there are ignored.
 
@@ -142,8 +141,6 @@ class StreamReader:
         """Return the samples of a series whose `quantities` (names of attributes) are finite and without faults.
 
         Args:
-            topic: for messages.
-            found: the series.
             quantities: (N, k) each; those of inertial sensors and magnetometers are screened.
             least: samples needed.
             slowest_s: longest usual step that such a sensor may have, s.
@@ -199,10 +196,7 @@ class StreamReader:
     def density(self, topic: str, kind: str, samples: Samples[AnySeries]) -> float | None:
         """Noise density, per sqrt(Hz), that the covariances of samples state; None if they state none.
 
-        Args:
-            topic: for what is counted.
-            kind: gyro, accel or mag.
-            samples: N >= 2.
+        The N >= 2 samples are of a `kind`: gyro, accel or mag.
         """
         attribute, least = _NOISE[kind]
         return plausibility.density(topic, kind, samples.t, getattr(samples.series, attribute), least, self.dropped)

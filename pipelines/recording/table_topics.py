@@ -164,9 +164,7 @@ class TableTopic(BaseModel):
         Rows without a number in any of its columns are left out. Raises InputError.
 
         Args:
-            topic: its name.
-            form: the table.
-            columns: texts of its columns, `names` at least.
+            columns: texts of the table's columns, `names` at least.
             logged: of a table of messages the log times, Unix ns.
         """
         path, given, notes = form.path, self._given, list[str]()

@@ -109,12 +109,7 @@ class TableForm(TableHead):
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
-    """Read a text file: a trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a table that the config describes.
-
-    Args:
-        path: as it was named.
-        data: the file to read.
-    """
+    """Read a text file: a trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a table that the config describes."""
     form = table_form(path, data)
     if not form.width:
         # A file that grows may still have one.
@@ -219,12 +214,8 @@ def read_columns(form: TableForm, names: Sequence[str], most: int | None = None)
     """Return the named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
-    are no rows; a last row that is cut short is left out, and so are others up to 1 % of all.
-
-    Args:
-        form: of the table.
-        names: of the columns.
-        most: number of rows at most that are looked at; None for all.
+    are no rows; a last row that is cut short is left out, and so are others up to 1 % of all. At
+    most `most` rows are looked at.
 
     Raises:
         InputError: a column is missing, or more rows are too short; the first of them is named.

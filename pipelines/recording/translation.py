@@ -61,12 +61,7 @@ def is_foxglove(name: str) -> bool:
 
 
 class Translation:
-    """Translates messages into CDR of a ROS 2 type. Raises MessageError.
-
-    Args:
-        recorded: what the messages are defined by: a schema, or a definition in ROS.
-        definition: of the ROS 2 type.
-    """
+    """Translates messages, defined by a schema or in ROS's own way, into CDR of a ROS 2 type. Raises MessageError."""
 
     def __init__(self, recorded: Schema | Definition, definition: Definition) -> None:
         self._definition = definition
