@@ -56,14 +56,7 @@ _STAMP = {
 }
 _COLUMNS: Mapping[str, Mapping[str, series.Column]] = {
     name: columns
-    for kind in (
-        series.ImuSeries,
-        series.MagneticSeries,
-        series.VectorSeries,
-        series.PoseSeries,
-        series.FixSeries,
-        series.TemperatureSeries,
-    )
+    for kind in series.Series.__subclasses__()
     for name, columns in ({kind.TYPE: kind.COLUMNS} | kind.OTHERS).items()
 }
 # Message types that become columns.
