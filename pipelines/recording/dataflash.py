@@ -99,16 +99,13 @@ def _messages(log: Any, codes: Mapping[str, Any], content: NDArray[np.uint8]) ->
             raise ValueError(f"the columns of {form.name} do not fill its messages")
         at = np.asarray(log.offsets[number], dtype=np.int64)
         read = byte_windows(content, form.len)[at[at + form.len <= len(content)]].view(dtype)
-        scales = (1.0 if scale is None else 1.0 / scale for scale in form.msg_mults)
-        data = {column: _scaled(read[column], per_unit) for column, per_unit in zip(form.columns, scales, strict=True)}
+        # Division by the whole number of counts per unit is exact to the last bit.
+        counts = (1 if scale is None else round(1.0 / scale) for scale in form.msg_mults)
+        each = zip(form.columns, counts, strict=True)
+        data = {column: read[column] if per_unit == 1 else read[column] / per_unit for column, per_unit in each}
         which = data.get("I", np.full(len(read), int(form.name.removeprefix(name) or 1) - 1))
         for instance in np.unique(which).tolist():
             yield (name, instance), {column: values[which == instance] for column, values in data.items()}
-
-
-def _scaled(values: NDArray[Any], per_unit: float) -> NDArray[Any]:
-    """Convert logged integers to units, exact to the last bit: division by the whole number of counts per unit."""
-    return values if per_unit == 1.0 else values / round(per_unit)
 
 
 def _topics(found: Mapping[Kind, Columns], offset: int) -> Iterator[tuple[str, series.Topic]]:
