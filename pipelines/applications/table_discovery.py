@@ -23,13 +23,12 @@ from alidade.pipelines.applications.table_times import Times
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import flow_yaml
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S
-from alidade.pipelines.recording.message_tables import message_tables
 from alidade.pipelines.recording.messages import IMU
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, PLAUSIBLE, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.table_topics import Table, TableTopic, tables_of
 from alidade.pipelines.recording.table_values import COMPATIBLE, UNITS, bare_name, unit_in, unit_of
-from alidade.pipelines.recording.tables import numbers
+from alidade.pipelines.recording.tables import message_tables, numbers
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
 

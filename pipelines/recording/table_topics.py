@@ -26,7 +26,6 @@ from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, MultiPartContainer
 from alidade.pipelines.recording.images import VideoFile
-from alidade.pipelines.recording.message_tables import MessageTable, WithTables, message_tables
 from alidade.pipelines.recording.table_values import (
     COMPATIBLE,
     TIME_UNITS,
@@ -36,7 +35,14 @@ from alidade.pipelines.recording.table_values import (
     of_rate,
     unit_of,
 )
-from alidade.pipelines.recording.tables import CsvFile, TableHead, numbers, numbers_or_times
+from alidade.pipelines.recording.tables import (
+    CsvFile,
+    MessageTable,
+    TableHead,
+    message_tables,
+    numbers,
+    numbers_or_times,
+)
 from alidade.pipelines.recording.topics import Axes, along
 
 # Rows of named columns: a text file, or the messages of a topic.
@@ -348,6 +354,20 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
         whole = WithTables(whole, ArrayContainer(container.path, of_messages, log_ns=logged))
     whole.assumptions = tuple(dict.fromkeys([*whole.assumptions, *notes]))
     return whole
+
+
+class WithTables(MultiPartContainer):
+    """Recording that has, beside its own topics, those that the config describes as tables of its messages."""
+
+    def __init__(self, recorded: Container, made: Container) -> None:
+        parts = recorded.parts if isinstance(recorded, MultiPartContainer) else [recorded]
+        super().__init__(recorded.path, [*parts, made])
+        self._recorded = recorded
+        self.assumptions, self.incomplete = recorded.assumptions, recorded.incomplete
+
+    def sha256(self) -> str:
+        """SHA-256 of the recording, hexadecimal."""
+        return self._recorded.sha256()
 
 
 def tables_of(container: Container) -> dict[str, CsvFile]:

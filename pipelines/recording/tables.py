@@ -1,8 +1,15 @@
-"""Tables as recordings: columns of numbers in a text file, however it is written, and trajectories in TUM's form.
+"""Tables: columns of numbers in a text file, however it is written, trajectories in TUM's form, messages of any type.
 
 How a table is written is read off its own lines: the delimiter and the decimal mark are those that make most of its
 cells numbers; the header is the last line of words ahead of the first row of numbers; what stands before it (names of
 devices, dates, comments) is the preamble. A line of units below the header belongs to it.
+
+Of messages, as a laboratory's own, each is a row, each number and word in it a column, described as those of a file:
+
+    columns:
+      /imu: {file: /fmu/out/sensor_combined, time: timestamp, unit: us, gyro: ['gyro_rad[0]', 'gyro_rad[1]', ...]}
+
+Their last column, log_time, is that of the times at which they were recorded, unless they have a field of that name.
 """
 
 from __future__ import annotations
@@ -13,16 +20,20 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.factors.array import Array
+from alidade.factors.array import Array, Stamps
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
+from alidade.pipelines.recording.container import Container, MessageBlock
+from alidade.pipelines.recording.decoding import FIRST_MESSAGES, LOG_TIME, MessageFormat, formats_of
+from alidade.pipelines.recording.messages import SENSORS, MessageError
 from alidade.pipelines.recording.table_values import TIME_NAME, bare_name, nanoseconds, unit_hinted, unit_in, unit_named
 
 # Texts of a table's cells by the names of their columns.
@@ -46,6 +57,10 @@ _COMMENTS = ("#", "//", "%")
 # What a cell without a number holds, lower case.
 _ABSENT = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
+# Bytes of a message beyond which its numbers are those of a picture or a scan; a pose with covariances has 400.
+_LARGEST_MESSAGE = 1 << 14
+# ns since 1970, of 1973.
+_UNIX_NS = 10**17
 _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|UTC|[+-]\d\d:?\d\d))?")
 
 
@@ -131,6 +146,60 @@ class CsvFile(ArrayContainer):
     def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], None]:
         """Return the named columns as texts, a sentence about each kind of row left out, and no log times."""
         return *read_columns(self.form, names, most), None
+
+
+class MessageTable:
+    """Table of the messages of the topic `name` of a container, with the formats of its channels by id."""
+
+    def __init__(self, container: Container, name: str, formats: Mapping[int, MessageFormat]) -> None:
+        self.name, self._container, self._formats = name, container, formats
+
+    @property
+    def is_proposed(self) -> bool:
+        """Whether `info` may propose columns for the topic: its message type is unknown and no message is a picture."""
+        is_small = self._first is not None and int(self._first.size.max(initial=0)) <= _LARGEST_MESSAGE
+        return is_small and not any(each.type in SENSORS for each in self._formats.values())
+
+    @cached_property
+    def form(self) -> TableHead:
+        """Names of the columns, those of the first messages. Raises InputError."""
+        path = self._container.path / self.name.strip("/")
+        first: dict[str, object] = {}
+        if self._first is not None:
+            try:
+                for cells in islice(self._formats[self._first.channel].cells(self._first), FIRST_MESSAGES):
+                    first = {**cells, **first}
+            except MessageError as error:
+                raise InputError(f"{self._container.path}: topic {self.name}: {error}") from error
+        if len(first) > MOST_COLUMNS:
+            raise InputError(f"{self._container.path}: topic {self.name}: its messages have {len(first)} fields")
+        names = tuple(sorted(first, key=lambda name: name == LOG_TIME))
+        return TableHead(path, names, tuple("ns" if _is_unix_ns(first[n]) else unit_in(n) for n in names), ())
+
+    @cached_property
+    def _first(self) -> MessageBlock | None:
+        """First block of messages; None without any."""
+        return next(self._container.blocks(set(self._formats)), None)
+
+    def read(self, names: Sequence[str], most: int | None = None) -> tuple[Columns, list[str], Stamps]:
+        """Return the named columns as texts (N,), empty where a message lacks the field, and log times (N,), Unix ns.
+
+        Between them the list of sentences about rows left out, as tables of files have it: there are none. After `most`
+        messages no more are looked at. Raises InputError when a column is missing, or a message cannot be read.
+        """
+        wanted = [self.form.names[self.form.index(name)] for name in names]
+        parts: list[list[NDArray[np.str_]]] = []
+        logged = [np.empty(0, np.int64)]
+        for block in self._container.blocks(set(self._formats)):
+            try:
+                parts.append(self._formats[block.channel].texts(block, wanted))
+            except MessageError as error:
+                raise InputError(f"{self._container.path}: topic {self.name}: {error}") from error
+            logged.append(block.log_ns)
+            if most is not None and sum(map(len, logged)) >= most:
+                break
+        texts = [np.concatenate(column) for column in zip(*parts, strict=True)] or [np.empty(0, np.str_)] * len(names)
+        return dict(zip(names, texts, strict=True)), [], np.concatenate(logged)
 
 
 def looks_like_text(start: bytes) -> bool:
@@ -402,3 +471,17 @@ def _trajectory(form: TableForm) -> series.PoseSeries | None:
     columns = dict(zip(_TUM, texts.values(), strict=True))
     position, xyzw = (numbers(form.path, columns, names) for names in (_TUM[1:4], _TUM[4:]))
     return series.PoseSeries(nanoseconds(form.path, columns["t"], "s"), xyzw[:, [3, 0, 1, 2]], position)
+
+
+def message_tables(container: Container) -> dict[str, MessageTable]:
+    """Return the topics of a recording as tables, by name."""
+    formats: dict[str, dict[int, MessageFormat]] = {}
+    for number, found in formats_of(container).items():
+        if found.is_parsed and container.counts.get(number):
+            formats.setdefault(container.channels[number].topic, {})[number] = found
+    return {name: MessageTable(container, name, own) for name, own in formats.items()}
+
+
+def _is_unix_ns(value: object) -> bool:
+    """Whether an integer is so large that it can only be a time in ns since 1970."""
+    return isinstance(value, int) and value > _UNIX_NS

@@ -22,10 +22,10 @@ from alidade.factors.array import Array
 from alidade.pipelines.applications.table_discovery import propose_columns
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.decoding import MessageFormat
-from alidade.pipelines.recording.message_tables import message_tables
 from alidade.pipelines.recording.opening import open_container
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.table_topics import TableTopic
+from alidade.pipelines.recording.tables import message_tables
 from tests.support.command import Command
 
 START = 1_700_000_000_000_000_000
