@@ -252,33 +252,29 @@ class _Table:
         imu = {kind: columns for kind, columns in named.items() if kind != "field"}
         together = all(clocks[kind] == clocks[other] for kind, other in pairwise(imu))
         alone = {"gyro": "/imu/gyro", "accel": "/imu/accel"} if self._file or self._rows or not together else {}
-        for kinds in filter(None, [list(imu)] if together else [[kind] for kind in imu]):
+        groups = [list(imu)] if together else [[kind] for kind in imu]
+        for kinds in filter(None, [*groups, [kind for kind in named if kind == "field"]]):
             own = {kind: units[kind] for kind in kinds if units[kind] and UNITS[units[kind]] != 1.0}
-            given = {kind: self._form.called(imu[kind]) for kind in kinds}
-            add(alone.get("".join(kinds), "/imu"), imu[kinds[0]], **given, units=own)
-        if "field" in named:
-            unit, field = units["field"], named["field"]
-            own = {"field": unit} if unit and UNITS[unit] != 1.0 else {}
-            add("/mag", field, field=self._form.called(field), units=own)
+            given = {kind: self._form.called(named[kind]) for kind in kinds}
+            topic = "/mag" if "field" in kinds else alone.get("".join(kinds), "/imu")
+            add(topic, named[kinds[0]], **given, units=own)
         attitude = "/vision/attitude" if _VISION.search(self.path.stem.lower()) else "/attitude"
         if wxyz := self._quaternion():
             add(attitude, wxyz, wxyz=self._form.called(wxyz))
         for key, angles in self._angles().items() if not wxyz else ():
             unit = self._unit(key, angles)
             add(attitude, angles, **{key: self._form.called(angles)}, units={key: unit} if unit == "deg" else {})
-        errors = self._first_of(_LOS_ERRORS)
-        if len(errors) == len(_LOS_ERRORS):
+        if errors := self._each_of(_LOS_ERRORS):
             (x, z), unit = self._form.called(errors), self._common_unit(errors)
             self.doubts.append(f"{self._where}{x} and {z} are angles, in {unit or 'rad'}, about x and z")
             add("/los/error", errors, vector=[x, None, z], units={"vector": unit} if unit in ("deg", "mrad") else {})
         for topic, joints in _JOINTS.items():
-            there = self._first_of([rf"^{joint}" for joint in joints])
-            if len(there) == len(joints):
+            if there := self._each_of([rf"^{joint}" for joint in joints]):
                 named_so = dict(zip(joints, self._form.called(there), strict=True))
                 add(topic, there, joints=named_so, units={"joints": "deg"} if self._common_unit(there) == "deg" else {})
-        if len(place := self._first_of(_PLACE)) == len(_PLACE):
+        if place := self._each_of(_PLACE):
             latitude, longitude = self._form.called(place)
-            height = next(iter(self._form.called(self._first_of([r"^(alt|height|elev)"]))), "")
+            height = next(iter(self._form.called(self._each_of([r"^(alt|height|elev)"]))), "")
             add("/fix", place, latitude_deg=latitude, longitude_deg=longitude, height=height)
         for topic, table in out.items():
             has = [kind for kind in (*_WORDS, *_OTHERS) if getattr(table, kind)]
@@ -294,11 +290,12 @@ class _Table:
         except InputError:
             return np.full(len(self._texts[i]), np.nan)
 
-    def _first_of(self, words: Sequence[str]) -> list[int]:
-        """Return the first column that each word is in the name of, without those that are in none."""
+    def _each_of(self, words: Sequence[str]) -> list[int]:
+        """Return the first column that each word is in the name of; none where one is in no name."""
         names = [bare_name(name) for name in self._form.names]
         found = (next((i for i, name in enumerate(names) if re.search(word, name)), None) for word in words)
-        return [i for i in found if i is not None]
+        columns = [i for i in found if i is not None]
+        return columns if len(columns) == len(words) else []
 
     def _common_unit(self, columns: Sequence[int], kind: str = "") -> str:
         """Return the unit that all columns have by their header, as a kind of sensor's; empty where they differ."""
@@ -330,9 +327,9 @@ class _Table:
             if "covariance" in name:
                 continue
             kind = _kind(name) or self._kind_of_units(columns)
-            if self._sensor and not len(self._norms(columns)):
-                continue
             norms, size = self._norms(columns), UNITS.get(self._common_unit(columns, kind))
+            if self._sensor and not len(norms):
+                continue
             if len(norms) > 1 and not any(np.ptp(self._values[i]) for i in columns):
                 continue  # a placeholder
             if (
@@ -427,9 +424,9 @@ class _Table:
 
     def _angles(self) -> dict[str, Sequence[int]]:
         """Return the columns of yaw, pitch and roll, or of a rotation vector in rad or deg, by their config key."""
-        columns: Sequence[int] = self._first_of(_ANGLES)
+        columns: Sequence[int] = self._each_of(_ANGLES)
         key, how = "yaw_pitch_roll", "turns about z, the new y and the new x"
-        if len(columns) < len(_ANGLES):
+        if not columns:
             triads = [triad for name, triad in _along_axes(self._form.names) if _ROTATION_VECTOR.search(name)]
             columns = next((triad for triad in triads if self._common_unit(triad) in ("rad", "deg")), ())
             key, how = "rotation_vector", "axis times angle"
