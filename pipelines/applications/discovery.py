@@ -40,13 +40,10 @@ _DELAY = 0.002
 
 @dataclass(frozen=True)
 class Suggestion:
-    """The topics that a method could read in a recording.
+    """The topics that a method could read in a recording, with reasons, and what would still be missing.
 
     Attributes:
-        method: its name.
         topics: key in the config -> where it could come from; the keys that are lacking alone.
-        reasons: sentences about why.
-        missing: what would still be lacking.
         has_to_be_asked_for: whether it serves only where the method is named.
     """
 

@@ -198,7 +198,6 @@ class _Table:
     """Sensors, units and time that are recognised in one table, or in its rows that have a word in a column.
 
     Args:
-        table: of the columns.
         is_named: whether there are other tables.
         texts: (n,) of each column, its first rows or those of the word.
         rows: that column and the word, which names their sensor.

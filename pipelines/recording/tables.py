@@ -69,7 +69,6 @@ class TableHead:
     """Names and units of the columns of a table of sensor readings, and the lines above the table.
 
     Attributes:
-        path: of the table, as it was named.
         names: of its columns; `column 1` and so on where it has no header.
         units: of its columns as the header has them, in the words of `table_values.UNITS`; empty where it says nothing.
         preamble: what stands ahead of the header.
@@ -107,8 +106,6 @@ class TableForm(TableHead):
     """Format of a table in a text file: encoding, delimiter, decimal mark, columns.
 
     Attributes:
-        data: the file to read.
-        encoding: of its text.
         delimiter: between cells; a blank stands for one or more.
         decimal: mark of a fraction, a point or a comma.
         first: number of lines ahead of its first row.
