@@ -217,12 +217,6 @@ class _Table:
         self._values = [self._numbers(i) for i in range(len(texts))]
         self._times = Times(self._form, self._texts, self._values, self._where, self.reasons, self.doubts)
 
-    @property
-    def _names(self) -> list[str]:
-        """Names of the table's columns; empty for those without numbers in the rows of one sensor."""
-        has = [not self._sensor or bool(np.isfinite(values).any()) for values in self._values]
-        return [name if there else "" for name, there in zip(self._form.names, has, strict=True)]
-
     def columns_of_words(self) -> list[int]:
         """Return the columns that hold a few words and no numbers; none where headers name the sensors."""
         if any(_kind(name) for name, _ in _along_axes(self._form.names)):
@@ -304,7 +298,9 @@ class _Table:
     def _triads(self) -> dict[str, tuple[int, ...]]:
         """Return kind -> columns along x, y, z: by names, as a file's only three, or, without a header, by numbers."""
         out: dict[str, tuple[int, ...]] = {}
-        along = _along_axes(self._names)
+        # Columns without numbers in the rows of one sensor are another's.
+        own = [not self._sensor or bool(np.isfinite(values).any()) for values in self._values]
+        along = _along_axes([name if is_own else "" for name, is_own in zip(self._form.names, own, strict=True)])
         first = 1 if self._times.increases(0) else 0
         if self._form.names[0] == "column 1" and len(self._values) == first + 3 and _kind(self.path.stem.lower()):
             along = [("", (first, first + 1, first + 2))]
@@ -325,7 +321,8 @@ class _Table:
             name = f"{self._sensor} {name}".strip().lower() or self.path.stem.lower()
             if "covariance" in name:
                 continue
-            kind = _kind(name) or self._kind_of_units(columns)
+            units = self._common_unit(columns)
+            kind = _kind(name) or next((kind for kind, si in _SI.items() if units in COMPATIBLE[si]), "")
             norms, size = self._norms(columns), UNITS.get(self._common_unit(columns, kind))
             if self._sensor and not len(norms):
                 continue
@@ -355,11 +352,6 @@ class _Table:
         return not (
             ros and _SIZES["accel"]["m/s^2"][0] < float(np.median(self._norms(columns))) < PLAUSIBLE["accel"][1]
         )
-
-    def _kind_of_units(self, columns: Sequence[int]) -> str:
-        """Return the kind of sensor that measures in the unit of three columns; empty for none."""
-        units = self._common_unit(columns)
-        return next((kind for kind, si in _SI.items() if units in COMPATIBLE[si]), "")
 
     def _norms(self, columns: Sequence[int]) -> Array:
         norms = np.linalg.norm(np.stack([self._values[i] for i in columns]), axis=0)

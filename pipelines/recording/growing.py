@@ -125,7 +125,9 @@ class GrowingFiles:
         """Return the recording so far: all of it, or what was logged since a time, Unix ns. Raises InputError."""
         files: list[Container] = []
         for path in paths:
-            if not _is_mcap(path):
+            with path.open("rb") as stream:
+                is_mcap = stream.read(len(MAGIC)) == MAGIC
+            if not is_mcap:
                 files.append(open_container(path))
                 continue
             if path not in self._files:
@@ -150,8 +152,3 @@ def _compact(block: MessageBlock) -> MessageBlock:
         data = byte_windows(block.buffer, size)[block.start].view(np.uint8)
         return block._replace(buffer=data, start=size * np.arange(len(block.size)))
     return MessageBlock.pack(block.channel, [block.message(i) for i in range(len(block.size))], block.log_ns)
-
-
-def _is_mcap(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(len(MAGIC)) == MAGIC

@@ -171,7 +171,9 @@ class MessageTable:
         if len(first) > MOST_COLUMNS:
             raise InputError(f"{self._container.path}: topic {self.name}: its messages have {len(first)} fields")
         names = tuple(sorted(first, key=lambda name: name == LOG_TIME))
-        return TableHead(path, names, tuple("ns" if _is_unix_ns(first[n]) else unit_in(n) for n in names), ())
+        # Integers so large can only be times in ns since 1970.
+        times = {name for name, value in first.items() if isinstance(value, int) and value > _UNIX_NS}
+        return TableHead(path, names, tuple("ns" if name in times else unit_in(name) for name in names), ())
 
     @cached_property
     def _first(self) -> MessageBlock | None:
@@ -477,8 +479,3 @@ def message_tables(container: Container) -> dict[str, MessageTable]:
         if found.is_parsed and container.counts.get(number):
             formats.setdefault(container.channels[number].topic, {})[number] = found
     return {name: MessageTable(container, name, own) for name, own in formats.items()}
-
-
-def _is_unix_ns(value: object) -> bool:
-    """Whether an integer is so large that it can only be a time in ns since 1970."""
-    return isinstance(value, int) and value > _UNIX_NS
