@@ -130,26 +130,20 @@ class StreamReader:
         return checks.clean(topic, t_ns, self.epoch_ns, values, self.dropped, least)
 
     def samples(
-        self,
-        topic: str,
-        found: AnySeries,
-        *quantities: str,
-        least: int = 2,
-        slowest_s: float = SLOWEST_S,
-        may_be_constant: bool = False,
+        self, topic: str, found: AnySeries, *quantities: str, least: int = 2, may_be_constant: bool = False
     ) -> Samples[AnySeries]:
         """Return the samples of a series whose `quantities` (names of attributes) are finite and without faults.
 
         Args:
             quantities: (N, k) each; those of inertial sensors and magnetometers are screened.
             least: samples needed.
-            slowest_s: longest usual step that such a sensor may have, s.
             may_be_constant: whether all axes may read the same throughout.
         """
         self.count(topic, "stamped by log time (kept)", found.stamped_by_log)
         for name in () if may_be_constant else quantities:
             _check_recorded(topic, found, name)
         values = np.concatenate([getattr(found, name).reshape(len(found), -1) for name in quantities], axis=1)
+        slowest_s = SLOWEST_GYRO_S if "gyro" in quantities else SLOWEST_S
         t, rows = checks.clean(topic, found.t_ns, self.epoch_ns, values, self.dropped, least, slowest_s)
         del values
         samples = Samples(t, _rows(found, rows))
@@ -165,14 +159,8 @@ class StreamReader:
 
         `may_be_constant`: a parked platform may read zero throughout, by a simulator or a driver that cuts off noise.
         """
-        samples = self.samples(
-            topic,
-            self.recording.imu(topic),
-            "gyro",
-            least=least,
-            slowest_s=SLOWEST_GYRO_S,
-            may_be_constant=may_be_constant,
-        )
+        imu = self.recording.imu(topic)
+        samples = self.samples(topic, imu, "gyro", least=least, may_be_constant=may_be_constant)
         checks.check_gyro(topic, samples.t, samples.series.gyro)
         return samples
 

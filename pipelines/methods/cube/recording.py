@@ -18,7 +18,7 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.methods.place import field_at, known_field, place_topics, read_place
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, check_overlap, nanoseconds
+from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Fields, Forces, Numbers, Quaternions, Rates
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series, white_covariance
@@ -244,7 +244,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
 
     reader = StreamReader(recording, dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic(IMU)
-    imu = reader.samples(name, recording.imu(name), "gyro", "accel", least=3, slowest_s=SLOWEST_GYRO_S)
+    imu = reader.samples(name, recording.imu(name), "gyro", "accel", least=3)
     raw = config.section(CubeConfig).raw
     sensors = [
         Readings(name, imu.t, imu.series.accel, raw.accel),
