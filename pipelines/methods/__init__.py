@@ -10,6 +10,7 @@ of their own as entry points of the group `alidade.commands`, word = "module:fun
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -157,9 +158,13 @@ class Method:
 
         Raises InputError when the file cannot be written.
         """
-        from alidade.pipelines.recording.mcap_writer import attached, write_session
+        from alidade.pipelines.recording.mcap_writer import write_session
+        from alidade.pipelines.settings import ATTACHMENT, TRUTH
 
-        write_session(path, self.to_topics(data, pictures), attached(truth, config_yaml))
+        attachments = {} if config_yaml is None else {ATTACHMENT: config_yaml.encode()}
+        if truth is not None:
+            attachments[TRUTH] = json.dumps(dict(truth), indent=1).encode()
+        write_session(path, self.to_topics(data, pictures), attachments)
 
     def settings(self, scenario: str | None = None, images: bool = False) -> Any:
         """Simulator settings of a scenario, by name or file; None: the default scenario, or the model's defaults

@@ -6,7 +6,6 @@ put together from blocks; the records around the chunks are the package's.
 
 from __future__ import annotations
 
-import json
 import struct
 import zlib
 from collections.abc import Mapping
@@ -27,23 +26,12 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import encode_series, ros2_schema
 from alidade.pipelines.recording.container import MessageBlock, Schema, byte_windows
 from alidade.pipelines.recording.mcap_records import AFTER_LENGTH, MAGIC, MESSAGE_HEAD
-from alidade.pipelines.settings import ATTACHMENT, TRUTH
 
 # Bytes of a chunk before compression.
 CHUNK_BYTES = 1 << 20
 # Of zstd: noise does not compress better at higher ones.
 _LEVEL = 1
 _MEDIA = {".yaml": "application/yaml", ".json": "application/json"}
-
-
-def attached(truth: Mapping[str, float] | None, config_yaml: str | None) -> dict[str, bytes]:
-    """Return a recording's attachments, name -> content: its config and the true parameter values, where given."""
-    attachments = {}
-    if config_yaml is not None:
-        attachments[ATTACHMENT] = config_yaml.encode()
-    if truth is not None:
-        attachments[TRUTH] = json.dumps(dict(truth), indent=1).encode()
-    return attachments
 
 
 def write_session(
