@@ -103,25 +103,20 @@ def _file(pixels: Pixels) -> bytes:
 
 def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
     """Yield pictures as (stamp in ns, file); raw ones and frames of a video become files in the Netpbm form."""
-    return ((t_ns, file) for t_ns, file in _files(messages, is_raw) if t_ns is not None)
-
-
-def _files(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int | None, bytes]]:
-    """Yield a picture for each message; its stamp is None where the message is left out."""
-    files = (_packet(message, is_raw) for message in messages)
-    for t_ns, form, data in files:
+    packets = (_packet(message, is_raw) for message in messages)
+    for t_ns, form, data in packets:
         if form in ANNEX_B or form in BY_PYAV:
-            packets = itertools.chain([(t_ns, data)], ((t_ns, data) for t_ns, _, data in files))
+            video = itertools.chain([(t_ns, data)], ((t_ns, data) for t_ns, _, data in packets))
             try:
-                yield from decode_video(packets, form)
+                yield from ((stamp, file) for stamp, file in decode_video(video, form) if stamp is not None)
             except ValueError as error:
                 raise MessageError(str(error)) from error
-            return
-        yield t_ns, data
+        elif t_ns is not None:
+            yield t_ns, data
 
 
 def _packet(message: DecodedMessage, is_raw: bool) -> tuple[int | None, str, bytes]:
-    """Return a message's stamp, ns, its format, and its picture as a file, or its packet of a video."""
+    """Return a message's stamp, ns (None: left out), format, and picture as a file, or packet of a video."""
     found, t_ns = message.content, None if message.left_out else message.t_ns
     if is_raw:
         return t_ns, "netpbm", netpbm(found)
