@@ -77,19 +77,12 @@ def group_recordings(paths: Sequence[Path]) -> list[Where]:
 
     Folders and patterns stand for all of their parts.
     """
-    found: list[list[Path]] = []
-    bags: dict[Path, list[Path]] = {}
-    for path in paths:
+    found: dict[Path | int, list[Path]] = {}  # by bag, or by place in the list
+    for i, path in enumerate(paths):
         metadata = path.parent / METADATA
-        if path.is_file() and path.name in parts_of_bag(_metadata(metadata)):
-            bag = metadata.resolve()
-            if bag in bags:
-                bags[bag].append(path)
-                continue
-            found.append(bags.setdefault(bag, [path]))
-        else:
-            found.append([path])
-    return [parts[0] if len(parts) == 1 else parts for parts in found]
+        is_part = path.is_file() and path.name in parts_of_bag(_metadata(metadata))
+        found.setdefault(metadata.resolve() if is_part else i, []).append(path)
+    return [parts[0] if len(parts) == 1 else parts for parts in found.values()]
 
 
 def describe_recordings(recordings: Sequence[Where]) -> str:
