@@ -13,7 +13,7 @@ triggers them. Where log times are as even as the stamps (simulated, or written 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +99,8 @@ def clean(
     if not len(keep):
         raise InputError(f"topic {topic}: every one of the {len(t_ns)} messages has a NaN or infinite value")
     in_file = t_ns[keep]
-    backward = int(np.count_nonzero(in_file < np.maximum.accumulate(in_file)))
+    late = in_file < np.maximum.accumulate(in_file)
+    backward = int(np.count_nonzero(late))
     keep = keep[np.argsort(in_file, kind="stable")]
     copies = _copies(t_ns[keep], take_rows(values, keep))
     count(dropped, f"{topic}{COPIED}", int(np.count_nonzero(copies)))
@@ -108,13 +109,16 @@ def clean(
     first = np.diff(stamps, prepend=np.iinfo(np.int64).min // 2) > 0
     duplicate = int(np.count_nonzero(~first))
     overtaken = backward and _is_overtaking(in_file, stamps[first])
-    for what, number in (("out of order", 0 if overtaken else backward), ("duplicate", duplicate)):
+    for what, number, at_ns in (
+        ("out of order", 0 if overtaken else backward, in_file[np.argmax(late)]),
+        ("duplicate", duplicate, stamps[np.argmin(first)]),
+    ):
         if number > MAX_BAD_STAMPS * len(in_file):
             mixed = "" if number < _TWO_DEVICES * len(in_file) or what != "duplicate" else _MIXED
-            at = _first_bad(in_file if what == "out of order" else stamps, epoch_ns, what)
             raise InputError(
-                f"topic {topic}: {number} of {len(in_file)} stamps are {what} (the first at {at:.6f} s from the "
-                f"start); the stamps have to be those of the measurements{_ADVICE[what]}{mixed}"
+                f"topic {topic}: {number} of {len(in_file)} stamps are {what} (the first at "
+                f"{float(at_ns - epoch_ns) * 1e-9:.6f} s from the start); the stamps have to be those of the "
+                f"measurements{_ADVICE[what]}{mixed}"
             )
     count(dropped, f"{topic}: stamp out of order (sorted, kept)", backward)
     if overtaken and backward > MAX_BAD_STAMPS * len(in_file):
@@ -246,15 +250,6 @@ def _is_overtaking(in_file: NDArray[np.int64], stamps: NDArray[np.int64]) -> boo
     usual = float(np.median(steps))
     late = float((np.maximum.accumulate(in_file) - in_file).max())
     return late <= _OVERTAKING_STEPS * usual and bool(np.mean(np.abs(steps - usual) <= _EVEN * usual) >= _EVEN_SHARE)
-
-
-def _first_bad(stamps: Stamps, epoch_ns: int, what: str) -> float:
-    if what == "duplicate":
-        order = np.argsort(stamps, kind="stable")
-        i: Any = order[1 + np.argmax(np.diff(stamps[order]) == 0)]
-    else:
-        i = np.argmax(stamps < np.maximum.accumulate(stamps))
-    return float(stamps[i] - epoch_ns) * 1e-9
 
 
 class Step(NamedTuple):
