@@ -259,18 +259,12 @@ class MultiPartContainer(Container):
         self.parts = sorted(parts, key=lambda part: part.first_log_ns)
         self.assumptions = self._named("assumptions")
         self.incomplete = self._named("incomplete")
-        self.channels = {
-            i * _ID_RANGE + number: channel._replace(
-                id=i * _ID_RANGE + number, schema_id=i * _ID_RANGE + channel.schema_id
-            )
-            for i, part in enumerate(self.parts)
-            for number, channel in part.channels.items()
-        }
-        self.schemas = {
-            i * _ID_RANGE + number: schema
-            for i, part in enumerate(self.parts)
-            for number, schema in part.schemas.items()
-        }
+        self.channels, self.schemas = {}, {}
+        for i, part in enumerate(self.parts):
+            at = i * _ID_RANGE
+            for number, channel in part.channels.items():
+                self.channels[at + number] = channel._replace(id=at + number, schema_id=at + channel.schema_id)
+            self.schemas |= {at + number: schema for number, schema in part.schemas.items()}
 
     @property
     def counts(self) -> dict[int, int]:  # type: ignore[override]
