@@ -26,8 +26,8 @@ from alidade.pipelines.recording.checks import MAX_RATE_RAD_S
 from alidade.pipelines.recording.messages import IMU
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, PLAUSIBLE, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
-from alidade.pipelines.recording.table_topics import Table, TableTopic, tables_of
-from alidade.pipelines.recording.table_values import COMPATIBLE, UNITS, bare_name, unit_in, unit_of
+from alidade.pipelines.recording.table_topics import Table, TableTopic, measures, tables_of
+from alidade.pipelines.recording.table_values import UNITS, bare_name, unit_in, unit_of
 from alidade.pipelines.recording.tables import message_tables, numbers
 from alidade.pipelines.recording.topics import TopicSource
 from alidade.pipelines.settings import Config
@@ -38,8 +38,6 @@ _WORDS = {
     "accel": r"acc(?!ur|ept)|^a(?=_|$)|specific.?force|^f(?=_|$)|^g.?f(?=_|$|orce)",
     "field": r"mag|^m(?=_|$)|^b(?=_|$)|^h(?=_|$)|field",
 }
-# SI units of the sensors.
-_SI = {"gyro": "rad/s", "accel": "m/s^2", "field": "T"}
 _LINEAR = re.compile(r"lin|free|user|without.?g|gravity|acceleration.?no.?g")
 _VISION = re.compile(r"vision|visual|pose|mocap|vicon|optitrack|tracker|ground|trajectory")
 # Median norms, in a unit; of an accelerometer gravity, of a magnetometer the earth's field and some iron.
@@ -109,16 +107,15 @@ def propose_columns(recording: Recording) -> Columns | None:
     Messages of types that are not known count as tables where they have something that is.
     """
     files = tables_of(recording.container)
-    found = [one for table in files.values() for one in _sensors(table, len(files) > 1)]
-    made = [one.topics() for one in found]
+    found = [(one, one.topics()) for table in files.values() for one in _sensors(table, len(files) > 1)]
     for table in message_tables(recording.container).values():
         with suppress(InputError):  # what cannot be read is no proposal
             if table.is_proposed:
                 one = _whole(table, True)
                 if topics := one.topics():
-                    found, made = [*found, one], [*made, topics]
+                    found.append((one, topics))
     columns: dict[str, TableTopic] = {}
-    for one, topics in zip(found, made, strict=True):
+    for one, topics in found:
         for topic, described in topics.items():
             same = columns.get(topic)
             if same is not None and same.file == described.file and described.where:
@@ -135,8 +132,8 @@ def propose_columns(recording: Recording) -> Columns | None:
     recorded = any(each.type == IMU for each in recording.topics.values())
     if len(gyros) + len(accels) == 1 and "/imu" not in columns and not recorded:
         sources = {"imu": TopicSource(topic=(gyros or accels)[0])}
-    reasons = tuple(reason for one in found for reason in one.reasons)
-    return Columns(columns, sources, reasons, tuple(doubt for one in found for doubt in one.doubts))
+    reasons = tuple(reason for one, _ in found for reason in one.reasons)
+    return Columns(columns, sources, reasons, tuple(doubt for one, _ in found for doubt in one.doubts))
 
 
 def with_columns(recording: Recording, config: Config) -> tuple[Recording, Config]:
@@ -322,7 +319,7 @@ class _Table:
             if "covariance" in name:
                 continue
             units = self._common_unit(columns)
-            kind = _kind(name) or next((kind for kind, si in _SI.items() if units in COMPATIBLE[si]), "")
+            kind = _kind(name) or next((kind for kind in _WORDS if measures(kind, units)), "")
             norms, size = self._norms(columns), UNITS.get(self._common_unit(columns, kind))
             if self._sensor and not len(norms):
                 continue

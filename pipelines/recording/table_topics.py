@@ -143,7 +143,7 @@ class TableTopic(BaseModel):
         for name, unit in self.units.items():
             if name not in _QUANTITIES:
                 raise ValueError(f"units.{name}: only {', '.join(_QUANTITIES)} have units")
-            if not _measures(name, unit):
+            if not measures(name, unit):
                 known = ", ".join(COMPATIBLE[_QUANTITIES[name]])
                 raise ValueError(f"units.{name}: {unit} is not one of {known}; counts have no entry in units")
         for name in {*kinds} & {*_VECTORS}:
@@ -273,7 +273,7 @@ class TableTopic(BaseModel):
             return UNITS[self.units[name]]
         stated = {unit_of(name, form.units[form.index(column)]) for column in self._columns(name)}
         (unit,) = stated if len(stated) == 1 else ("",)
-        if unit not in UNITS or not _measures(name, unit) or UNITS[unit] == 1.0:
+        if unit not in UNITS or not measures(name, unit) or UNITS[unit] == 1.0:
             return 1.0
         notes.append(f"{form.path.name}: {name} is in {unit} by its header")
         return UNITS[unit]
@@ -284,7 +284,7 @@ def of_yaw_pitch_roll(angles: Array) -> Array:
     return so3.compose(*(so3.exp(angles[:, [i]] * axis) for i, axis in enumerate(np.eye(3)[::-1])))
 
 
-def _measures(name: str, unit: str) -> bool:
+def measures(name: str, unit: str) -> bool:
     """Whether a unit is one that the quantity `name` can have."""
     return name in _QUANTITIES and unit in COMPATIBLE[_QUANTITIES[name]]
 
