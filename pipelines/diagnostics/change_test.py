@@ -26,9 +26,6 @@ from alidade.pipelines.estimation.widening import by_wider_priors, widened
 
 # Probability of calling a recording changed in which nothing changed.
 LEVEL = 1e-3
-# The same of a mean bias: errors of motion capture last longer than the blocks that show them. Of 49 healthy parts of
-# BROAD trials, altered, one had a p-value of 6e-5; a step of .5 deg/s has 1e-5 to 1e-16.
-_OF_A_MEAN = 1e-5
 # Most paths drawn, a batch at a time; so many that reach the largest difference give its p-value to a tenth (Besag and
 # Clifford 1991), and no more are drawn.
 _PATHS, _BATCH, _REACHING = 4000, 500, 100
@@ -141,7 +138,7 @@ def offset_finding(step: OffsetStep, quantities: Sequence[Quantity]) -> Finding 
     WEAK if it is material: a mean of what changed is right for no part of the recording.
     """
     steps = _significant(step.steps, 1.0)
-    if step.level >= _OF_A_MEAN or not steps:
+    if step.level >= LEVEL or not steps:
         return None
     required = {q.name: q.require for q in quantities}
     material = any(abs(size) - _SURE * sigma > _MATERIAL * required[name] for name, (size, sigma) in steps.items())

@@ -49,7 +49,6 @@ from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import innovations_of, sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
 from alidade.pipelines.solvers.offset_step import largest_offset_step
-from alidade.pipelines.solvers.offset_step_of_chain import largest_offset_step_of_chain
 from alidade.pipelines.solvers.posterior import Reported, chi_square, leverages, moved_to, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
 from alidade.pipelines.solvers.robust import solve_robust, solve_truncated, without_onsets
@@ -258,7 +257,7 @@ def whole_estimate(
         innovations = innovations_of(compiled, solved.levels, solved.solution) if budget else innovations
         if steps:
             largest = largest_steps(compiled, solved.levels, solved.solution)
-            offset_step = largest_offset_step_of_chain(compiled, solved.levels, solved.solution)
+            offset_step = largest_offset_step(compiled, solved.solution, solved.levels)
         widened = slow_widening(sandwich, len(names))
         wide, covariance = by * widened, covariance * np.outer(widened, widened)
     elif steps:

@@ -31,7 +31,7 @@ from alidade.pipelines.solvers.chain import UNDETERMINED, IndeterminateStateErro
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import certain_ratio, sigma_ratio
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize, states_first
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Point, Solution, minimize, states_first
 from alidade.pipelines.solvers.linear_chain import LinearChain, LinearSolution, Widening
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.noise_estimation import apply_levels
@@ -528,7 +528,7 @@ def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution)
     return np.where(ratio > certain_ratio(blocks), np.maximum(ratio, 1.0), 1.0)
 
 
-def chain_about(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> tuple[LinearChain, list[Array]]:
+def chain_about(compiled: Compiled, levels: Sequence[Level], solution: Point) -> tuple[LinearChain, list[Array]]:
     """Linearise the chain about a solution; return it and the variances (n,) of each kind of rows."""
     chain = LinearChain.of(compiled.engine, solution.values)
     return chain, chain.variances(levels, unwidened(solution.engine.inliers(solution.values)), NO_SAY)

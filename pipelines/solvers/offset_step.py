@@ -1,148 +1,204 @@
-"""Test for a step of offsets at one moment, in graphs of shared unknowns alone: hard iron that moved.
+"""Test for a step of offsets at one moment: hard iron that moved, a gyro bias that jumped.
 
-A robust loss rejects what was recorded before a step as outliers, and coloured residuals widen sigmas until it passes.
-So the test takes all measurements, each with Huber's weight, and the covariance of the step d from the steps d_b found
-when one block of the recording is left out (delete-a-block jackknife: Künsch, "The jackknife and the bootstrap for
-general stationary observations", Annals of Statistics 17, 1989):
+The rows of all measurements are summed in pieces, before and after a moment (Andrews, "Tests for parameter instability
+and structural change with unknown change point", Econometrica 61, 1993). In a graph without states they are residuals,
+in a chain of states innovations with their derivatives by the shared unknowns. All have Huber's weight: a robust loss
+rejects what was recorded before a step as outliers. The moment is that of the largest fall of chi-square.
 
-    covariance of d = (n - 1) / n sum over n blocks of (d_b - d) (d_b - d)',     at least that of white noise
+The covariance W of the step d holds for white noise. With the steps d_b found when one block of the recording is left
+out (delete-a-block jackknife: Künsch, "The jackknife and the bootstrap for general stationary observations", Annals of
+Statistics 17, 1989), the ratio r of actual to white sigmas of q offsets, pooled and along d, is
 
-The device turns equally far in all blocks: while it rests it repeats one error, which no block would show. The moment
-is that of the largest fall of chi-square. Of few blocks the chi-square of d is Hotelling's T^2, with the degrees of
-freedom of a difference of two means (Welch 1947), tested at the level over the number of blocks (Bonferroni): within a
-block all steps look alike.
+    J = (n - 1) / n sum over n blocks of (d_b - d) (d_b - d)'
+    r^2 = max(1, trace(W^-1 J) / q, d' W^-1 J W^-1 d / d' W^-1 d)
 
-Limits: blocks have to be longer than residuals are correlated. The first and the last fifth of what a device turns have
-no moments.
+and d' W^-1 d / (q r^2) is F-distributed. Each offset adds the degrees of freedom of a difference of two means (Welch
+1947). The p-value is that of one moment times the number of blocks (Bonferroni): within a block all steps look alike.
+
+Residuals at rest repeat one error, which no block would show: in all blocks the device turns equally far. Innovations
+at rest are new information: all blocks have equally many rows.
+
+Priors of the offsets have no say, since one that the recording contradicts would ask for a step. Those of the other
+unknowns have, which may not be determined without.
+
+Limits: blocks have to be longer than rows are correlated. The first and the last fifth have no moments. What an
+innovation remembers of states before the step is left out, a second or so. Noise levels are those without a step, which
+raises them, and sigmas with them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from alidade.factors.array import Array, Index
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import OffsetStep
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.levenberg import Point
 from alidade.pipelines.solvers.linearization import NOT_MEASURED
+from alidade.pipelines.solvers.marginal_likelihood import chain_about, innovations_by_shared
 from alidade.pipelines.solvers.posterior import Reported
 
-# Blocks, as of `ratio_by_blocks`, those on either side of a step at least, and moments in each. Of fewer measurements
-# than moments, as of means over rests, each is a block.
-_BLOCKS, _SIDE, _MOMENTS = 25, 5, 4
-# Huber's bound, sigmas: 95 % as efficient as least squares on normal noise.
-_BOUND = 1.345
+# Blocks, as of `ratio_by_blocks`, those on either side of a step at least, and moments in each, fewer of few rows. Of
+# less than `_FEWEST` rows a block, as of means over rests, each row is one.
+_BLOCKS, _SIDE, _MOMENTS, _FEWEST = 25, 5, 10, 4
+# Huber's bound, sigmas: normal noise seldom reaches it. 1.345, the usual one, makes a gyro bias's steps 14 % too small.
+_BOUND = 3.0
 # Parts whose mean Jacobians show how far a device turned.
 _PARTS = 500
 
 
-def largest_offset_step(compiled: Compiled, solution: Point) -> OffsetStep | None:
-    """Find the most significant step of one of `Problem.offsets`; None with states, or with too few measurements.
+def largest_offset_step(
+    compiled: Compiled, solution: Point, levels: Sequence[Level] | None = None
+) -> OffsetStep | None:
+    """Find the most significant step of one of `Problem.offsets`; None with too few rows, or where none is determined.
 
     Args:
         compiled: the problem.
         solution: at its noise levels.
+        levels: of a chain of states; None: of a graph without states, with states there is no test.
     """
-    if not compiled.problem.offsets or compiled.layout.sizes[0] > 1:
+    if not compiled.problem.offsets or (levels is None and compiled.layout.sizes[0] > 1):
         return None
-    rows = _Rows.of(compiled, solution)
-    if rows.block[-1] + 1 < 2 * _SIDE:
+    pieces = _residuals(compiled, solution) if levels is None else _innovations(compiled, solution, levels)
+    if pieces.blocks < 2 * _SIDE:
         return None
     reported = Reported.of(compiled, solution.values)
-    inverse = np.asarray(np.linalg.pinv(reported.jacobian), dtype=float)
-    found = []
+    inverse = np.asarray(np.linalg.pinv(reported.jacobian[:, compiled.layout.sizes[3] :]), dtype=float)
+    found = list[OffsetStep]()
     for names in compiled.problem.offsets:
         with suppress(np.linalg.LinAlgError):
-            found.append(rows.largest(names, inverse[:, [reported.names.index(name) for name in names]]))
-    if not found:
-        return None
-    best = min(found, key=lambda each: each.level)
-    return replace(best, level=min(best.level * len(found), 1.0))
+            found.append(pieces.largest(names, inverse[:, [reported.names.index(name) for name in names]]))
+    best = min(found, key=lambda each: each.level, default=None)
+    return None if best is None else replace(best, level=min(best.level * len(found), 1.0))
+
+
+def _residuals(compiled: Compiled, solution: Point) -> _Pieces:
+    """Linearise all measurements at a solution, also those rejected, and sum them in pieces of equal turn."""
+    size = compiled.layout.sizes[4] + 1
+    times, measured, prior = list[Array](), list[Array](), [np.zeros((0, size))]
+    for group in solution.engine.groups:
+        rows = np.concatenate(replace(group, loss=None, excluded=None).rows(solution.values, size)[0])
+        if group.family in NOT_MEASURED:
+            prior.append(rows)
+            continue
+        times.append(np.repeat(group.model.time, group.model.rows))
+        measured.append(rows)
+    return _Pieces.of(np.concatenate(times), np.concatenate(measured), np.concatenate(prior), by_turn=True)
+
+
+def _innovations(compiled: Compiled, solution: Point, levels: Sequence[Level]) -> _Pieces:
+    """Sum the innovations of a chain about its solution in pieces of equally many rows."""
+    chain, variances = chain_about(compiled, levels, solution)
+    times, measured = list[Array](), list[Array]()
+    for time, G, e in innovations_by_shared(chain, variances):
+        times.append(np.repeat(time, e.shape[1]))
+        measured.append(np.concatenate([G, -e[..., None]], axis=2).reshape(-1, G.shape[2] + 1))
+    prior = np.column_stack([chain.prior[:, :-1], -chain.prior[:, -1]])
+    return _Pieces.of(np.concatenate(times), np.concatenate(measured), prior, by_turn=False)
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
-    """Rows of all measurements in order of time, in pieces.
+class _Pieces:
+    """Normal equations of a recording's rows [derivatives by the shared unknowns | right side], in pieces by time.
 
     Attributes:
         starts: (pieces,) time of the first measurement of each, s.
-        block: (pieces,) block that each is in.
+        blocks: number of blocks, each of as many pieces.
         squares: (pieces, s + 1, s + 1) their normal equations, right side last.
         prior: (s + 1, s + 1) the same of priors.
         count: number of rows.
     """
 
     starts: Array
-    block: Index
+    blocks: int
     squares: Array
     prior: Array
     count: int
 
     @classmethod
-    def of(cls, compiled: Compiled, solution: Point) -> _Rows:
-        """Linearise all measurements of a recording at a solution, each with Huber's weight."""
-        size = compiled.layout.sizes[4] + 1
-        times, measured, weighted, prior = list[Array](), list[Array](), list[Array](), np.zeros((size, size))
-        for group in solution.engine.groups:
-            rows = np.concatenate(replace(group, loss=None, excluded=None).rows(solution.values, size)[0])
-            if group.family in NOT_MEASURED:
-                prior += rows.T @ rows
-                continue
-            weights = np.minimum(1.0, _BOUND / np.maximum(np.abs(rows[:, -1:]), 1e-300))
-            times.append(np.repeat(group.model.time, group.model.rows))
-            measured.append(rows)
-            weighted.append(np.sqrt(weights) * rows)
-        time = np.concatenate(times)
-        order, n = np.argsort(time, kind="stable"), len(time)
-        blocks, pieces = (n, n) if n < _BLOCKS * _MOMENTS else (_BLOCKS, _BLOCKS * _MOMENTS)
-        starts = _equal_turns(np.concatenate(measured)[order, :-1], pieces)
-        squares = np.array([rows.T @ rows for rows in np.split(np.concatenate(weighted)[order], starts[1:])])
-        return cls(time[order][starts], np.arange(pieces) * blocks // pieces, squares, prior, n)
+    def of(cls, time: Array, rows: Array, prior: Array, by_turn: bool) -> _Pieces:
+        """Sum rows (n, s + 1), each with Huber's weight, in pieces of equal turn, or of equally many rows.
+
+        Args:
+            time: (n,) s.
+            rows: of measurements, whitened.
+            prior: (r, s + 1) rows of priors.
+            by_turn: whether the device turns equally far in all pieces.
+        """
+        n, order = len(time), np.argsort(time, kind="stable")
+        time, rows = time[order], rows[order]
+        blocks = n if n < _FEWEST * _BLOCKS else _BLOCKS
+        pieces = blocks * min(_MOMENTS, n // blocks)
+        first = _equal_turns(rows[:, :-1], pieces) if by_turn else np.arange(pieces) * n // pieces
+        weights = np.minimum(1.0, _BOUND / np.maximum(np.abs(rows[:, -1:]), 1e-300))
+        squares = np.array([each.T @ each for each in np.split(np.sqrt(weights) * rows, first[1:])])
+        return cls(time[first], blocks, squares, prior.T @ prior, n)
 
     def largest(self, names: tuple[str, ...], moves: Array) -> OffsetStep:
         """Most significant step of numbers (q,) whose unit moves (s, q) the shared unknowns.
 
         Raises numpy.linalg.LinAlgError where it is not determined.
         """
-        pieces, blocks = len(self.starts), int(self.block[-1]) + 1
-        least, prior = -(-_SIDE * pieces // blocks), self._prior_without(moves)
-        tests = [self._test(moment, moves, prior) for moment in range(least, pieces - least + 1)]
-        best = int(np.argmax([fall for fall, *_ in tests]))
-        _, size, step, covariance = tests[best]
-        each = zip(names, zip(step.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True), strict=True)
-        level = _level(size, len(names), blocks * (least + best) / pieces, blocks)
-        tried = blocks - 2 * _SIDE + 1
-        return OffsetStep(float(self.starts[least + best]), as_sigmas(level), min(level * tried, 1.0), dict(each))
+        from scipy.special import fdtrc
 
-    def _prior_without(self, moves: Array) -> Array:
-        """Normal equations (s + 1, s + 1) of the priors, their say on the numbers that step taken out.
-
-        A prior that the recording contradicts would ask for a step.
-        """
+        pieces, q = len(self.starts), len(names)
         of_moves = self.prior[:, :-1] @ moves
-        return self.prior - of_moves @ np.linalg.pinv(moves.T @ of_moves[:-1]) @ of_moves.T
+        prior = self.prior - of_moves @ np.linalg.pinv(moves.T @ of_moves[:-1]) @ of_moves.T
+        least = _SIDE * pieces // self.blocks
+        steps = [self._step(moment, moves, prior) for moment in range(least, pieces - least + 1)]
+        best = int(np.argmax([fall for fall, *_ in steps]))
+        fall, step, white = steps[best]
+        ratio = self._ratio(least + best, moves, prior, step, white)
+        sides = self.blocks * np.array([least + best, pieces - least - best]) / pieces
+        dof = np.square((1.0 / sides).sum()) / (1.0 / (sides**2 * (sides - 1.0))).sum()
+        level = float(fdtrc(q, q * dof, fall / (q * ratio**2)))
+        sigmas = ratio * np.sqrt(np.diag(white))
+        each = dict(zip(names, zip(step.tolist(), sigmas.tolist(), strict=True), strict=True))
+        tried = self.blocks - 2 * _SIDE + 1
+        return OffsetStep(float(self.starts[least + best]), _as_sigmas(level), min(level * tried, 1.0), each)
 
-    def _test(self, moment: int, moves: Array, prior: Array) -> tuple[float, float, Array, Array]:
-        """Fall of chi-square by a step before a piece, its test statistic, the step (q,) and its covariance (q, q)."""
-        s, q = moves.shape
-        after = np.block([[np.eye(s), moves, np.zeros((s, 1))], [np.zeros((1, s + q)), np.ones((1, 1))]])
-        before = after * np.repeat([1.0, 0.0, 1.0], [s, q, 1])
-        of_blocks = np.zeros((int(self.block[-1]) + 1, s + q + 1, s + q + 1))
-        for part, columns in ((slice(moment), before), (slice(moment, None), after)):
-            np.add.at(of_blocks, self.block[part], columns.T @ self.squares[part] @ columns)
-        whole = before.T @ prior @ before + of_blocks.sum(axis=0)
+    def _step(self, moment: int, moves: Array, prior: Array) -> tuple[float, Array, Array]:
+        """Fall of chi-square by a step before a piece, the step (q,), and its covariance (q, q) under white noise."""
+        s, (before, after) = len(moves), _columns(moves)
+        sums = [each.sum(axis=0) for each in (self.squares[:moment], self.squares[moment:])]
+        whole = before.T @ (prior + sums[0]) @ before + after.T @ sums[1] @ after
         found = np.linalg.solve(whole[:-1, :-1], whole[:-1, -1])
-        without = whole - of_blocks
-        each = np.linalg.solve(without[:, :-1, :-1], without[:, :-1, -1:])[..., 0]
-        step, off = found[s:], (each - found)[:, s:]
-        robust = off.T @ off * ((len(off) - 1.0) / len(off))
         left = (whole[-1, -1] - whole[-1, :-1] @ found) / max(self.count - len(found), 1)
         white = np.linalg.inv(whole[:-1, :-1])[s:, s:] * left
-        sizes = [float(step @ np.linalg.solve(covariance, step)) for covariance in (robust, white)]
-        return sizes[1], min(sizes), step, robust if sizes[0] <= sizes[1] else white
+        return float(found[s:] @ np.linalg.solve(white, found[s:])), found[s:], white
+
+    def _ratio(self, moment: int, moves: Array, prior: Array, step: Array, white: Array) -> float:
+        """Ratio of jackknife to white sigma of a step, at least 1.
+
+        Args:
+            moment: piece before which the step is.
+            moves, prior: of the offsets; normal equations of the priors, without their say on these.
+            step, white: (q,) and its covariance (q, q) under white noise.
+        """
+        q, (before, after) = len(step), _columns(moves)
+        each = np.concatenate([before.T @ self.squares[:moment] @ before, after.T @ self.squares[moment:] @ after])
+        of_blocks = np.add.reduceat(each, np.arange(0, len(each), len(each) // self.blocks))
+        without = before.T @ prior @ before + of_blocks.sum(axis=0) - of_blocks
+        found = np.linalg.solve(without[:, :-1, :-1], without[:, :-1, -1:])[:, -q:, 0]
+        off = found - step
+        jackknife = off.T @ off * ((self.blocks - 1.0) / self.blocks)
+        along = np.linalg.solve(white, step)
+        pooled = float(np.trace(np.linalg.solve(white, jackknife))) / q
+        return float(np.sqrt(max(1.0, pooled, float(along @ jackknife @ along / (along @ step)))))
+
+
+def _columns(moves: Array) -> tuple[Array, Array]:
+    """Matrices (s + 1, s + q + 1) that map shared unknowns and a step to the unknowns before and after the step."""
+    s, q = moves.shape
+    before = np.hstack([np.eye(s + 1, s), np.zeros((s + 1, q)), np.eye(s + 1)[:, s:]])
+    after = before.copy()
+    after[:s, s:-1] = moves
+    return before, after
 
 
 def _equal_turns(jacobians: Array, count: int) -> Index:
@@ -158,16 +214,7 @@ def _equal_turns(jacobians: Array, count: int) -> Index:
     return np.asarray(first[part])
 
 
-def _level(square: float, q: int, before: float, blocks: int) -> float:
-    """p-value of Hotelling's T^2 of a difference of q means, with so many `blocks`, some of them `before`."""
-    from scipy.special import fdtrc
-
-    counts = np.array([before, blocks - before])
-    dof = np.square((1.0 / counts).sum()) / (1.0 / (counts**2 * (counts - 1.0))).sum()
-    return float(fdtrc(q, dof - q + 1.0, square * (dof - q + 1.0) / (q * dof)))
-
-
-def as_sigmas(level: float) -> float:
+def _as_sigmas(level: float) -> float:
     """Convert a p-value to the size of a standard normal number that is exceeded with that probability."""
     from scipy.special import ndtri
 
