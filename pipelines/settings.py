@@ -38,7 +38,7 @@ from alidade.pipelines.recording.topics import Topic, TopicSource
 # Names of the attachments that hold a recording's config and, if simulated, its truth.
 ATTACHMENT = "alidade.yaml"
 TRUTH = "truth.json"
-# ... and with a corrected topic's name behind it, of the one that holds the name of the topic that was corrected.
+# Before a corrected topic's name, the name of the attachment that states which topic was corrected.
 CORRECTED = "corrected:"
 _UNIT_TOLERANCE = 1e-3
 

@@ -125,14 +125,15 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
         return Session.read(open_recording(source, strict), method, config)
     if isinstance(source, Simulated):
         return Session.of(methods.method(method) if method else None, source, config)
+    if not (isinstance(source, Mapping) or is_dataclass(source)):
+        raise InputError(f"open(...) takes a recording, simulated data or arrays by name, not {type(source).__name__}")
     settings = load_config(None, config)
     name = method or settings.method
     if name is None:
         raise InputError("arrays do not say which method they are for: open(..., method=...)")
     chosen = methods.method(name)
-    given = _data(chosen, source)
     with _naming_arrays():
-        data = _at_config_place(_checked(chosen, given), settings)
+        data = _at_config_place(_checked(chosen, _data(chosen, source)), settings)
         chosen.check(data)
     return Session(chosen, data, settings)
 
@@ -265,10 +266,7 @@ def _check_seed(seed: object) -> None:
 
 
 class _Result:
-    """Base of results in one call, tuples as other tools have them: the whole calibration is behind their numbers.
-
-    An inconsistent or unobservable one raises a UserWarning.
-    """
+    """Base of the tuples that `magcal`, `imu_static` and `hand_eye` return: the calibration behind their numbers."""
 
     calibration: Calibration
 
@@ -302,6 +300,9 @@ def magcal(m: ArrayLike, t: ArrayLike | None = None, *, config: Settings = None)
         t: (N,) s; without it 50 Hz.
         config: as `alidade.open` has it.
 
+    Warns:
+        UserWarning: the result is inconsistent or unobservable.
+
     Raises:
         InputError: arrays or config cannot be used.
     """
@@ -328,6 +329,9 @@ def imu_static(
         latitude_deg: of the place: gravity is 9.780 m/s^2 at the equator and 9.832 at the poles.
         config: as `alidade.open` has it.
 
+    Warns:
+        UserWarning: the result is inconsistent or unobservable.
+
     Raises:
         InputError: arrays or config cannot be used.
     """
@@ -352,6 +356,9 @@ def hand_eye(
         t_wxyz: (M,) s.
         config: as `alidade.open` has it.
 
+    Warns:
+        UserWarning: the result is inconsistent or unobservable.
+
     Raises:
         InputError: arrays or config cannot be used.
     """
@@ -374,20 +381,18 @@ def _data(method: Method, given: Any) -> Any:
     kind = method.data
     if is_dataclass(given):
         if not isinstance(given, kind):
-            raise InputError(f"arrays: {method.name} takes {kind.__name__}, not {type(given).__name__}")
+            raise InputError(f"{method.name} takes {kind.__name__}, not {type(given).__name__}")
         given = {field.name: getattr(given, field.name) for field in fields(kind)}
-    if not isinstance(given, Mapping):
-        raise InputError(f"open(...) takes a recording, simulated data or arrays by name, not {type(given).__name__}")
     hints = typing.get_type_hints(kind)
     known = {field.name: field for field in fields(kind)}
     for name in given:
         if name not in known:
-            raise InputError(f"arrays: {method.name} has no {name}; it has {', '.join(known)}")
+            raise InputError(f"{method.name} has no {name}; it has {', '.join(known)}")
     values = {"epoch_ns": 0} | {name: value for name, value in given.items() if value is not None}
     for name, field in known.items():
         if name not in values and field.default is MISSING and field.default_factory is MISSING:
             if NoneType not in typing.get_args(hints[name]):
-                raise InputError(f"arrays: {method.name} needs {name}")
+                raise InputError(f"{method.name} needs {name}")
             values[name] = None
     return kind(**values)
 
@@ -464,7 +469,7 @@ def _naming_arrays() -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise InputError(f"arrays: {str(error).removeprefix('topic ').removeprefix('arrays: ')}") from error
+        raise InputError(f"arrays: {str(error).removeprefix('topic ')}") from error
 
 
 def _check_stamps(name: str, given: Any, t: Array) -> None:

@@ -117,7 +117,8 @@ class Validated:
         if self.held is not None:
             out += [f"{what}: no accuracy is required of it" for what in self._changes(self.held.changes.others)]
             if self.held.steps and self.held.untested:
-                out.append(f"the recording does not determine whether {', '.join(self.held.untested)} changed")
+                apart = ", apart from what did" * bool(self.held.changes.found or self.held.changes.others)
+                out.append(f"the recording does not determine whether {', '.join(self.held.untested)} changed{apart}")
         shown = None if self.held is None else self.within  # by the sentence
         if self.own is not None and (own := finding_of_recording(self.own, shown)) is not None:
             out.append(sentence(own, self.own.quantities))

@@ -309,8 +309,8 @@ def disturbances(estimate: Estimate) -> Iterator[Finding]:
     """
     for family, time, rejected in _in_order(estimate):
         for first, last in intervals(rejected):
-            at_end = len(time) - last < last - first
-            is_long = time[last - 1] - time[first] > LIMITS.lasting * (time[-1] - time[0])
+            length, rest = time[last - 1] - time[first], time[-1] - time[last - 1]
+            is_long, at_end = length > LIMITS.lasting * (time[-1] - time[0]), rest < LIMITS.lasting * length
             evidence = {
                 "family": family,
                 "since_s": float(time[first]),

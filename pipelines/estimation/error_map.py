@@ -91,7 +91,7 @@ class ErrorMap:
         functions: (n, k) of mean 0 and rms 1.
         places: where each measurement was made, name -> (n,), rad, to be drawn.
         moves: whether it moves an estimate; else it may be an error of other sensors as well, and widens sigmas alone.
-        least: sigma of each in recordings that show no map: what no sensor is free of, nor a recording can show.
+        least: sigma of each that is assumed where a recording shows no map.
         slopes: (n, k, places) derivatives of the functions by the places, where these are the angles of a gimbal that
             the gyro drives; else None.
     """

@@ -56,7 +56,15 @@ _STAMP = {
 }
 _COLUMNS: Mapping[str, Mapping[str, series.Column]] = {
     name: columns
-    for kind in series.Series.__subclasses__()
+    for kind in (
+        series.ImuSeries,
+        series.MagneticSeries,
+        series.VectorSeries,
+        series.QuaternionSeries,
+        series.PoseSeries,
+        series.FixSeries,
+        series.TemperatureSeries,
+    )
     for name, columns in ({kind.TYPE: kind.COLUMNS} | kind.OTHERS).items()
 }
 # Message types that become columns.

@@ -57,7 +57,7 @@ _PASSING_S, _ASIDE = 0.25, 5
 def implausible(kind: str, values: Array) -> str:
     """Return a phrase about readings (N, 3) that are implausible in their unit; empty if plausible, and for a gyro.
 
-    They are of an accel, gyro or mag, and should be in m/s^2, rad/s or T; rows with NaN do not count.
+    `kind` is accel, gyro or mag, the unit m/s^2, rad/s or T; rows with NaN do not count.
     """
     if kind not in PLAUSIBLE:
         return ""
@@ -115,7 +115,7 @@ def to_signed(values: Array, bits: int) -> Array:
 def is_there(kind: str, values: Array, covariance: Array) -> bool:
     """Whether values (N, 3) in messages are measurements of a sensor, not filled in by a driver.
 
-    They are of an accel or gyro; a covariance (N, 3, 3) that begins with -1 says that there is no such sensor.
+    `kind` is accel or gyro; a covariance (N, 3, 3) that begins with -1 says that there is no such sensor.
     """
     finite = values[np.isfinite(values).all(axis=1)]
     if not finite.any():

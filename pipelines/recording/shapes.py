@@ -54,14 +54,14 @@ class Rows:
             if array.dtype == object and array.size and not any(isinstance(one, str) for one in array.flat):
                 array = array.astype(float)
         except (ValueError, TypeError) as error:
-            raise InputError(f"arrays: {name} is no array: its rows differ in length{_odd_row(value)}") from error
+            raise InputError(f"{name} is no array: its rows differ in length{_odd_row(value)}") from error
         if array.dtype.kind not in "iuf":
-            raise InputError(f"arrays: {name} has to be numbers, not {array.dtype.type.__name__.rstrip('_')}")
+            raise InputError(f"{name} has to be numbers, not {array.dtype.type.__name__.rstrip('_')}")
         if array.shape[:1] == (0,):
-            raise InputError(f"arrays: {name} has no rows; what was not recorded is left out")
+            raise InputError(f"{name} has no rows; what was not recorded is left out")
         if array.ndim == 0 or (self.shape is not None and array.shape[1:] != self.shape):
             needed = ", ".join(["N", *map(str, self.shape or ())])
-            raise InputError(f"arrays: {name} has the shape {array.shape}; ({needed}) is needed")
+            raise InputError(f"{name} has the shape {array.shape}; ({needed}) is needed")
         return np.asarray(np.ma.filled(array.astype(float, copy=False), np.nan))
 
     def lost(self, values: Array) -> NDArray[np.intp]:

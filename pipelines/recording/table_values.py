@@ -146,7 +146,7 @@ def of_rate(count: int, rate_hz: float) -> Stamps:
 def check_steps(path: Path, name: str, t_ns: Stamps, unit: str, slowest_s: float) -> None:
     """Raise InputError where steps between stamps are plausible for a sensor only in another unit of time.
 
-    `name` is the topic's, `unit` that which was taken, `slowest_s` the longest usual step of such a sensor, s.
+    `name` is the topic's, `unit` the one used, `slowest_s` the longest usual step of such a sensor, s.
     """
     likely = likely_time_unit(t_ns, slowest_s)
     if likely is None:

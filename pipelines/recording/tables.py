@@ -282,8 +282,8 @@ def read_columns(form: TableForm, names: Sequence[str], most: int | None = None)
     """Return the named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
-    are no rows; a last row that is cut short is left out, and so are others up to 1 % of all. At
-    most `most` rows are looked at.
+    are no rows; a last row that is cut short is left out, and so are others up to 1 % of all. At most `most` rows are
+    looked at.
 
     Raises:
         InputError: a column is missing, or more rows are too short; the first of them is named.

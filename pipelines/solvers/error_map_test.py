@@ -64,47 +64,55 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
     k, ratio = len(error_map.names), estimate.widest(problem.quantities)
     root = mapped.at(at)[0].root()
     chi_square, dof, _ = _tested(root[-k - 1 :, -k - 1 :], error_map, ratio)
+    covered = _covered(estimate, error_map, posterior, root) if error_map.least else estimate
     if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
-        moves = -np.linalg.lstsq(root[: -k - 1, : -k - 1], root[: -k - 1, -k - 1 : -1], rcond=None)[0]
-        reported, columns = posterior.reported, np.zeros((len(estimate.names), k))
-        names = [estimate.names[i] for i in reported.free]
-        gain = _along_strong(reported.jacobian[reported.free] @ moves, names, posterior)
-        columns[reported.free] = gain @ _spread(root[-k - 1 : -1, -k - 1 : -1], error_map.least)
-        return widened(estimate, SOURCE, columns)
+        return covered
     try:
-        return _freed(problem, error_map, posterior, estimate, ratio)
+        return _freed(problem, error_map, posterior, estimate, ratio) or covered
     except (IndeterminateStateError, np.linalg.LinAlgError):
         deadline.passed(_WHAT)
-        return estimate
+        return covered
 
 
-def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float) -> Estimate:
+def _covered(estimate: Estimate, error_map: ErrorMap, posterior: Posterior, root: Array) -> Estimate:
+    """Add the least error map to an estimate's covariance, by the linear system's R with the map as last unknowns."""
+    k, reported = len(error_map.names), posterior.reported
+    moves = -np.linalg.lstsq(root[: -k - 1, : -k - 1], root[: -k - 1, -k - 1 : -1], rcond=None)[0]
+    columns, names = np.zeros((len(estimate.names), k)), [estimate.names[i] for i in reported.free]
+    gain = _along_strong(reported.jacobian[reported.free] @ moves, names, posterior)
+    columns[reported.free] = gain @ _spread(root[-k - 1 : -1, -k - 1 : -1], error_map.least)
+    return widened(estimate, SOURCE, columns)
+
+
+def _freed(
+    problem: Problem, error_map: ErrorMap, without: Posterior, estimate: Estimate, ratio: float
+) -> Estimate | None:
     """Re-estimate with the error map as free parameters, its prior at least as wide as the map's rms, or that rms.
 
     Directions that are weak `without` the map keep their values. A map that moves a required number by more than the
     sigma of its default prior takes that number's place, as where a device hardly turns, and is no error: the estimate
-    stays. Moves beyond a prior known from an earlier calibration are what such errors do.
+    stays: None. Moves beyond a prior known from an earlier calibration are what such errors do.
     """
     compiled, solution, information = _solved(problem, error_map, estimate)
     if not solution.converged:
         deadline.passed(_WHAT)
-        return estimate
+        return None
     chi_square, dof, rms = _tested(_rows(information, error_map)[1], error_map, ratio)
     if rms == 0.0 and not error_map.moves:
-        return estimate
+        return None
     if rms > error_map.prior or not error_map.moves:
         error_map = replace(error_map, prior=max(rms, error_map.least))
         near = replace(estimate, names=information.names, values=information.at)
         compiled, solution, information = _solved(problem, error_map, near)
     if not solution.converged:
         deadline.passed(_WHAT)
-        return estimate
+        return None
     posterior = constrained_solution(compiled, solution)
     at = dict(zip(posterior.reported.names, posterior.reported.numbers.tolist(), strict=True))
     shift = np.array([at[name] for name in estimate.names]) - estimate.values
     required = {q.name: q.prior_scale for q in problem.quantities if q.required}
     if any(abs(by) > required.get(name, np.inf) for name, by in zip(estimate.names, shift.tolist(), strict=True)):
-        return estimate
+        return None
     rows, root = _rows(information, error_map)
     p, own = len(rows) - len(root), _own(information, error_map)
     # Given the map the numbers move by -R_xx^-1 R_xc c; with its prior the information on c is R_cc' R_cc + 1 / p^2.
@@ -130,8 +138,6 @@ def _freed(problem: Problem, error_map: ErrorMap, without: Posterior, estimate: 
 
 def _spread(root: Array, prior: float) -> Array:
     """Root S (k, k) of the covariance S S' of a map's numbers, from rows R (k, k) about them and their prior sigma."""
-    if prior == 0.0:
-        return np.zeros_like(root)
     return np.asarray(np.linalg.inv(np.linalg.qr(np.concatenate([root, np.eye(len(root)) / prior]), mode="r")))
 
 

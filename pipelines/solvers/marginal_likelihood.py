@@ -32,7 +32,7 @@ from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import certain_ratio, sigma_ratio
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Point, Solution, minimize, states_first
-from alidade.pipelines.solvers.linear_chain import LinearChain, LinearSolution, Widening
+from alidade.pipelines.solvers.linear_chain import LinearChain, LinearSolution, Rows, Widening
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.noise_estimation import apply_levels
 from alidade.pipelines.solvers.posterior import Reported
@@ -218,9 +218,9 @@ def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = No
     p = chain.prior.shape[1] - 1
     known = chain.prior[:, :p].T @ chain.prior[:, :p]
     information, of_scores, blocks = known.copy(), known.copy(), 0
-    for time, G, e in innovations_by_shared(chain, variances, at):
+    for rows, G, e in innovations_by_shared(chain, variances, at):
         information += np.einsum("nmi,nmj->ij", G, G)
-        block = ((time - time.min()) / SANDWICH_BLOCK_S).astype(int)
+        block = ((rows.time - rows.time.min()) / SANDWICH_BLOCK_S).astype(int)
         blocks = int(block.max()) + 1
         sums = np.zeros((blocks, p))
         np.add.at(sums, block, np.einsum("nmi,nm->ni", G, e))
@@ -230,14 +230,14 @@ def scores(chain: LinearChain, variances: Sequence[Array], at: Array | None = No
 
 def innovations_by_shared(
     chain: LinearChain, variances: Sequence[Array], at: Array | None = None
-) -> Iterator[tuple[Array, Array, Array]]:
-    """Yield times (n,), s, of each kind of measurements, derivatives (n, m, p) of their innovations, and these (n, m).
+) -> Iterator[tuple[Rows, Array, Array]]:
+    """Yield each kind of measurements with the derivatives (n, m, p) of their innovations, and these (n, m).
 
     Arguments as of `scores`.
     """
     for kind, each in chain.innovations(variances, chain.limits, by_shared=True).items():
         G = each.whitened[..., 1:]
-        yield chain.rows[kind].time, G, each.whitened[..., 0] + (0.0 if at is None else G @ at)
+        yield chain.rows[kind], G, each.whitened[..., 0] + (0.0 if at is None else G @ at)
 
 
 def sandwich(information: Array, of_scores: Array) -> tuple[Array, Array]:

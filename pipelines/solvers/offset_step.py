@@ -1,9 +1,10 @@
 """Test for a step of offsets at one moment: hard iron that moved, a gyro bias that jumped.
 
-The rows of all measurements are summed in pieces, before and after a moment (Andrews, "Tests for parameter instability
-and structural change with unknown change point", Econometrica 61, 1993). In a graph without states they are residuals,
-in a chain of states innovations with their derivatives by the shared unknowns. All have Huber's weight: a robust loss
-rejects what was recorded before a step as outliers. The moment is that of the largest fall of chi-square.
+Rows of measurements are summed in pieces, before and after a moment (Andrews, "Tests for parameter instability and
+structural change with unknown change point", Econometrica 61, 1993). In a graph without states they are residuals, in a
+chain of states innovations of the inliers with their derivatives by the shared unknowns. They have Huber's weight; of
+residuals also what the robust loss rejects, as it does all before a step. The moment is that of the largest fall of
+chi-square.
 
 The covariance W of the step d holds for white noise. With the steps d_b found when one block of the recording is left
 out (delete-a-block jackknife: Künsch, "The jackknife and the bootstrap for general stationary observations", Annals of
@@ -22,8 +23,7 @@ Priors of the offsets have no say, since one that the recording contradicts woul
 unknowns have, which may not be determined without.
 
 Limits: blocks have to be longer than rows are correlated. The first and the last fifth have no moments. What an
-innovation remembers of states before the step is left out, a second or so. Noise levels are those without a step, which
-raises them, and sigmas with them.
+innovation remembers of states before the step is left out, a second or so.
 """
 
 from __future__ import annotations
@@ -92,12 +92,13 @@ def _residuals(compiled: Compiled, solution: Point) -> _Pieces:
 
 
 def _innovations(compiled: Compiled, solution: Point, levels: Sequence[Level]) -> _Pieces:
-    """Sum the innovations of a chain about its solution in pieces of equally many rows."""
+    """Sum the innovations of a chain's inliers about its solution in pieces of equally many rows."""
     chain, variances = chain_about(compiled, levels, solution)
-    times, measured = list[Array](), list[Array]()
-    for time, G, e in innovations_by_shared(chain, variances):
-        times.append(np.repeat(time, e.shape[1]))
-        measured.append(np.concatenate([G, -e[..., None]], axis=2).reshape(-1, G.shape[2] + 1))
+    times, measured, inliers = list[Array](), list[Array](), solution.engine.inliers(solution.values)
+    for kind, G, e in innovations_by_shared(chain, variances):
+        used = inliers[kind.group]
+        times.append(np.repeat(kind.time[used], e.shape[1]))
+        measured.append(np.concatenate([G, -e[..., None]], axis=2)[used].reshape(-1, G.shape[2] + 1))
     prior = np.column_stack([chain.prior[:, :-1], -chain.prior[:, -1]])
     return _Pieces.of(np.concatenate(times), np.concatenate(measured), prior, by_turn=False)
 
