@@ -27,7 +27,7 @@ from alidade.factors.chi_square import quantile
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.error_map import SOURCE, ErrorMap, FoundMap
 from alidade.pipelines.estimation.problem import Estimate, History, PosteriorHistory, Problem, SqrtInformation
-from alidade.pipelines.estimation.widening import widened
+from alidade.pipelines.estimation.widening import marginalised, widened
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
@@ -35,7 +35,7 @@ from alidade.pipelines.solvers.freed import at_solution
 from alidade.pipelines.solvers.layout import Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization
-from alidade.pipelines.solvers.posterior import sqrt_information
+from alidade.pipelines.solvers.posterior import sqrt_information, without_priors
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed
 from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
@@ -64,7 +64,7 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
     k, ratio = len(error_map.names), estimate.widest(problem.quantities)
     root = mapped.at(at)[0].root()
     chi_square, dof, _ = _tested(root[-k - 1 :, -k - 1 :], error_map, ratio)
-    covered = _covered(estimate, error_map, posterior, root) if error_map.least else estimate
+    covered = _covered(problem, error_map, posterior, estimate, root) if error_map.least else estimate
     if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
         return covered
     try:
@@ -74,14 +74,30 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
         return covered
 
 
-def _covered(estimate: Estimate, error_map: ErrorMap, posterior: Posterior, root: Array) -> Estimate:
-    """Add the least error map to an estimate's covariance, by the linear system's R with the map as last unknowns."""
+def _covered(problem: Problem, error_map: ErrorMap, posterior: Posterior, estimate: Estimate, root: Array) -> Estimate:
+    """Add the least error map to an estimate's covariance, by R of the linear system with the map as last unknowns.
+
+    The square-root information has no priors of the device, without which the map trades with more.
+    """
+    out, information = widened(replace(estimate, sqrt_info=None), SOURCE, _least(error_map, posterior, root)), None
+    if estimate.sqrt_info is not None:
+        names, at = estimate.sqrt_info.names, posterior.at
+        device = np.array(names)[(estimate.sqrt_info.prior_R != 0.0).any(axis=0)].tolist()
+        engine, *_ = without_priors(problem, posterior.reported, at.engine, at.values, device)
+        mapped, values = _mapped(engine, at.values, error_map)
+        columns = _least(error_map, posterior, mapped.at(values)[0].root()) / estimate.inflations[:, None]
+        information = marginalised(estimate.sqrt_info, columns[[estimate.names.index(name) for name in names]])
+    return replace(out, sqrt_info=information)
+
+
+def _least(error_map: ErrorMap, posterior: Posterior, root: Array) -> Array:
+    """Columns S (n, k): the least error map adds S S' to the covariance, by R with the map as last unknowns."""
     k, reported = len(error_map.names), posterior.reported
     moves = -np.linalg.lstsq(root[: -k - 1, : -k - 1], root[: -k - 1, -k - 1 : -1], rcond=None)[0]
-    columns, names = np.zeros((len(estimate.names), k)), [estimate.names[i] for i in reported.free]
+    columns, names = np.zeros((len(reported.names), k)), [reported.names[i] for i in reported.free]
     gain = _along_strong(reported.jacobian[reported.free] @ moves, names, posterior)
     columns[reported.free] = gain @ _spread(root[-k - 1 : -1, -k - 1 : -1], error_map.least)
-    return widened(estimate, SOURCE, columns)
+    return columns
 
 
 def _freed(

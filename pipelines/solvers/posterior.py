@@ -373,9 +373,36 @@ def sqrt_information(
     Raises:
         IndeterminateStateError: a state is not determined.
     """
-    problem, layout = compiled.problem, engine.layout
-    reported = Reported.of(compiled, values)
-    c, J = layout.sizes[3], reported.jacobian
+    problem, reported = compiled.problem, Reported.of(compiled, values)
+    without, prior_R, prior_d = without_priors(problem, reported, engine, values, device)
+    found = reported.root(without.at(values)[0].root())
+    rows, d = fewest(found.R / reported.scale, found.d, reported.scale)
+    return SqrtInformation(
+        names=tuple(reported.names[i] for i in reported.free),
+        at=reported.numbers[reported.free],
+        R=rows,
+        d=d,
+        prior_R=prior_R,
+        prior_d=prior_d,
+        scales=np.array([problem.quantities[i].prior_scale for i in reported.free]),
+    )
+
+
+def without_priors(
+    problem: Problem, reported: Reported, engine: Linearization, values: Values, device: Collection[str]
+) -> tuple[Linearization, Array, Array]:
+    """Take the priors of the device's numbers out of a linearisation.
+
+    Args:
+        problem, engine: with them.
+        reported: the numbers at the values.
+        values: about which they are linear.
+        device: names of the numbers.
+
+    Returns the linearisation without them, and their rows about the free reported numbers: (r, n) and right side (r,).
+    """
+    layout, J = engine.layout, reported.jacobian
+    c = layout.sizes[3]
     inverse = np.linalg.pinv(J)[c:]
     # Rounding, which units that differ by many orders make large.
     inverse[np.abs(inverse) < UNSEEN * np.abs(inverse).max(initial=0.0)] = 0.0
@@ -396,17 +423,7 @@ def sqrt_information(
             groups.append(replace(group, weights=group.all_weights * ~of_device))
         else:
             groups.append(group)
-    found = reported.root(engine.with_groups(groups).at(values)[0].root())
-    rows, d = fewest(found.R / reported.scale, found.d, reported.scale)
-    return SqrtInformation(
-        names=tuple(reported.names[i] for i in reported.free),
-        at=reported.numbers[reported.free],
-        R=rows,
-        d=d,
-        prior_R=np.concatenate(prior_R),
-        prior_d=np.concatenate(prior_d),
-        scales=np.array([problem.quantities[i].prior_scale for i in reported.free]),
-    )
+    return engine.with_groups(groups), np.concatenate(prior_R), np.concatenate(prior_d)
 
 
 def moved_to(compiled: Compiled, engine: Linearization, values: Values, numbers: Mapping[str, float]) -> Values:

@@ -29,6 +29,7 @@ from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import SqrtInformation
+from alidade.pipelines.estimation.widening import marginalised
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.opening import group_recordings
 from alidade.pipelines.reports.joint_report import forecasts, recording_blocks
@@ -134,7 +135,8 @@ def test_linearised_again_about_its_own_solution_a_recording_says_the_same(share
     first = calibration.estimate.sqrt_info
     assert first is not None
     estimate = calibration.estimate
-    again = information_at(session.problem(), estimate, _names(session))
+    assert first.added is not None  # errors of vision by the attitude
+    again = marginalised(information_at(session.problem(), estimate, _names(session)), first.added)
     both = [each.R.T @ each.R + each.prior_R.T @ each.prior_R for each in (first, again)]
     one, other = (np.sqrt(np.diag(np.linalg.inv(each))) for each in both)
     np.testing.assert_allclose(other, one, rtol=1e-3)
