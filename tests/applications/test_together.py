@@ -140,8 +140,11 @@ def test_linearised_again_about_its_own_solution_a_recording_says_the_same(share
     both = [each.R.T @ each.R + each.prior_R.T @ each.prior_R for each in (first, again)]
     one, other = (np.sqrt(np.diag(np.linalg.inv(each))) for each in both)
     np.testing.assert_allclose(other, one, rtol=1e-3)
-    moved = np.linalg.solve(both[1], again.R.T @ again.d + again.prior_R.T @ again.prior_d)
-    assert (np.abs(moved) < 0.05 * one).all()
+    before, after = (
+        np.linalg.solve(information, each.R.T @ each.d + each.prior_R.T @ each.prior_d)
+        for information, each in zip(both, (first, again), strict=True)
+    )
+    assert (np.abs(after - before) < 0.05 * one).all()
 
 
 @pytest.mark.slow
