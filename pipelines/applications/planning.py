@@ -214,7 +214,7 @@ def _predicted(
     config = session.config.model_copy(update={"require": {**session.config.require, **require}, "noise_known": 0.0})
     problem = method.graph(session.data, config)
     try:
-        estimate = solve_batch(problem, budget=True)
+        estimate = solve_batch(problem, budget=True, error_map=True)
     except IndeterminateError as error:
         raise InputError(f"scenario: {error}") from error
     covariance = finite_covariance(problem.quantities, estimate.covariance)
