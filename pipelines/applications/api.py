@@ -1,4 +1,4 @@
-"""Python interface, `import alidade`: the functions behind the commands, with files or with arrays in memory.
+"""Functions of `import alidade`: what the commands do, with recordings in files or with arrays in memory.
 
 A, b, field = alidade.magcal(m)                         # MATLAB: (m - b) @ A lies on a sphere of radius field
 K, bias, K_gyro, bias_gyro = alidade.imu_static(acc, gyro, t, latitude_deg=48.1)

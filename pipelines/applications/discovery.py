@@ -150,7 +150,7 @@ def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
 
 
 def _corrected(recording: Recording, name: str) -> str:
-    """Return the name of the topic that a corrected one was made of: as stated, else without the default suffix."""
+    """Return the name of the recorded topic that `apply` corrected into a topic: by its attachment, else its suffix."""
     stated = recording.attachment(f"{CORRECTED}{name}", needed=False)
     return name.removesuffix(CALIBRATED) if stated is None else stated.decode(errors="replace")
 

@@ -281,7 +281,7 @@ class _Table:
             return np.full(len(self._texts[i]), np.nan)
 
     def _each_of(self, words: Sequence[str]) -> list[int]:
-        """Return the first column that each word is in the name of; none where one is in no name."""
+        """Return, for each regular expression, the first column whose name it matches; empty if one matches no name."""
         names = [bare_name(name) for name in self._form.names]
         found = (next((i for i, name in enumerate(names) if re.search(word, name)), None) for word in words)
         columns = [i for i in found if i is not None]

@@ -330,7 +330,10 @@ class CalibrationCheck:
 
     @property
     def untested(self) -> list[str]:
-        """Required parameters whose change the recording does not determine, or not apart from significant ones."""
+        """Names of the calibration's required parameters for which a recording does not determine whether they changed.
+
+        Also those that it does not determine apart from parameters that did change.
+        """
         tested = {step.name for step in self.steps}
         return [name for name in self.required if name not in tested]
 

@@ -199,17 +199,20 @@ class UseBands:
 
     @property
     def before(self) -> float:
-        """Largest 95 % bound of the error before calibration."""
+        """Largest 95 % bound of the error in use without the calibration, in the use's unit."""
         return self.figure(lambda band: np.maximum(*map(np.abs, band.before_bounds)))
 
     @property
     def after(self) -> float:
-        """Largest 95 % bound after calibration."""
+        """Largest 95 % bound of the error in use with the calibration, in the use's unit."""
         return self.figure(lambda band: band.bound + np.abs(band.after) * self.use.signed)
 
     @property
     def required(self) -> float | None:
-        """Largest 95 % bound if the parameters only just met their requirements; None without requirements."""
+        """Largest 95 % bound of the error in use if all sigmas were as large as required, in the use's unit.
+
+        None without requirements.
+        """
         return self.figure(lambda band: band.allowed) or None
 
     @property

@@ -11,7 +11,9 @@ from alidade.factors.array import Array
 from alidade.pipelines.estimation.problem import Estimate, Quantity, SqrtInformation
 
 
-def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.inf) -> Estimate:
+def widened(
+    estimate: Estimate, source: str, columns: Array, since: float = -np.inf, apart: Array | None = None
+) -> Estimate:
     """Add a source of error to an estimate: its covariance becomes P + S S'.
 
     Whoever reads the estimate reads that covariance: its history from a time on, the budget, and the square-root
@@ -22,6 +24,7 @@ def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.
         source: in the budget.
         columns: S (n, m).
         since: s, from which on the error is there.
+        apart: S (n, m) without the device's priors, which the square-root information has not; None: `columns`.
     """
     sigmas = np.linalg.norm(columns, axis=1)
     covariance = estimate.covariance + columns @ columns.T
@@ -35,7 +38,8 @@ def widened(estimate: Estimate, source: str, columns: Array, since: float = -np.
     sqrt_info = estimate.sqrt_info
     if sqrt_info is not None:
         rows = [estimate.names.index(name) for name in sqrt_info.names]
-        sqrt_info = marginalised(sqrt_info, (columns / estimate.inflations[:, None])[rows])
+        apart = columns if apart is None else apart
+        sqrt_info = marginalised(sqrt_info, (apart / estimate.inflations[:, None])[rows])
     return replace(estimate, covariance=covariance, history=history, budget=budget, sqrt_info=sqrt_info)
 
 

@@ -102,7 +102,10 @@ def _file(pixels: Pixels) -> bytes:
 
 
 def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple[int, bytes]]:
-    """Yield pictures as (stamp in ns, file); raw ones and frames of a video become files in the Netpbm form."""
+    """Yield the pictures in a topic's messages as (stamp in Unix ns, content of a picture file).
+
+    Raw pictures and frames of a video become files in the Netpbm form. Raises MessageError.
+    """
     packets = (_packet(message, is_raw) for message in messages)
     for t_ns, form, data in packets:
         if form in ANNEX_B or form in BY_PYAV:

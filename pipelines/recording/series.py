@@ -50,7 +50,10 @@ class Stamped:
 
 @dataclass(frozen=True, eq=False)
 class Series(Stamped):
-    """Base of the series of numbers: fills in arrays that are left out, and raises ValueError at a wrong shape."""
+    """Base of a sensor's readings: arrays with a row for each of N messages of a topic.
+
+    Arrays that are left out are filled in. Raises ValueError at a wrong shape.
+    """
 
     COLUMNS: ClassVar[dict[str, Column]]
     # Where other types of messages hold the columns; what they have not got is filled in.

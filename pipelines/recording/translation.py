@@ -61,7 +61,10 @@ def is_foxglove(name: str) -> bool:
 
 
 class Translation:
-    """Translates messages, defined by a schema or in ROS's own way, into CDR of a ROS 2 type. Raises MessageError."""
+    """Converter of recorded messages, as of protobuf, JSON or ROS 1, to the CDR bytes of a ROS 2 message type.
+
+    Raises MessageError.
+    """
 
     def __init__(self, recorded: Schema | Definition, definition: Definition) -> None:
         self._definition = definition

@@ -27,7 +27,7 @@ from alidade.factors.chi_square import quantile
 from alidade.pipelines import deadline
 from alidade.pipelines.estimation.error_map import SOURCE, ErrorMap, FoundMap
 from alidade.pipelines.estimation.problem import Estimate, History, PosteriorHistory, Problem, SqrtInformation
-from alidade.pipelines.estimation.widening import marginalised, widened
+from alidade.pipelines.estimation.widening import widened
 from alidade.pipelines.solvers.chain import IndeterminateStateError
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
@@ -64,14 +64,15 @@ def with_error_map(problem: Problem, posterior: Posterior, estimate: Estimate) -
     k, ratio = len(error_map.names), estimate.widest(problem.quantities)
     root = mapped.at(at)[0].root()
     chi_square, dof, _ = _tested(root[-k - 1 :, -k - 1 :], error_map, ratio)
-    covered = _covered(problem, error_map, posterior, estimate, root) if error_map.least else estimate
-    if chi_square <= quantile(1.0 - FALSE_ALARMS, dof):
-        return covered
-    try:
-        return _freed(problem, error_map, posterior, estimate, ratio) or covered
-    except (IndeterminateStateError, np.linalg.LinAlgError):
-        deadline.passed(_WHAT)
-        return covered
+    found = None
+    if chi_square > quantile(1.0 - FALSE_ALARMS, dof):
+        try:
+            found = _freed(problem, error_map, posterior, estimate, ratio)
+        except (IndeterminateStateError, np.linalg.LinAlgError):
+            deadline.passed(_WHAT)
+    if found is not None or not error_map.least:
+        return found or estimate
+    return _covered(problem, error_map, posterior, estimate, root)
 
 
 def _covered(problem: Problem, error_map: ErrorMap, posterior: Posterior, estimate: Estimate, root: Array) -> Estimate:
@@ -79,15 +80,13 @@ def _covered(problem: Problem, error_map: ErrorMap, posterior: Posterior, estima
 
     The square-root information has no priors of the device, without which the map trades with more.
     """
-    out, information = widened(replace(estimate, sqrt_info=None), SOURCE, _least(error_map, posterior, root)), None
-    if estimate.sqrt_info is not None:
-        names, at = estimate.sqrt_info.names, posterior.at
-        device = np.array(names)[(estimate.sqrt_info.prior_R != 0.0).any(axis=0)].tolist()
+    apart = None
+    if (information := estimate.sqrt_info) is not None:
+        at, device = posterior.at, np.array(information.names)[(information.prior_R != 0.0).any(axis=0)].tolist()
         engine, *_ = without_priors(problem, posterior.reported, at.engine, at.values, device)
         mapped, values = _mapped(engine, at.values, error_map)
-        columns = _least(error_map, posterior, mapped.at(values)[0].root()) / estimate.inflations[:, None]
-        information = marginalised(estimate.sqrt_info, columns[[estimate.names.index(name) for name in names]])
-    return replace(out, sqrt_info=information)
+        apart = _least(error_map, posterior, mapped.at(values)[0].root())
+    return widened(estimate, SOURCE, _least(error_map, posterior, root), apart=apart)
 
 
 def _least(error_map: ErrorMap, posterior: Posterior, root: Array) -> Array:
